@@ -1,0 +1,42 @@
+"""beam-warp: relightable 4D Gaussian assets on NVIDIA Warp.
+
+Public names are resolved on first use: ``import beam_warp`` costs no Warp and no USD, so that a converter or a
+validator starts at once.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from beam_warp._version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from beam_warp.assets import GaussianCloud as GaussianCloud
+    from beam_warp.assets import GaussianSequence as GaussianSequence
+    from beam_warp.assets import Observability as Observability
+    from beam_warp.errors import BeamError as BeamError
+
+_HOMES = {
+    "GaussianCloud": "assets",
+    "GaussianSequence": "assets",
+    "Observability": "assets",
+    "BeamError": "errors",
+}
+"""Public name → the module that defines it."""
+
+__all__ = ["__version__", *sorted(_HOMES)]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name's home when the name is first used."""
+    if name in _HOMES:
+        value = getattr(import_module(f"beam_warp.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'beam_warp' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """List the public names before they are imported, for completion."""
+    return sorted({*globals(), *_HOMES})

@@ -1,0 +1,1 @@
+"""The command line: parse, call one API function, print."""

@@ -1,0 +1,1 @@
+"""The written contract of an asset on disk, and what reads, writes and validates it."""

@@ -1,0 +1,35 @@
+"""Fixtures that every test may use: devices, a seeded generator, the external data folder."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+def _devices() -> list[str]:
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.init()
+    return ["cpu", *(["cuda:0"] if wp.is_cuda_available() else [])]
+
+
+def pytest_generate_tests(metafunc):
+    """Run every test that takes ``device`` on the CPU and, where there is one, on the first GPU."""
+    if "device" in metafunc.fixturenames:
+        metafunc.parametrize("device", _devices())
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20260)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of external captures and splats; tests that need it skip, saying so, where it is absent."""
+    path = Path(os.environ.get("BEAM_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"external data folder {path} is absent (set BEAM_DATA)")
+    return path

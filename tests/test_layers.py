@@ -1,0 +1,127 @@
+"""Imports point one way: each room may import only the rooms below it, and heavy packages stay in their rooms."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+# Rooms from the bottom up; a module may import modules of strictly lower rank, or of its own room.
+RANKS = {
+    "beam_warp._version": 0,
+    "beam_warp.errors": 0,
+    "beam_warp.kernels": 0,
+    "beam_warp.checks": 1,
+    "beam_warp.assets": 2,
+    "beam_warp.spherical_harmonics": 2,
+    "beam_warp.axes": 3,
+    "beam_warp.images": 3,
+    "beam_warp.cameras": 3,
+    "beam_warp.reference": 3,
+    "beam_warp.environments": 4,
+    "beam_warp.captures": 4,
+    "beam_warp.schema": 4,
+    "beam_warp.frame_store": 4,
+    "beam_warp.converters": 5,
+    "beam_warp.scene": 5,
+    "beam_warp.tracing": 6,
+    "beam_warp.lighting": 7,
+    "beam_warp.rasterizing": 7,
+    "beam_warp.surfaces": 8,
+    "beam_warp.deferred": 8,
+    "beam_warp.materials": 9,
+    "beam_warp.evaluation": 9,
+    "beam_warp.contact_sheet": 9,
+    "beam_warp.demo_figure": 9,
+    "beam_warp.pipeline": 10,
+    "beam_warp.demo": 11,
+    "beam_warp.cli": 12,
+    "beam_warp": 13,
+}
+
+WITHOUT_WARP = (
+    "errors",
+    "checks",
+    "assets",
+    "axes",
+    "images",
+    "cameras",
+    "captures",
+    "environments",
+    "schema",
+    "converters",
+)
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for folder, package in (
+        ("beam_warp", "beam_warp"),
+        ("kernels", "beam_warp.kernels"),
+        ("schema", "beam_warp.schema"),
+        ("converters", "beam_warp.converters"),
+    ):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
+            found[".".join((package, *parts)).removesuffix(".__init__")] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(path: Path) -> set[str]:
+    """Every module that a file imports, at any depth, type-checking blocks left out."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    skipped = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    names = set()
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide the room"
+            names |= {node.module or ""} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def rank(module: str) -> tuple[str, int]:
+    """The room of a module and its rank."""
+    name = module
+    while name not in RANKS:
+        name = name.rpartition(".")[0]
+        assert name, f"{module} has no room in tests/test_layers.py"
+    return name, RANKS[name]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_point_down(module):
+    room, height = rank(module)
+    assert room != "beam_warp" or module == "beam_warp", f"{module} has no room in tests/test_layers.py"
+    for name in imports(MODULES[module]):
+        if not name.startswith("beam_warp.") or name not in MODULES:
+            continue
+        other_room, other_height = rank(name)
+        assert other_room == room or other_height < height, f"{module} imports {name}, which lies above it"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_heavy_packages_stay_in_their_rooms(module):
+    room, _ = rank(module)
+    names = {name.split(".")[0] for name in imports(MODULES[module])}
+    assert "torch" not in names
+    assert "pxr" not in names or room == "beam_warp.schema"
+    if room.removeprefix("beam_warp.") in WITHOUT_WARP:
+        assert "warp" not in names
+        assert not any(name.startswith("beam_warp.kernels") for name in imports(MODULES[module]))
+    if room == "beam_warp.kernels":
+        assert not {n for n in imports(MODULES[module]) if n.startswith("beam_warp.")} - {
+            n for n in imports(MODULES[module]) if n.startswith("beam_warp.kernels")
+        }
