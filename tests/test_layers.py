@@ -24,6 +24,7 @@ RANKS = {
     "beam_warp.schema": 4,
     "beam_warp.frame_store": 4,
     "beam_warp.converters": 5,
+    "beam_warp.devices": 4,
     "beam_warp.scene": 5,
     "beam_warp.tracing": 6,
     "beam_warp.lighting": 7,
