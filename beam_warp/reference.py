@@ -1,4 +1,4 @@
-"""Slow and obvious float64 twins of the tracer, without hierarchy or packing: what the fast code is measured against."""
+"""Slow, obvious float64 twins of the tracer, without hierarchy or packing: what the fast code is measured against."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def reverse_bits(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def owen_scramble(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """Nested uniform scramble of a digital sequence's bits by hashing (Laine and Karras 2011; constants Burley 2020)."""
+    """Nested uniform scramble of a sequence's bits by hashing (Laine and Karras 2011; constants Burley 2020)."""
     r = reverse_bits(x) + seed
     r ^= r * wp.uint32(0x6C50B47C)
     r ^= r * U_B82F1E52
