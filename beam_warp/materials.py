@@ -40,6 +40,9 @@ from beam_warp.surfaces import SurfaceNormals
 POINTS_AT_ONCE = 1 << 14
 """Gaussians whose rays are held at a time: 64 rays of 28 bytes and 512 block weights each, 60 MiB."""
 
+BOUNCE_PART = 4
+"""The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
+
 VIEW_COUNT = 8
 SMALLEST_VIEW_COSINE = 0.2
 """Views below this n.v count for nothing: there the shading normal and the lobe's edge dominate the residue."""
@@ -249,8 +252,10 @@ def measure_materials(
         mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
     hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32)[scene.rows], wp.vec3, device)
     samples = options.sample_count
-    for start in range(0, count if scene.bvh is not None else 0, POINTS_AT_ONCE):
-        here = slice(start, min(start + POINTS_AT_ONCE, count))
+    # What is buried is filled from neighbours anyway: its light is not traced.
+    seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY) if scene.bvh is not None else np.zeros(0, np.intp)
+    for start in range(0, len(seen), POINTS_AT_ONCE):
+        here = seen[start : start + POINTS_AT_ONCE]
         at = chosen[here]
         size = len(at)
         views, cosines = hemisphere_views(surface.normals[at])
@@ -273,7 +278,8 @@ def measure_materials(
         )
         bounce = wp.zeros(size, dtype=wp.vec3, device=device)
         if options.bounce:
-            launch_trace_bounce(scene, points, hit_radiance, (options.seed, frame), start, samples, bounce)
+            bounce_samples = max(samples // BOUNCE_PART, 2)
+            launch_trace_bounce(scene, points, hit_radiance, (options.seed, frame), start, bounce_samples, bounce)
         irradiance = wp.empty(size, dtype=wp.vec3, device=device)
         fit = ColorFit()
         for name in ("numerator", "denominator", "observed"):
@@ -345,11 +351,13 @@ def solve_base_color(
     openness = evidence.openness / evidence.frames
 
     flags = np.zeros(len(cloud), np.uint8)
-    flags[~(irradiance > UNLIT_PART * mean_irradiance) | ~(denominator > 0.0).all(axis=1)] |= Observability.UNLIT
-    flags[~(openness > BURIED_VISIBILITY)] |= Observability.UNSEEN
-    flags[(0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)] |= Observability.SATURATED
-    flags[~(surface_confidence > UNCERTAIN_NORMAL)] |= Observability.UNCERTAIN_NORMAL
-    missing = (flags & (Observability.UNLIT | Observability.UNSEEN)) != 0
+    flags[~(irradiance > UNLIT_PART * mean_irradiance) | ~(denominator > 0.0).all(axis=1)] |= np.uint8(
+        Observability.UNLIT
+    )
+    flags[~(openness > BURIED_VISIBILITY)] |= np.uint8(Observability.UNSEEN)
+    flags[(0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)] |= np.uint8(Observability.SATURATED)
+    flags[~(surface_confidence > UNCERTAIN_NORMAL)] |= np.uint8(Observability.UNCERTAIN_NORMAL)
+    missing = (flags & np.uint8(Observability.UNLIT | Observability.UNSEEN)) != 0
 
     safe = np.where(denominator > 0.0, denominator, 1.0)
     raw = np.where(denominator > 0.0, numerator / safe, 0.0)
@@ -360,7 +368,7 @@ def solve_base_color(
     error = np.sqrt(residual / safe / degrees + (base_color * noise[:, None]) ** 2)
     clipped = float((raw[~missing] > 1.0).any(axis=1).mean()) if (~missing).any() else 0.0
     base_color, error = _fill_from_neighbors(cloud.positions, base_color, error, missing)
-    flags[missing] |= Observability.FILLED
+    flags[missing] |= np.uint8(Observability.FILLED)
     return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
 
 

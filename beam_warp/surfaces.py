@@ -19,7 +19,7 @@ NEIGHBOR_COUNT = 16
 FLAT_RATIO = 0.35
 """A Gaussian whose smallest scale is below this part of its middle one has an orientation of its own."""
 
-ORIENTATION_RAYS = 16
+ORIENTATION_RAYS = 8
 SMOOTHING_PASSES = 3
 
 

@@ -177,8 +177,8 @@ def fit_color_kernel(
         before = float(0.0)
         for k in range(sample_count):
             w = rays.radiance_over_pdf[start + k]
-            f = (w[0] + w[1] + w[2]) * wp.max(wp.dot(n, rays.directions[start + k]), 0.0)
-            term = (rays.visibility[start + k] - ratio) * f
+            power = (w[0] + w[1] + w[2]) * wp.max(wp.dot(n, rays.directions[start + k]), 0.0)
+            term = (rays.visibility[start + k] - ratio) * power
             if k % 2 == 1:
                 spread += (term - before) * (term - before)
             before = term
