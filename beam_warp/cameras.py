@@ -76,7 +76,7 @@ class Camera:
     @property
     def world_to_camera(self) -> NDArray[np.float64]:
         """The inverse pose, ``(4, 4)`` float64."""
-        return np.linalg.inv(self.camera_to_world)
+        return np.linalg.inv(self.camera_to_world).astype(np.float64)
 
     @property
     def position(self) -> NDArray[np.float64]:
