@@ -1,0 +1,155 @@
+"""Reading Radiance pictures (.hdr, RGBE): flat, old and new run-length encodings.
+
+Source: Ward 1991, "Real Pixels" (Graphics Gems II), and the Radiance file-format notes. Differences: a mantissa m
+decodes to m · 2^(e − 136) without Ward's half step, as in Blender, OpenImageIO and stb, so that every renderer sees
+the same light; pictures in XYZE or with transposed scan order are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.errors import AssetFormatError, MissingFileError
+
+MAX_HEADER_BYTES = 65536
+"""A header is a few lines of text; the limit bounds the search for its end in a file that is none."""
+
+MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 32767
+"""Widths for which the new run-length encoding is defined."""
+
+_RESOLUTION = re.compile(rb"([+-])Y (\d{1,9}) ([+-])X (\d{1,9})\n")
+
+
+def read_radiance_hdr(path: Path, *, max_side: int, max_pixels: int) -> NDArray[np.float32]:
+    """Read a picture as linear RGB.
+
+    Args:
+        path: The file.
+        max_side: Largest width or height accepted [px].
+        max_pixels: Largest number of pixels accepted.
+
+    Returns:
+        Radiance, ``(H, W, 3)`` float32, top row first, with the header's exposure divided out.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: It is no Radiance picture, is truncated or corrupt, or is larger than the limits.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(
+            f"image must be a readable file, got {path} ({error.strerror}). Check the path."
+        ) from error
+    flip_y, flip_x, height, width, exposure, start = _parse_header(path, data)
+    if not (0 < height <= max_side and 0 < width <= max_side and height * width <= max_pixels):
+        raise AssetFormatError(
+            f"image must have sides in [1, {max_side}] px and at most {max_pixels} px, got {width} x {height} "
+            f"in {path}. Resize it."
+        )
+    # A scanline takes at least one four-byte entry: refuse what cannot be complete before allocating for it.
+    if len(data) - start < 4 * height:
+        raise _truncated(path, 0)
+    rgbe = _decode(path, data, start, height, width)[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+    scale = np.ldexp(1.0 / exposure, np.arange(256) - 136)
+    scale[0] = 0.0  # exponent 0 is black by definition
+    return (rgbe[..., :3] * scale[rgbe[..., 3], None]).astype(np.float32)
+
+
+def _truncated(path: Path, row: int) -> AssetFormatError:
+    return AssetFormatError(
+        f"image must hold every scanline that its header promises, got a damaged or truncated one at row {row} "
+        f"of {path}. Copy or export the file again."
+    )
+
+
+def _parse_header(path: Path, data: bytes) -> tuple[bool, bool, int, int, float, int]:
+    """Return (flip y, flip x, height, width, exposure, offset of the first scanline)."""
+    head = data[:MAX_HEADER_BYTES]
+    end = head.find(b"\n\n")
+    match = _RESOLUTION.match(head, end + 2) if end >= 0 else None
+    if not head.startswith((b"#?RADIANCE", b"#?RGBE")) or match is None:
+        raise AssetFormatError(
+            f"image must be a Radiance picture with a '-Y height +X width' line, got another header in {path}. "
+            "Export it as RGBE with the usual scan order."
+        )
+    exposure = 1.0
+    for line in head[:end].split(b"\n"):
+        name, _, value = line.partition(b"=")
+        if name == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
+            raise AssetFormatError(
+                f"image must have FORMAT=32-bit_rle_rgbe, got {value.decode('latin-1').strip()!r} in {path}. "
+                "Export it as RGBE."
+            )
+        if name == b"EXPOSURE":
+            try:
+                exposure *= float(value)
+            except ValueError:
+                exposure = float("nan")
+    if not (0.0 < exposure < float("inf")):
+        raise AssetFormatError(f"image must have a positive EXPOSURE, got {exposure} in {path}. Mend its header.")
+    sign_y, height, sign_x, width = match.groups()
+    return sign_y == b"+", sign_x == b"-", int(height), int(width), exposure, match.end()
+
+
+def _decode(path: Path, data: bytes, start: int, height: int, width: int) -> NDArray[np.uint8]:
+    """Return the RGBE bytes, ``(H, W, 4)``; each scanline says by its first bytes how it is encoded."""
+    marker = bytes((2, 2, width >> 8, width & 255)) if MIN_RUN_WIDTH <= width <= MAX_RUN_WIDTH else None
+    rows = []
+    position = start
+    for row in range(height):
+        if marker is not None and data.startswith(marker, position):
+            line, position = _decode_new(data, position + 4, width)
+        else:
+            line, position = _decode_old(data, position, width)
+        if line is None:
+            raise _truncated(path, row)
+        rows.append(line)
+    return np.stack(rows)
+
+
+def _decode_new(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint8] | None, int]:
+    """Decode one scanline of the new encoding: the four components one after the other, each in runs."""
+    out = bytearray()
+    size = len(data)
+    for end in (width, 2 * width, 3 * width, 4 * width):
+        while len(out) < end:
+            if position + 1 >= size:
+                return None, position
+            code = data[position]
+            if code > 128:
+                out += data[position + 1 : position + 2] * (code - 128)
+                position += 2
+            else:
+                out += data[position + 1 : position + 1 + code]
+                position += 1 + code
+                if code == 0:
+                    return None, position
+        if len(out) != end:  # a run crosses the component's end, or a literal the file's
+            return None, position
+    return np.frombuffer(bytes(out), np.uint8).reshape(4, width).T, position
+
+
+def _decode_old(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint8] | None, int]:
+    """Decode one scanline of the old encoding, or a flat one: RGBE entries, where (1, 1, 1, n) repeats the last.
+
+    Repeats that follow one another are the bytes of one count, the lowest first.
+    """
+    available = min((len(data) - position) // 4, width)
+    entries = np.frombuffer(data, np.uint8, 4 * available, position).reshape(-1, 4)
+    repeats = (entries[:, :3] == 1).all(axis=1)
+    index = np.arange(available)
+    pixel = np.maximum.accumulate(np.where(repeats, -1, index))  # the entry whose colour each entry stands for
+    place = index - pixel - 1  # how many repeats came right before this one
+    if available == 0 or pixel[0] < 0 or (repeats & (place > 3)).any():
+        return None, position
+    counts = np.where(repeats, entries[:, 3].astype(np.int64) << (8 * np.clip(place, 0, 3)), 1)
+    filled = np.cumsum(counts)
+    used = int(np.searchsorted(filled, width)) + 1
+    if used > available or filled[used - 1] != width:
+        return None, position
+    return entries[np.repeat(pixel[:used], counts[:used])], position + 4 * used
