@@ -1,0 +1,316 @@
+"""What sees the scene: a pinhole camera, and the ways to place one.
+
+Camera axes are OpenCV's: x right, y down, z forward. Pixel (0, 0) is the top left one and its centre is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.checks import require_array, require_count, require_finite, require_number, require_range
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+
+MAX_SIDE = 65_536
+"""Largest image side in pixels: beyond it a size is a mistake, not a picture."""
+
+RIGID_TOLERANCE = 1e-4
+"""Largest entry of |R^T R - I| accepted as a rotation: single-precision poses printed with six digits are within it."""
+
+PARALLEL_SINE = 1e-6
+"""Below this sine between the viewing direction and up, the roll of a camera is undefined in double precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Attributes:
+        width: Image width [pixel].
+        height: Image height [pixel].
+        focal_x: Focal length along x [pixel].
+        focal_y: Focal length along y [pixel].
+        center_x: Principal point from the left edge of the image [pixel].
+        center_y: Principal point from the top edge of the image [pixel].
+        camera_to_world: Rigid pose, ``(4, 4)`` float64: its columns are right, down, forward and the position [m].
+
+    Raises:
+        InvalidOptionError: A size, focal length or principal point is not a number in range.
+        InvalidArrayError: The pose is not a rigid motion.
+    """
+
+    width: int
+    height: int
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
+    camera_to_world: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check every field once."""
+        for name in ("width", "height"):
+            object.__setattr__(self, name, require_count(name, getattr(self, name), 1, MAX_SIDE))
+        for name in ("focal_x", "focal_y"):
+            object.__setattr__(self, name, require_number(name, getattr(self, name), 1e-3, 1e9))
+        for name in ("center_x", "center_y"):
+            object.__setattr__(self, name, require_number(name, getattr(self, name), -1e9, 1e9))
+        pose = require_array("camera_to_world", self.camera_to_world, (4, 4), np.float64).copy()
+        require_finite("camera_to_world", pose)
+        if not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
+            raise InvalidArrayError(
+                f"camera_to_world must end in the row 0 0 0 1, got {pose[3].tolist()}. Pass a rigid motion."
+            )
+        rotation = pose[:3, :3]
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        if not (error <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0):
+            raise InvalidArrayError(
+                f"camera_to_world must hold a rotation, got |R^T R - I| = {error:.3g} and determinant "
+                f"{np.linalg.det(rotation):.3g}. Take out scale, shear and mirroring."
+            )
+        pose.flags.writeable = False
+        object.__setattr__(self, "camera_to_world", pose)
+
+    @property
+    def world_to_camera(self) -> NDArray[np.float64]:
+        """The inverse pose, ``(4, 4)`` float64."""
+        return np.linalg.inv(self.camera_to_world).astype(np.float64)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Where the camera is in the world [m], ``(3,)`` float64."""
+        return self.camera_to_world[:3, 3]
+
+    @property
+    def forward(self) -> NDArray[np.float64]:
+        """Unit world direction of the optical axis, ``(3,)`` float64."""
+        return self.camera_to_world[:3, 2]
+
+    def directions(self) -> NDArray[np.float64]:
+        """Return unit world directions from the camera through every pixel centre, ``(height, width, 3)`` float64."""
+        x = (np.arange(self.width) + 0.5 - self.center_x) / self.focal_x
+        y = (np.arange(self.height) + 0.5 - self.center_y) / self.focal_y
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., 0], rays[..., 1] = x[None, :], y[:, None]
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return rays @ self.camera_to_world[:3, :3].T
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Project world points.
+
+        Args:
+            points: World positions [m], ``(N, 3)``.
+
+        Returns:
+            ``(N, 3)`` float64: pixel x, pixel y, and depth along the optical axis [m]. The pixel is NaN where the
+            depth is not positive, since such a point is on no pixel.
+
+        Raises:
+            InvalidArrayError: ``points`` has another shape.
+        """
+        world = require_array("points", points, (None, 3), np.float64)
+        local = (world - self.position) @ np.linalg.inv(self.camera_to_world[:3, :3]).T
+        depth = np.where(local[:, 2] > 0.0, local[:, 2], np.nan)
+        return np.stack(
+            [
+                self.focal_x * local[:, 0] / depth + self.center_x,
+                self.focal_y * local[:, 1] / depth + self.center_y,
+                local[:, 2],
+            ],
+            axis=-1,
+        )
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        *,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        width: int,
+        height: int,
+        vertical_fov: float,
+    ) -> Camera:
+        """Place a camera at ``eye`` that looks at ``target``, with square pixels and a centred principal point.
+
+        Args:
+            eye: Where the camera is [m], ``(3,)``.
+            target: What it looks at [m], ``(3,)``.
+            up: World direction that is up in the image, ``(3,)``, not parallel to the viewing direction.
+            width: Image width [pixel].
+            height: Image height [pixel].
+            vertical_fov: Angle between the top and bottom edges of the image [degree].
+
+        Raises:
+            InvalidArrayError: ``eye``, ``target`` or ``up`` is not three finite numbers.
+            InvalidOptionError: They coincide or are parallel, or the angle or a size is out of range.
+        """
+        start, end, above = (_point(n, v) for n, v in (("eye", eye), ("target", target), ("up", up)))
+        axis = end - start
+        distance = float(np.linalg.norm(axis))
+        if not distance > 0.0:
+            raise InvalidOptionError(f"target must differ from eye, got {end.tolist()} for both. Move one of them.")
+        forward = axis / distance
+        right = np.cross(forward, above)
+        sine = float(np.linalg.norm(right) / max(float(np.linalg.norm(above)), np.finfo(float).tiny))
+        if not sine > PARALLEL_SINE:
+            raise InvalidOptionError(
+                f"up must not be parallel to the viewing direction {forward.round(6).tolist()}, got {above.tolist()}. "
+                "Choose another up."
+            )
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = start
+        rows = require_count("height", height, 1, MAX_SIDE)
+        columns = require_count("width", width, 1, MAX_SIDE)
+        focal = focal_length(rows, vertical_fov)
+        return cls(columns, rows, focal, focal, 0.5 * columns, 0.5 * rows, pose)
+
+    @classmethod
+    def orbit(
+        cls,
+        center: ArrayLike,
+        distance: float,
+        azimuth: float,
+        elevation: float,
+        *,
+        width: int,
+        height: int,
+        vertical_fov: float,
+    ) -> Camera:
+        """Place a camera on a sphere around ``center``, looking at it.
+
+        Args:
+            center: What it looks at [m], ``(3,)``.
+            distance: How far away it is [m].
+            azimuth: 0 looks along +y (the world's forward); grows counter-clockwise seen from above, so that 90 sees
+                the scene from +x [degree].
+            elevation: Height above the horizon, -90 to 90 [degree]; at the poles up continues along the meridian.
+            width: Image width [pixel].
+            height: Image height [pixel].
+            vertical_fov: Angle between the top and bottom edges of the image [degree].
+
+        Raises:
+            InvalidArrayError: ``center`` is not three finite numbers.
+            InvalidOptionError: The distance, an angle or a size is out of range.
+        """
+        middle = _point("center", center)
+        away, above = _orbit_directions(azimuth, elevation)
+        reach = require_number("distance", distance, 1e-6, 1e9)
+        return cls.look_at(
+            middle + reach * away, middle, up=above, width=width, height=height, vertical_fov=vertical_fov
+        )
+
+    @classmethod
+    def frame_cloud(
+        cls,
+        positions: ArrayLike,
+        opacities: ArrayLike | None = None,
+        *,
+        azimuth: float = 0.0,
+        elevation: float = 0.0,
+        width: int,
+        height: int,
+        vertical_fov: float = 35.0,
+        margin: float = 1.1,
+    ) -> Camera:
+        """Place an orbit camera so near that the cloud just fills the image.
+
+        Trained clouds carry stray Gaussians far off: see `bulk` for which positions count.
+
+        Args:
+            positions: Centres [m], ``(N, 3)`` with N at least 1.
+            opacities: How much each one counts, ``(N,)`` in [0, 1]; all the same without.
+            azimuth: See `orbit` [degree].
+            elevation: See `orbit` [degree].
+            width: Image width [pixel].
+            height: Image height [pixel].
+            vertical_fov: Angle between the top and bottom edges of the image [degree].
+            margin: Half the image over the half that the cloud may fill, at least 1.
+
+        Raises:
+            InvalidArrayError: An array breaks its contract, or there is no Gaussian.
+            InvalidOptionError: An angle, the margin or a size is out of range.
+        """
+        kept = bulk(positions, opacities)
+        center = 0.5 * (kept.min(axis=0) + kept.max(axis=0))
+        room = require_number("margin", margin, 1.0, 100.0)
+        trial = cls.orbit(
+            center, 1.0, azimuth, elevation, width=width, height=height, vertical_fov=vertical_fov
+        )  # its rotation and focal length are final; only the distance is left to find
+        offset = (kept - center) @ trial.camera_to_world[:3, :3]
+        # A point at depth d + z is inside if |x| focal / (d + z) <= half the side / margin: solve for d.
+        needed = np.maximum(
+            np.abs(offset[:, 0]) * trial.focal_x * room / (0.5 * trial.width),
+            np.abs(offset[:, 1]) * trial.focal_y * room / (0.5 * trial.height),
+        )
+        extent = float(np.linalg.norm(kept.max(axis=0) - kept.min(axis=0)))
+        distance = max(float((needed - offset[:, 2]).max()), 1.05 * float(-offset[:, 2].min()), 1e-3 * extent)
+        if not distance > 0.0:  # every kept position is the same point: any distance frames it
+            distance = 1.0
+        return cls.orbit(center, distance, azimuth, elevation, width=width, height=height, vertical_fov=vertical_fov)
+
+
+def bulk(positions: ArrayLike, opacities: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Return the positions that belong to the subject, without strays.
+
+    Per axis, the box between the 1 % and 99 % quantiles by opacity is robust against any 1 % of strays but cuts off
+    feet and fingers; grown by a quarter of its size to each side it holds them again.
+
+    Args:
+        positions: Centres [m], ``(N, 3)`` with N at least 1.
+        opacities: How much each one counts, ``(N,)`` in [0, 1]; all the same without.
+
+    Returns:
+        ``(M, 3)`` float64 with M at least 1.
+
+    Raises:
+        InvalidArrayError: An array breaks its contract, or there is no Gaussian.
+    """
+    points = require_array("positions", positions, (None, 3), np.float64)
+    if not len(points):
+        raise InvalidArrayError(
+            "positions must hold at least one Gaussian, got none. Check that the asset is not empty."
+        )
+    require_finite("positions", points)
+    if opacities is None:
+        weights = np.ones(len(points))
+    else:
+        weights = require_array("opacities", opacities, (len(points),), np.float64)
+        require_range("opacities", weights, 0.0, 1.0)
+    if not weights.sum() > 0.0:
+        weights = np.ones(len(points))
+    inside = np.ones(len(points), dtype=bool)
+    for axis in range(3):
+        order = np.argsort(points[:, axis], kind="stable")
+        share = np.cumsum(weights[order])
+        sorted_points = points[order, axis]
+        low, high = sorted_points[np.searchsorted(share, np.array([0.01, 0.99]) * share[-1])]
+        grown = 0.25 * (high - low)
+        inside &= (points[:, axis] >= low - grown) & (points[:, axis] <= high + grown)
+    return points[inside] if inside.any() else points
+
+
+def focal_length(height: int, vertical_fov: float) -> float:
+    """Return the focal length [pixel] at which ``height`` pixels span ``vertical_fov`` degrees."""
+    angle = require_number("vertical_fov", vertical_fov, 0.01, 179.0)
+    return 0.5 * height / float(np.tan(np.radians(0.5 * angle)))
+
+
+def _orbit_directions(azimuth: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the unit direction from the centre to the camera, and the up of its image, which is perpendicular."""
+    a = np.radians(require_number("azimuth", azimuth, -3600.0, 3600.0))
+    e = np.radians(require_number("elevation", elevation, -90.0, 90.0))
+    ground = np.array([np.sin(a), -np.cos(a), 0.0])
+    zenith = np.array([0.0, 0.0, 1.0])
+    return np.cos(e) * ground + np.sin(e) * zenith, np.cos(e) * zenith - np.sin(e) * ground
+
+
+def _point(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return three finite numbers."""
+    point = require_array(name, value, (3,), np.float64)
+    require_finite(name, point)
+    return point

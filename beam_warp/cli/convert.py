@@ -1,0 +1,163 @@
+"""``beam-convert``: Gaussians from one file format, set of axes and profile to another; and a look into a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from beam_warp import __version__, converters
+from beam_warp.assets import GaussianCloud
+from beam_warp.cli.console import print_json, progress, run_command
+from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
+from beam_warp.errors import InvalidOptionError
+
+_CONVERT_HELP = """Convert Gaussians between PLY and USD, axes, units and profiles.
+
+Example: beam-convert person.compressed.ply person.ply --target unity --sh-degree 3
+
+A folder of numbered PLY files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
+`beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the version.
+"""
+
+_INSPECT_HELP = """Say what a file or a folder of numbered PLY files holds, who wrote it and what it leaves open.
+
+Example: beam-convert inspect person.compressed.ply --json
+"""
+
+
+@dataclass(frozen=True)
+class ConvertCommand:
+    """What `beam-convert` was asked for."""
+
+    input: Annotated[Positional[Path], arg(metavar="IN", help="PLY or USD file, or a folder of numbered PLY files.")]
+    output: Annotated[Positional[Path], arg(metavar="OUT", help="File to write: .ply, .usd, .usda, .usdc or .usdz.")]
+    target: Annotated[Target | None, arg(help="Whose axes and units to write; by default a PLY keeps its own.")] = None
+    source_axes: Annotated[
+        str | None, arg(metavar="CODE", help="Where the input's x, y, z point, e.g. rdf; else its word, else rdf.")
+    ] = None
+    meters_per_unit: Annotated[
+        float | None, arg(metavar="X", help="Length of the input's unit in metres; else its word, else 1.")
+    ] = None
+    profile: Annotated[Profile, arg(help="PLY: standard for every importer, beam to append the materials.")] = (
+        "standard"
+    )
+    sh_degree: Annotated[int | None, arg(metavar="0..3", help="Pad or cut spherical harmonics to this degree.")] = None
+    activation: Annotated[
+        Activation | None, arg(help="How a PLY stores scales and opacities: log (3DGS) or linear.")
+    ] = None
+    material_activation: Annotated[
+        MaterialActivation | None, arg(help="Whose material channels a PLY holds; else only stated ones are read.")
+    ] = None
+    drop_invalid: Annotated[bool, arg(help="Drop rows with NaN or zero quaternions instead of refusing them.")] = False
+    full_float: Annotated[bool, arg(help="USD: single precision throughout.")] = False
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+
+
+@dataclass(frozen=True)
+class InspectCommand:
+    """What `beam-convert inspect` was asked for."""
+
+    input: Annotated[Positional[Path], arg(metavar="FILE", help="PLY or USD file, or a folder of numbered PLY files.")]
+    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+
+
+def _require_apart(source: Path, output: Path, frame_count: int) -> None:
+    """Refuse to write over the input: a conversion that goes wrong must not cost the original."""
+    taken = {path.resolve() for path in (source.iterdir() if source.is_dir() else [source])}
+    planned = [output] if frame_count == 1 else [converters.numbered_path(output, n) for n in range(frame_count)]
+    clash = next((path for path in planned if path.resolve() in taken), None)
+    if clash is not None:
+        raise InvalidOptionError(
+            f"output must be another file than the input, got {clash} for both. Choose another name."
+        )
+
+
+def convert(command: ConvertCommand) -> int:
+    """Read, write, and say what was done."""
+    started = time.perf_counter()
+    options = converters.WriteOptions(
+        target=command.target, profile=command.profile, sh_degree=command.sh_degree, full_float=command.full_float
+    )
+    converters.require_output(command.output)
+    sequence = converters.read(
+        command.input,
+        source_axes=command.source_axes,
+        meters_per_unit=command.meters_per_unit,
+        material_activation=command.material_activation,
+        activation=command.activation,
+        drop_invalid=command.drop_invalid,
+    )
+    is_ply = command.output.suffix.lower() == ".ply"
+    _require_apart(command.input, command.output, len(sequence) if is_ply else 1)
+    first = sequence[0]
+    with progress(command.quiet or command.json) as report:
+
+        def read_and_report(frame: int) -> GaussianCloud:
+            cloud = sequence[frame]
+            report("convert", frame + 1, len(sequence))
+            return cloud
+
+        paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
+
+    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    if is_ply and command.profile == "standard" and first.base_color is not None:
+        notes.append("materials are not in a standard PLY: --profile beam keeps them")
+    seconds = time.perf_counter() - started
+    if command.json:
+        print_json(
+            {
+                "outputs": [str(path) for path in paths],
+                "frame_count": len(sequence),
+                "gaussian_count": len(first),
+                "source_axes": first.axes,
+                "notes": notes,
+                "seconds": round(seconds, 3),
+            }
+        )
+    elif not command.quiet:
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
+        last = f" … {paths[-1].name}" if len(paths) > 1 else ""
+        frames = f"{len(sequence)} frames, " if len(sequence) > 1 else ""
+        print(f"wrote {paths[0]}{last}: {frames}{len(first):,} Gaussians, {seconds:.2f} s")
+    return 0
+
+
+def inspect(command: InspectCommand) -> int:
+    """Print what a file holds."""
+    found = converters.inspect(command.input)
+    if command.json:
+        print_json(found.as_json())
+    else:
+        print(found.as_text())
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``beam-convert``; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"beam-convert {__version__}")
+        return 0
+    if words[:1] == ["inspect"]:
+        asked = tyro.cli(
+            InspectCommand,
+            prog="beam-convert inspect",
+            description=_INSPECT_HELP,
+            args=words[1:],
+            config=(FlagCreatePairsOff,),
+        )
+        return run_command(lambda: inspect(asked))
+    command = tyro.cli(
+        ConvertCommand, prog="beam-convert", description=_CONVERT_HELP, args=words, config=(FlagCreatePairsOff,)
+    )
+    return run_command(lambda: convert(command))

@@ -1,0 +1,68 @@
+"""How training stores a quantity and what it means: logit and log against linear, raw materials against [0, 1].
+
+The one place that knows; everything else in the package is linear. Plain NumPy, float64 inside, float32 out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.spherical_harmonics import SH_C0
+
+LOG_SCALE_LIMITS = (-30.0, 20.0)
+"""Natural logs of a believable standard deviation: below is nothing, above is a wrong activation."""
+
+LOGIT_LIMIT = 20.0
+"""Largest logit written: sigmoid(20) rounds to 1 in float32, and sigmoid(-20) = 2.1e-9 shows nothing."""
+
+
+def sigmoid(logits: ArrayLike) -> NDArray[np.float32]:
+    """Return 1 / (1 + exp(-x)); NaN stays NaN."""
+    bounded = np.clip(np.asarray(logits, dtype=np.float64), -700.0, 700.0)  # exp(700) is still finite
+    return (1.0 / (1.0 + np.exp(-bounded))).astype(np.float32)
+
+
+def logit(opacities: ArrayLike) -> NDArray[np.float32]:
+    """Return ln(o / (1 - o)) held within ± `LOGIT_LIMIT`, so that 0 and 1 stay finite in a file."""
+    value = np.asarray(opacities, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        raw = np.log(value) - np.log1p(-value)
+    return np.clip(raw, -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.float32)
+
+
+def exp_scale(log_scales: ArrayLike) -> NDArray[np.float32]:
+    """Return the standard deviations of natural logs that lie in `LOG_SCALE_LIMITS`."""
+    return np.exp(np.asarray(log_scales, dtype=np.float64)).astype(np.float32)
+
+
+def log_scale(scales: ArrayLike) -> NDArray[np.float32]:
+    """Return natural logs, never below the lower limit: a flat Gaussian (0) is written as exp(-30) = 9e-14."""
+    with np.errstate(divide="ignore"):
+        raw = np.log(np.asarray(scales, dtype=np.float64))
+    return np.clip(raw, *LOG_SCALE_LIMITS).astype(np.float32)
+
+
+def dc_from_color(color: ArrayLike) -> NDArray[np.float32]:
+    """Return the zeroth spherical-harmonics coefficient that shows a colour from everywhere."""
+    return ((np.asarray(color, dtype=np.float64) - 0.5) / SH_C0).astype(np.float32)
+
+
+def color_from_dc(coefficients: ArrayLike) -> NDArray[np.float32]:
+    """Return the colour that a zeroth coefficient shows."""
+    return (0.5 + SH_C0 * np.asarray(coefficients, dtype=np.float64)).astype(np.float32)
+
+
+def linear(raw: ArrayLike) -> NDArray[np.float32]:
+    """Return a material that is stored as it is meant."""
+    return np.asarray(raw, dtype=np.float32)
+
+
+def sigmoid_base_color(raw: ArrayLike) -> NDArray[np.float32]:
+    """Return 0.03 + 0.77 sigmoid(x), the base colour of Relightable 3D Gaussian and IRGS."""
+    return (0.03 + 0.77 * sigmoid(raw).astype(np.float64)).astype(np.float32)
+
+
+def sigmoid_roughness(raw: ArrayLike) -> NDArray[np.float32]:
+    """Return 0.09 + 0.9 sigmoid(x), the roughness of Relightable 3D Gaussian."""
+    return (0.09 + 0.9 * sigmoid(raw).astype(np.float64)).astype(np.float32)

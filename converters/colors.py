@@ -1,0 +1,57 @@
+"""What colour a file shows in a viewer that knows no materials."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
+from beam_warp.converters.activations import color_from_dc, dc_from_color
+
+CAPTURED = "captured"
+BASE_COLOR_ONLY = "baseColorOnly"
+NO_COLOR = "none"
+
+_TOE, _TOE_SLOPE = 0.0031308, 12.92
+
+
+def srgb_encode(linear: ArrayLike) -> NDArray[np.float64]:
+    """Return the display code of linear light, clamped at 0 below and free above. Source: IEC 61966-2-1."""
+    value = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
+    return np.where(value <= _TOE, _TOE_SLOPE * value, 1.055 * np.maximum(value, _TOE) ** (1.0 / 2.4) - 0.055)
+
+
+def srgb_slope(linear: ArrayLike) -> NDArray[np.float64]:
+    """Return the derivative of `srgb_encode`; on the toe, and below 0, the toe's slope."""
+    value = np.asarray(linear, dtype=np.float64)
+    return np.where(value <= _TOE, _TOE_SLOPE, 1.055 / 2.4 * np.maximum(value, _TOE) ** (1.0 / 2.4 - 1.0))
+
+
+def display_radiance(cloud: GaussianCloud) -> tuple[NDArray[np.float32], str]:
+    """Return spherical harmonics in display sRGB, ``(N, K, 3)``, and what they mean.
+
+    Captured radiance is kept; if it is linear, its mean colour is encoded exactly and the higher bands to first order
+    about it (an encoding is not linear, so no finite set of bands is exact). Without radiance, the colour is the
+    sRGB-encoded product of base colour and ambient occlusion; without either, mid grey.
+    """
+    if cloud.radiance is not None:
+        if cloud.radiance_color_space == DISPLAY_SRGB:
+            return cloud.radiance, CAPTURED
+        mean = color_from_dc(cloud.radiance[:, :1])
+        encoded = srgb_slope(mean) * cloud.radiance
+        encoded[:, :1] = dc_from_color(srgb_encode(mean))
+        return encoded.astype(np.float32), CAPTURED
+    if cloud.base_color is None:
+        return np.zeros((len(cloud), 1, 3), np.float32), NO_COLOR
+    shade = 1.0 if cloud.ambient_occlusion is None else cloud.ambient_occlusion[:, None].astype(np.float64)
+    return dc_from_color(srgb_encode(cloud.base_color * shade))[:, None], BASE_COLOR_ONLY
+
+
+def resize_bands(radiance: NDArray[np.float32], degree: int | None) -> NDArray[np.float32]:
+    """Return coefficients ``(N, (degree + 1)^2, 3)``, cut or padded with zeros; None keeps them."""
+    if degree is None or radiance.shape[1] == (degree + 1) ** 2:
+        return radiance
+    resized = np.zeros((len(radiance), (degree + 1) ** 2, 3), np.float32)
+    kept = min(radiance.shape[1], resized.shape[1])
+    resized[:, :kept] = radiance[:, :kept]
+    return resized

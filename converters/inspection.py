@@ -1,0 +1,213 @@
+"""What a file holds, what it leaves open, and the evidence for either."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.axes import handedness
+from beam_warp.converters.compressed_ply import is_compressed
+from beam_warp.converters.numbering import numbered_files
+from beam_warp.converters.ply_container import PlyHeader, read_header
+
+_MATERIALS = ("base_color", "roughness", "ambient_occlusion", "normals")
+
+_INVISIBLE = 1.0 / 255.0
+"""Opacity that an 8-bit picture cannot show."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Least, middle and greatest of some values."""
+
+    least: float
+    median: float
+    greatest: float
+
+    def __str__(self) -> str:
+        """Return ``least … greatest, median``."""
+        return f"{self.least:.4g} … {self.greatest:.4g}, median {self.median:.4g}"
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """One file or folder, as found.
+
+    Attributes:
+        name: File or folder name.
+        format: Container, encoding and layout.
+        producer: Who wrote it, with the grounds for saying so.
+        frame_count: Frames; the values below are those of the first.
+        frames_per_second: Playback rate.
+        gaussian_count: Gaussians.
+        axes: Axis code that a reader will use.
+        axes_evidence: Why, and what speaks for or against it.
+        bounds: Least and greatest corner of the centres [m], or None without Gaussians.
+        scales: Standard deviations [m], linear.
+        opacities: Peak alphas, linear.
+        sh_degree: Degree of the captured radiance, or None without one.
+        color_state: What the colour is and in which space.
+        materials: Material channels that a reader delivers.
+        comments: Header comments of a PLY.
+        notes: What a reader assumed or left out, and what looks odd.
+    """
+
+    name: str
+    format: str
+    producer: str
+    frame_count: int
+    frames_per_second: float
+    gaussian_count: int
+    axes: str
+    axes_evidence: tuple[str, ...]
+    bounds: tuple[tuple[float, ...], tuple[float, ...]] | None
+    scales: Spread | None
+    opacities: Spread | None
+    sh_degree: int | None
+    color_state: str
+    materials: tuple[str, ...]
+    comments: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain lists, numbers and text."""
+        return asdict(self)
+
+    def as_text(self) -> str:
+        """Return one line for each fact."""
+        frames = f"{self.frame_count} at {self.frames_per_second:g} per second" if self.frame_count > 1 else "1"
+        rows = [
+            ("file", self.name),
+            ("format", self.format),
+            ("producer", self.producer),
+            ("frames", frames),
+            ("Gaussians", f"{self.gaussian_count:,}" + (" in the first frame" if self.frame_count > 1 else "")),
+        ]
+        if self.bounds is not None:
+            size = np.subtract(self.bounds[1], self.bounds[0])
+            rows += [
+                ("bounds [m]", " to ".join(f"({', '.join(f'{v:.3f}' for v in corner)})" for corner in self.bounds)),
+                ("size [m]", " × ".join(f"{v:.3f}" for v in size)),
+                ("scale [m]", str(self.scales)),
+                ("opacity", str(self.opacities)),
+            ]
+        rows += [
+            ("SH degree", "none" if self.sh_degree is None else str(self.sh_degree)),
+            ("colour", self.color_state),
+            ("materials", ", ".join(self.materials) or "none"),
+            ("axes", f"{self.axes}, {handedness(self.axes)}-handed"),
+            *(("", line) for line in self.axes_evidence),
+            *(("comment", line) for line in self.comments),
+            *(("note", line) for line in self.notes),
+        ]
+        return "\n".join(f"{label:<11} {value}" for label, value in rows)
+
+
+def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
+    """Describe what `beam_warp.converters.read` made of a path.
+
+    Args:
+        sequence: What was read; only its first frame is looked at.
+        path: Where it was read from.
+
+    Raises:
+        AssetFormatError: The first frame is malformed.
+    """
+    cloud = sequence[0]
+    ply = numbered_files(path)[0] if path.is_dir() else path if path.suffix.lower() == ".ply" else None
+    header = read_header(ply) if ply else None
+    stated = header is None or "beam_axes" in header.statements
+    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if not line.startswith("axes are")]
+    if header is not None and "beam_schema" not in header.statements:
+        notes.append("one unit is taken as 1 m; pass --meters-per-unit when converting if it is another")
+    return Inspection(
+        name=path.name,
+        format=_format_of(header, path),
+        producer=sequence.metadata.get("producer", "unknown"),
+        frame_count=len(sequence),
+        frames_per_second=sequence.frames_per_second,
+        gaussian_count=len(cloud),
+        axes=cloud.axes,
+        axes_evidence=("stated by the file",) if stated else _axes_evidence(cloud),
+        bounds=_bounds(cloud),
+        scales=_spread(cloud.scales),
+        opacities=_spread(cloud.opacities),
+        sh_degree=cloud.sh_degree,
+        color_state=_color_state(cloud, header),
+        materials=tuple(name for name in _MATERIALS if getattr(cloud, name) is not None),
+        comments=() if header is None else header.comments,
+        notes=(*notes, *_oddities(cloud)),
+    )
+
+
+def _format_of(header: PlyHeader | None, path: Path) -> str:
+    if header is None:
+        return f"USD ({path.suffix.lower()})"
+    encoding = {"ascii": "text", "binary_little_endian": "binary", "binary_big_endian": "big-endian binary"}
+    layout = "packed in chunks of 256" if is_compressed(header) else "one property per value"
+    kind = "PLY, one file per frame" if path.is_dir() else "PLY"
+    return f"{kind}, {encoding[header.encoding]}, {layout}"
+
+
+def _spread(values: np.ndarray) -> Spread | None:
+    if not values.size:
+        return None
+    return Spread(float(values.min()), float(np.median(values)), float(values.max()))
+
+
+def _bounds(cloud: GaussianCloud) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    if not len(cloud):
+        return None
+    return tuple(cloud.positions.min(axis=0).tolist()), tuple(cloud.positions.max(axis=0).tolist())
+
+
+def _color_state(cloud: GaussianCloud, header: PlyHeader | None) -> str:
+    if cloud.radiance is None:
+        return "none"
+    stated = header is None or "beam_radiance_color_space" in header.statements
+    return f"captured radiance, {cloud.radiance_color_space}" + ("" if stated else " (the usual; not stated)")
+
+
+def _axes_evidence(cloud: GaussianCloud) -> tuple[str, ...]:
+    """Say what the shape tells of the vertical: the tallest axis, and which of its ends is at the origin."""
+    lines = ["not stated by the file: rdf is what 3DGS training writes; pass --source-axes to say otherwise"]
+    if len(cloud) < 2:
+        return tuple(lines)
+    low, high = np.quantile(cloud.positions.astype(np.float64), [0.01, 0.99], axis=0)
+    size = high - low
+    tallest = int(np.argmax(size))
+    others = np.delete(size, tallest)
+    extents = " × ".join(f"{value:.2f}" for value in size)
+    if not size[tallest] > 1.3 * others.max():
+        lines.append(f"the shape has no tall axis (98 % within {extents}): it says nothing of the vertical")
+        return tuple(lines)
+    name = "xyz"[tallest]
+    lines.append(f"tallest along {name} (98 % within {extents}): {name} is the vertical if the subject stands")
+    near, far = sorted((abs(low[tallest]), abs(high[tallest])))
+    if near < 0.1 * far:
+        up = "down" if abs(high[tallest]) == near else "up"
+        lines.append(f"it spans {low[tallest]:.2f} … {high[tallest]:.2f}: {name} points {up} if it stands at 0")
+        agrees = cloud.axes[tallest] == up[0]
+        lines.append(f"which {'agrees with' if agrees else 'contradicts'} {cloud.axes}")
+    return tuple(lines)
+
+
+def _oddities(cloud: GaussianCloud) -> list[str]:
+    """Say what is legal and yet likely to surprise."""
+    if not len(cloud):
+        return []
+    notes = []
+    invisible = int(np.count_nonzero(cloud.opacities < _INVISIBLE))
+    if invisible:
+        notes.append(f"{invisible:,} Gaussians ({invisible / len(cloud):.1%}) are less than 1/255 opaque")
+    low, high = np.quantile(cloud.positions, [0.01, 0.99], axis=0)
+    reach = float(np.max(high - low))
+    middle = (low + high) / 2.0
+    far = int(np.count_nonzero(np.abs(cloud.positions - middle).max(axis=1) > 5.0 * reach)) if reach > 0.0 else 0
+    if far:
+        notes.append(f"{far:,} Gaussians lie more than 5 × the size of the middle 98 % away from it")
+    return notes

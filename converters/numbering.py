@@ -1,0 +1,72 @@
+"""Sequences as folders of numbered files: find them in order, and name them."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+from beam_warp.errors import AssetFormatError, OutputError
+
+DIGITS = 6
+"""Digits of a frame number that we write: prefix000000.ply."""
+
+_NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)(?:\.compressed)?\.ply", re.IGNORECASE)
+
+
+def numbered_path(path: Path, frame: int) -> Path:
+    """Return the name of a frame's file: ``out/walk.ply`` → ``out/walk000012.ply``."""
+    return path.with_name(f"{path.stem}{frame:0{DIGITS}d}{path.suffix}")
+
+
+def numbered_files(folder: Path) -> list[Path]:
+    """Return the frames of a folder in the order of their numbers.
+
+    Raises:
+        AssetFormatError: There are none, several sequences share the folder, a number is missing or comes twice.
+    """
+    found = [(match, path) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))]
+    if not found:
+        raise AssetFormatError(
+            f"folder {folder.name} must hold numbered files (walk000000.ply, walk000001.ply, …), got none. "
+            "Pass a file, or another folder."
+        )
+    prefixes = sorted({match["prefix"] for match, _ in found})
+    if len(prefixes) > 1:
+        named = ", ".join(repr(prefix) for prefix in prefixes[:5])
+        raise AssetFormatError(
+            f"folder {folder.name} must hold one sequence, got {len(prefixes)} prefixes ({named}). "
+            "Move each sequence to its own folder."
+        )
+    numbers = sorted((int(match["number"]), path) for match, path in found)
+    for (number, path), (following, other) in pairwise(numbers):
+        if following == number:
+            raise AssetFormatError(
+                f"folder {folder.name} must hold each frame once, got {path.name} and {other.name}. Remove one."
+            )
+        if following != number + 1:
+            raise AssetFormatError(
+                f"folder {folder.name} must hold every frame, got none between {path.name} and {other.name}. "
+                "Add the missing frames or renumber the files."
+            )
+    return [path for _, path in numbers]
+
+
+def require_no_stale_frames(path: Path, frame_count: int) -> None:
+    """Refuse to write a sequence beside later frames of an older, longer one: they would join it unseen.
+
+    Raises:
+        OutputError: There are such frames.
+    """
+    stale = [
+        other.name
+        for other in path.parent.iterdir()
+        if (match := _NUMBERED.fullmatch(other.name))
+        and match["prefix"] == path.stem
+        and int(match["number"]) >= frame_count
+    ]
+    if stale:
+        raise OutputError(
+            f"output folder must hold no frames after the last of {frame_count}, got {min(stale)} "
+            f"({len(stale)} in all). Delete them or choose another name."
+        )

@@ -1,0 +1,76 @@
+"""What a caller may ask of a reader and of a writer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from beam_warp.axes import TARGETS, require_axes
+from beam_warp.checks import require_choice, require_count, require_number
+
+Activation = Literal["log", "linear"]
+MaterialActivation = Literal["linear", "r3dg", "gsir", "irgs"]
+Target = Literal["usd", "unity", "unreal"]
+Profile = Literal["standard", "beam"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What a file does not say about itself. A value given here wins over what the file says.
+
+    Attributes:
+        source_axes: Axis code of the file (see `beam_warp.axes`).
+        meters_per_unit: Length of one unit of the file [m].
+        activation: ``log`` if scales are natural logs and opacities logits, as 3DGS training leaves them; ``linear``
+            if both are linear. None means ``log``, with files that look linear refused.
+        material_activation: Whose material channels the file holds, and so how they are stored.
+        drop_invalid: Leave out Gaussians with non-finite values or zero quaternions instead of refusing the file.
+
+    Raises:
+        InvalidOptionError: A value is outside its contract.
+    """
+
+    source_axes: str | None = None
+    meters_per_unit: float | None = None
+    activation: Activation | None = None
+    material_activation: MaterialActivation | None = None
+    drop_invalid: bool = False
+
+    def __post_init__(self) -> None:
+        """Check each option that is given."""
+        if self.source_axes is not None:
+            require_axes("source_axes", self.source_axes)
+        if self.meters_per_unit is not None:
+            require_number("meters_per_unit", self.meters_per_unit, 1e-6, 1e6)
+        if self.activation is not None:
+            require_choice("activation", self.activation, ("log", "linear"))
+        if self.material_activation is not None:
+            require_choice("material_activation", self.material_activation, ("linear", "r3dg", "gsir", "irgs"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteOptions:
+    """What a writer is asked for.
+
+    Attributes:
+        target: Whose axes and units to write; None keeps the cloud's axes in metres (USD is always ``usd``).
+        profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
+        sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
+        full_float: USD only. Single precision throughout instead of half where half suffices.
+
+    Raises:
+        InvalidOptionError: A value is outside its contract.
+    """
+
+    target: Target | None = None
+    profile: Profile = "standard"
+    sh_degree: int | None = None
+    full_float: bool = False
+
+    def __post_init__(self) -> None:
+        """Check each option."""
+        if self.target is not None:
+            require_choice("target", self.target, tuple(TARGETS))
+        require_choice("profile", self.profile, ("standard", "beam"))
+        if self.sh_degree is not None:
+            require_count("sh_degree", self.sh_degree, 0, 3)

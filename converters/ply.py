@@ -1,0 +1,333 @@
+"""PLY files of Gaussians, read: the 3DGS training layout in any property order, the beam profile, the packed form.
+
+Source of the layout: the exporter of Kerbl et al. 2023: x y z, nx ny nz, f_dc, f_rest channel after channel, opacity
+as a logit, scale as natural logs, rot as w x y z. A file without ``scale_2`` (2D Gaussians) is read as flat ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, GaussianCloud, GaussianSequence, sh_degree_of
+from beam_warp.axes import AXIS_CODES
+from beam_warp.checks import require_number
+from beam_warp.converters import compressed_ply
+from beam_warp.converters.activations import exp_scale, sigmoid
+from beam_warp.converters.colors import BASE_COLOR_ONLY, NO_COLOR
+from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types, rows_at
+from beam_warp.converters.ply_container import PlyHeader, Table, malformed, read_header, read_table
+from beam_warp.converters.producers import (
+    LAYOUTS,
+    NORMAL_NAMES,
+    MaterialLayout,
+    guess_producer,
+    material_producer,
+    material_properties,
+)
+from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, SchemaVersionError
+
+DEFAULT_AXES = "rdf"
+"""Axes of a PLY that does not say: those of COLMAP, in which 3DGS is trained."""
+
+_POSITION = ("x", "y", "z")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_FLAT = _SCALE[:2]
+_UNIT_ROUNDING = 1e-6
+"""Lengths this close to 1 are float32 rounding of unit vectors, which are kept bit for bit."""
+
+
+@dataclass(frozen=True)
+class PlyFrame:
+    """One file as read: the Gaussians, what the file says of its place in time, and what to tell the user."""
+
+    cloud: GaussianCloud
+    frames_per_second: float
+    notes: tuple[str, ...]
+
+
+def read(path: Path, options: ReadOptions) -> GaussianSequence:
+    """Read one file as a sequence of one frame."""
+    return read_numbered([path], options)
+
+
+def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequence:
+    """Make a sequence of files that are read as their frames are asked for.
+
+    Every header is checked at once, so that a cut file is found before any work is done.
+
+    Raises:
+        AssetFormatError, MissingFileError: A header or the first frame is refused.
+    """
+    headers = [read_header(path) for path in paths]
+    first = read_frame(headers[0], options)
+    return GaussianSequence(
+        frame_count=len(paths),
+        read_frame=lambda frame: first.cloud if frame == 0 else read_frame(read_header(paths[frame]), options).cloud,
+        frames_per_second=first.frames_per_second,
+        metadata={
+            "source": paths[0].name,
+            "producer": guess_producer(headers[0]),
+            **({"notes": "\n".join(first.notes)} if first.notes else {}),
+        },
+    )
+
+
+def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
+    """Read the Gaussians of a file whose header is read.
+
+    Raises:
+        AssetFormatError: It holds no Gaussians, or values outside their contract; the message names file and row.
+    """
+    statements = _Statements.of(header)
+    notes: list[str] = []
+    if compressed_ply.is_compressed(header):
+        fields = compressed_ply.decode(header)
+    else:
+        fields = _decode(header, options, statements, notes)
+    units = statements.meters_per_unit if options.meters_per_unit is None else options.meters_per_unit
+    if units != 1.0:
+        for name in ("positions", "scales"):
+            fields[name] = fields[name] * units  # pyright: ignore[reportOperatorIssue]
+    axes = options.source_axes or statements.axes
+    if axes is None:
+        axes = DEFAULT_AXES
+        notes.append(f"axes are not stated: taken as {axes} (3DGS training); pass --source-axes if they are others")
+    try:
+        cloud = GaussianCloud(**fields, axes=axes)
+    except InvalidArrayError as error:
+        raise AssetFormatError(f"{header.path.name}: {error}") from error
+    if not len(cloud):
+        notes.append("holds no Gaussians")
+    return PlyFrame(cloud, statements.frames_per_second, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Statements:
+    """What the comments of our own writer say, checked."""
+
+    axes: str | None
+    meters_per_unit: float
+    frames_per_second: float
+    material_linear: bool
+    radiance_meaning: str | None
+    radiance_color_space: str
+
+    @classmethod
+    def of(cls, header: PlyHeader) -> _Statements:
+        said = header.statements
+        version = said.get("beam_schema", "1.0")
+        if version.split(".")[0] != "1":
+            raise SchemaVersionError(
+                f"{header.path.name}: beam_schema must be 1.x, got {version}. Update beam-warp to read it."
+            )
+        for key, allowed in (
+            ("beam_axes", AXIS_CODES),
+            ("beam_material", ("linear",)),
+            ("beam_base_color_space", (LINEAR_REC709,)),
+            ("beam_radiance_color_space", COLOR_SPACES),
+        ):
+            if key in said and said[key] not in allowed:
+                choices = ", ".join(allowed) if len(allowed) < 5 else "an axis code such as rdf"
+                raise malformed(header.path, f"comment {key} must be {choices}", said[key], "Correct that line.")
+        try:
+            units = require_number("beam_meters_per_unit", said.get("beam_meters_per_unit", 1.0), 1e-6, 1e6)  # type: ignore[arg-type]
+            rate = said.get("beam_frame", "0 30").split()[-1]
+            frames_per_second = require_number("beam_frame's rate", rate, 1e-3, 1e6)  # type: ignore[arg-type]
+        except BeamError as error:
+            raise AssetFormatError(f"{header.path.name}: {error}") from error
+        return cls(
+            axes=said.get("beam_axes"),
+            meters_per_unit=units,
+            frames_per_second=frames_per_second,
+            material_linear="beam_material" in said,
+            radiance_meaning=said.get("beam_radiance_meaning"),
+            radiance_color_space=said.get("beam_radiance_color_space", DISPLAY_SRGB),
+        )
+
+
+def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:
+    """Check that a file holds Gaussians in the training layout; return its property names."""
+    vertex = header.element("vertex")
+    names = vertex.names if vertex else ()
+    missing = [name for name in (*_POSITION, "opacity", *_FLAT, *_ROTATION) if name not in names]
+    if vertex is None or missing:
+        raise malformed(
+            header.path,
+            f"Gaussians must have the properties {', '.join(missing)}",
+            f"vertices with {', '.join(names[:16]) or 'nothing'}",
+            "This is a point cloud or a mesh: train Gaussians from it first."
+            if set(_POSITION) <= set(names) and not {"opacity", "rot_0", "scale_0"} & set(names)
+            else "Export it again as 3DGS PLY.",
+        )
+    used = (*_POSITION, "opacity", *_SCALE, *_ROTATION, *_DC, *(n for n in names if n.startswith("f_rest_")))
+    require_types(header.path, vertex, tuple(name for name in used if name in names), ("f4", "f8"))
+    return names
+
+
+def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, notes: list[str]) -> dict[str, Any]:
+    """Return the fields of a cloud in the file's axes and units."""
+    names = _require_gaussians(header)
+    table = read_table(header, "vertex")
+    if options.drop_invalid:
+        table = _without_invalid_rows(table, options, notes)
+
+    scale_names = _SCALE if "scale_2" in names else _FLAT
+    scales, opacities = table.columns(scale_names), table.columns(["opacity"])[:, 0]
+    if options.activation != "linear":
+        if options.activation is None:
+            require_not_linear(header.path, scales, opacities)
+        require_log_scales(header.path, scales)
+        finite = np.isfinite(opacities)
+        if not finite.all():
+            raise malformed(
+                header.path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY
+            )
+        scales, opacities = exp_scale(scales), sigmoid(opacities)
+    if scale_names == _FLAT:
+        notes.append("no scale_2: read as 2D Gaussians of thickness 0")
+        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
+    fields: dict[str, Any] = {
+        "positions": table.columns(_POSITION),
+        "orientations": _orientations(header.path, table),
+        "scales": scales,
+        "opacities": opacities,
+    }
+    read_names = {*_POSITION, "opacity", *scale_names, *_ROTATION}
+    fields |= _materials(header, table, options, statements, notes, read_names)
+    fields |= _radiance(header, table, statements, "base_color" in fields, notes, read_names)
+    unread = [name for name in names if name not in read_names and name not in NORMAL_NAMES]
+    if unread:
+        notes.append(f"properties left out: {', '.join(unread[:12])}{', …' if len(unread) > 12 else ''}")
+    return fields
+
+
+_DROP_REMEDY = "Repair those rows, or drop them with --drop-invalid."
+
+
+def _without_invalid_rows(table: Table, options: ReadOptions, notes: list[str]) -> Table:
+    """Leave out rows that no reading can make a Gaussian of."""
+    geometry = table.columns([name for name in table.names if name in (*_POSITION, "opacity", *_SCALE, *_DC)])
+    rotations = table.columns(_ROTATION).astype(np.float64)
+    valid = np.isfinite(geometry).all(axis=1) & (np.linalg.norm(rotations, axis=1) > 1e-12)
+    valid &= np.isfinite(rotations).all(axis=1)
+    if not valid.all():
+        notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} Gaussians dropped: not finite, or zero quaternions")
+    return table if valid.all() else Table(table.names, table.rows[valid])
+
+
+def _orientations(path: Path, table: Table) -> NDArray[np.float32]:
+    """Return unit quaternions xyzw; those that are unit already keep their bits."""
+    wxyz = table.columns(_ROTATION)
+    length = np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz, dtype=np.float64))
+    bad = ~((length > 1e-12) & np.isfinite(length))
+    if bad.any():
+        zero = length[int(np.flatnonzero(bad)[0])] <= 1e-12
+        got = f"{'a zero quaternion' if zero else 'NaN or infinity'} at {rows_at(bad)}"
+        raise malformed(path, "rot_0 … rot_3 must be a quaternion", got, _DROP_REMEDY)
+    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
+    return (wxyz[:, [1, 2, 3, 0]] / divisor[:, None]).astype(np.float32)
+
+
+def _radiance(
+    header: PlyHeader,
+    table: Table,
+    statements: _Statements,
+    has_base_color: bool,
+    notes: list[str],
+    read_names: set[str],
+) -> dict[str, Any]:
+    """Return the captured colour, unless the file says that its colour only repeats the material."""
+    rest = [name for name in table.names if name.startswith("f_rest_")]
+    present = [name for name in _DC if name in table.names]
+    if not present and not rest:
+        notes.append("no f_dc_0 … f_dc_2: read without colour")
+        return {}
+    ordered = tuple(f"f_rest_{index}" for index in range(len(rest)))
+    if len(present) != 3 or set(ordered) != set(rest) or len(rest) not in (0, 9, 24, 45, 72):
+        raise malformed(
+            header.path,
+            "spherical harmonics must be f_dc_0 … 2 and f_rest_0 … with 0, 9, 24, 45 or 72 of them",
+            f"{len(present)} and {len(rest)}",
+            "Export it again with full bands.",
+        )
+    read_names |= {*_DC, *rest}
+    if statements.radiance_meaning == NO_COLOR or (statements.radiance_meaning == BASE_COLOR_ONLY and has_base_color):
+        return {}
+    if statements.radiance_meaning == BASE_COLOR_ONLY:
+        notes.append("colour is base colour times ambient occlusion, not captured radiance")
+    radiance = np.empty((len(table.rows), 1 + len(rest) // 3, 3), np.float32)
+    radiance[:, 0] = table.columns(_DC)
+    if rest:
+        radiance[:, 1:] = table.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
+    sh_degree_of(radiance.shape[1])
+    return {"radiance": radiance, "radiance_color_space": statements.radiance_color_space}
+
+
+def _materials(
+    header: PlyHeader,
+    table: Table,
+    options: ReadOptions,
+    statements: _Statements,
+    notes: list[str],
+    read_names: set[str],
+) -> dict[str, Any]:
+    """Return the material channels and normals, as far as the file or the caller says how they are stored."""
+    activation = options.material_activation or ("linear" if statements.material_linear else None)
+    layout = LAYOUTS[activation or "linear"]
+    fields: dict[str, Any] = {}
+    found = material_properties(table.names)
+    if activation is None and found:
+        producer = material_producer(table.names)
+        named = f" of {producer[0]}" if producer else ""
+        choice = producer[1] if producer and producer[1] else "linear|r3dg|gsir|irgs"
+        notes.append(
+            f"materials{named} left out ({', '.join(found)}): pass --material-activation {choice} to read them"
+        )
+    elif activation is not None:
+        fields = _activated(table, layout, read_names)
+        if options.material_activation is not None and not fields:
+            wanted = ", ".join(name for names, _ in layout.channels.values() for name in names)
+            raise malformed(
+                header.path,
+                f"materials of {activation} must have {wanted}",
+                ", ".join(found) or "no material channels",
+                "Choose another --material-activation, or leave it out.",
+            )
+    return fields | _normals(table, layout, notes, read_names)
+
+
+def _activated(table: Table, layout: MaterialLayout, read_names: set[str]) -> dict[str, Any]:
+    """Return the channels of a layout that a table holds, linear."""
+    fields: dict[str, Any] = {}
+    for channel, (names, activate) in layout.channels.items():
+        if set(names) <= set(table.names):
+            read_names |= set(names)
+            values = activate(table.columns(names))
+            fields[channel] = values if len(names) == 3 else values[:, 0]
+    return fields
+
+
+def _normals(table: Table, layout: MaterialLayout, notes: list[str], read_names: set[str]) -> dict[str, Any]:
+    """Return unit normals, or nothing where the file holds the usual zeros."""
+    if not set(layout.normals) <= set(table.names):
+        return {}
+    read_names |= set(layout.normals)
+    normals = table.columns(layout.normals)
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals, dtype=np.float64))
+    usable = (length > 1e-6) & np.isfinite(length)
+    if not usable.any():
+        return {}
+    if not usable.all():
+        notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
+        return {}
+    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
+    return {"normals": (normals / divisor[:, None]).astype(np.float32)}

@@ -1,0 +1,66 @@
+"""What a PLY of Gaussians must hold, checked on the raw values where names and rows are still the file's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.converters.activations import LOG_SCALE_LIMITS
+from beam_warp.converters.ply_container import Element, malformed
+
+_WORDS = {"u1": "uchar", "u4": "uint", "f4": "float", "f8": "double"}
+
+
+def rows_at(bad: NDArray[np.bool_]) -> str:
+    """Say which rows of a mask are set: ``row 12 (3 rows in all)``."""
+    rows = np.flatnonzero(bad)
+    return f"row {rows[0]}" + (f" ({len(rows)} rows in all)" if len(rows) > 1 else "")
+
+
+def require_types(path: Path, element: Element, names: tuple[str, ...], codes: tuple[str, ...]) -> None:
+    """Refuse properties that are absent or of another type."""
+    missing = [name for name in names if name not in element.names]
+    if missing:
+        raise malformed(
+            path,
+            f"element {element.name} must have {', '.join(missing)}",
+            ", ".join(element.names[:24]) or "no properties",
+            "Export it again.",
+        )
+    for column in element.properties:
+        if column.name in names and column.code not in codes:
+            wanted = " or ".join(_WORDS[code] for code in codes)
+            raise malformed(path, f"{column.name} must be {wanted}", column.word, "Export it again.")
+
+
+def require_log_scales(path: Path, log_scales: NDArray[np.floating]) -> None:
+    """Refuse scales that cannot be natural logs of standard deviations; NaN cannot."""
+    low, high = LOG_SCALE_LIMITS
+    bad = ~((log_scales >= low) & (log_scales <= high)).all(axis=1)
+    if bad.any():
+        row = log_scales[int(np.flatnonzero(bad)[0])]
+        worst = row[int(np.argmax(~((row >= low) & (row <= high))))]
+        raise malformed(
+            path,
+            f"scales must be natural logs in [{low:g}, {high:g}]",
+            f"{worst:g} at {rows_at(bad)}",
+            "Drop those rows (--drop-invalid), or pass --activation linear if the file's scales are linear.",
+        )
+
+
+def require_not_linear(path: Path, log_scales: NDArray[np.floating], logits: NDArray[np.floating]) -> None:
+    """Refuse a file whose every scale is above 0 and every opacity in [0, 1]: it was activated already.
+
+    As logs and logits the same numbers would mean that every Gaussian is over a unit wide and none more than 73 %
+    opaque, which no training leaves.
+    """
+    if len(logits) and log_scales.min() > 0.0 and logits.min() >= 0.0 and logits.max() <= 1.0:
+        raise malformed(
+            path,
+            "scales must be natural logs and opacities logits",
+            f"scales in [{log_scales.min():g}, {log_scales.max():g}] and opacities in "
+            f"[{logits.min():g}, {logits.max():g}], which look linear",
+            "Pass --activation linear, or --activation log if they are what they should be.",
+        )

@@ -1,0 +1,307 @@
+"""What bytes a PLY file holds: header and tables, every size checked against the file before memory is asked for.
+
+Source: Turk 1994, "The PLY Polygon File Format". CRLF headers, comments and ``obj_info`` are accepted; lists are
+accepted in elements that are not read.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.errors import AssetFormatError, MissingFileError
+
+MAX_HEADER_BYTES = 64 * 1024
+MAX_ELEMENTS = 16
+MAX_PROPERTIES = 1024
+MAX_COUNT = 2**31 - 1
+
+ENCODINGS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+SCALAR_TYPES = {
+    word: code
+    for code, words in {
+        "i1": ("char", "int8"),
+        "u1": ("uchar", "uint8"),
+        "i2": ("short", "int16"),
+        "u2": ("ushort", "uint16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+    }.items()
+    for word in words
+}
+"""Type words, old and new, by NumPy code."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """One column: its name, its type word, its NumPy code (empty for a list)."""
+
+    name: str
+    word: str
+    code: str
+
+
+@dataclass(frozen=True)
+class Element:
+    """One table: its name, row count and columns."""
+
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Column names in file order."""
+        return tuple(column.name for column in self.properties)
+
+    @property
+    def stride(self) -> int | None:
+        """Bytes of a binary row, or None if a list makes rows differ."""
+        if not all(column.code for column in self.properties):
+            return None
+        return sum(int(column.code[1]) for column in self.properties)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a header says, checked against the size of its file."""
+
+    path: Path
+    encoding: str
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
+    data_start: int
+    file_size: int
+
+    def element(self, name: str) -> Element | None:
+        """Return an element by name, or None."""
+        return next((element for element in self.elements if element.name == name), None)
+
+    @property
+    def statements(self) -> dict[str, str]:
+        """Comments of the form ``beam_<key> <value>``: what our own writer says of a file."""
+        pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
+        return {key: value.strip() for key, _, value in pairs}
+
+
+@dataclass(frozen=True)
+class Table:
+    """The rows of one element: a matrix where all columns share a type, else a structured array."""
+
+    names: tuple[str, ...]
+    rows: NDArray[Any]
+
+    def columns(self, names: Sequence[str], dtype: Any = np.float32) -> NDArray[Any]:
+        """Return some columns as a new matrix ``(N, len(names))``; values too large for ``dtype`` become infinite."""
+        places = [self.names.index(name) for name in names]
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.rows.dtype.names:
+                return np.stack([self.rows[name].astype(dtype) for name in names], axis=1)
+            run = places == list(range(places[0], places[0] + len(places)))
+            picked = self.rows[:, places[0] : places[0] + len(places)] if run else self.rows[:, places]
+            return np.array(picked, dtype=dtype, order="C")
+
+
+def malformed(path: Path, contract: str, got: str, remedy: str) -> AssetFormatError:
+    """Make the error of a file that breaks its format."""
+    return AssetFormatError(f"{path.name}: {contract}, got {got}. {remedy}")
+
+
+def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:
+    """Return the header's lines and where the data start."""
+    if not start:
+        raise malformed(
+            path, "a PLY file must start with the line ply", "an empty file", "Export or download it again."
+        )
+    if not re.match(rb"ply\r?\n", start):
+        raise malformed(
+            path, "a PLY file must start with the line ply", repr(start[:8]), "Check that it is a PLY file."
+        )
+    end = re.search(rb"\nend_header\r?\n", start)
+    if end is None:
+        got = f"none in the first {MAX_HEADER_BYTES // 1024} KiB" if len(start) == MAX_HEADER_BYTES else "a cut file"
+        raise malformed(path, "the header must end with the line end_header", got, "Export or download it again.")
+    text = start[: end.start()].decode("utf-8", "replace")
+    return [line.strip() for line in text.split("\n")], end.end()
+
+
+def _count(path: Path, name: str, word: str) -> int:
+    if not re.fullmatch(r"\d{1,19}", word) or int(word) > MAX_COUNT:
+        raise malformed(
+            path, f"element {name} must count 0 to {MAX_COUNT} rows", repr(word[:32]), "Export the file again."
+        )
+    return int(word)
+
+
+def _property(path: Path, line: str, words: list[str]) -> Property:
+    if words[1] == "list" and len(words) == 5 and {words[2], words[3]} <= set(SCALAR_TYPES):
+        return Property(words[4], "list", "")
+    if len(words) == 3 and words[1] in SCALAR_TYPES:
+        return Property(words[2], words[1], SCALAR_TYPES[words[1]])
+    raise malformed(path, "a property must be a type word and a name", repr(line[:80]), "Export the file again.")
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Read and check a header; nothing of the data is read.
+
+    Raises:
+        MissingFileError: There is no such file, or it cannot be opened.
+        AssetFormatError: The header is malformed or too large, or promises more bytes than the file has.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"input must be an existing file, got {path}. Check the path.")
+    try:
+        with path.open("rb") as file:
+            start = file.read(MAX_HEADER_BYTES)
+            file_size = file.seek(0, io.SEEK_END)
+    except OSError as error:
+        raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
+    lines, data_start = _header_lines(path, start)
+
+    encoding: str | None = None
+    comments: list[str] = []
+    tables: list[tuple[str, int, list[Property]]] = []
+    for line in lines[1:]:
+        words = line.split()
+        match words:
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.partition(" ")[2].strip())
+            case ["format", word, "1.0"] if word in ENCODINGS and encoding is None:
+                encoding = word
+            case ["element", name, count] if encoding is not None:
+                tables.append((name, _count(path, name, count), []))
+            case ["property", _, _, *_] if tables:
+                tables[-1][2].append(_property(path, line, words))
+            case _:
+                raise malformed(
+                    path,
+                    "a header line must be format, comment, element or property, in that order",
+                    repr(line[:80]),
+                    "Export the file again.",
+                )
+    if encoding is None:
+        raise malformed(
+            path, f"the header must name its format ({', '.join(ENCODINGS)} 1.0)", "none", "Export the file again."
+        )
+    header = PlyHeader(
+        path, encoding, tuple(Element(n, c, tuple(p)) for n, c, p in tables), tuple(comments), data_start, file_size
+    )
+    _check_limits(header)
+    _check_sizes(header)
+    return header
+
+
+def _check_limits(header: PlyHeader) -> None:
+    property_count = sum(len(element.properties) for element in header.elements)
+    for what, count, limit in (
+        ("elements", len(header.elements), MAX_ELEMENTS),
+        ("properties", property_count, MAX_PROPERTIES),
+    ):
+        if count > limit:
+            raise malformed(header.path, f"a header must have at most {limit} {what}", str(count), "Drop the rest.")
+    for kind, names in (
+        ("element", [element.name for element in header.elements]),
+        *((f"property of {element.name}", list(element.names)) for element in header.elements),
+    ):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise malformed(header.path, f"each {kind} must be named once", ", ".join(twice), "Rename one of them.")
+
+
+def _least_row_bytes(header: PlyHeader, element: Element) -> int | None:
+    """Return the fewest bytes a row can take, or None if nothing can be said."""
+    if header.encoding == "ascii":
+        return 2 * len(element.properties)  # a digit and a separator each
+    return element.stride
+
+
+def _check_sizes(header: PlyHeader) -> None:
+    """Refuse counts that the bytes of the file cannot hold, before anything of that size is allocated."""
+    left = header.file_size - header.data_start + (header.encoding == "ascii")  # the last line may lack its end
+    for element in header.elements:
+        row_bytes = _least_row_bytes(header, element)
+        if row_bytes is None:
+            return
+        left -= element.count * row_bytes
+        if left < 0:
+            held = max(0, left + element.count * row_bytes) // row_bytes
+            raise malformed(
+                header.path,
+                f"element {element.name} must have the {element.count} rows that the header counts",
+                f"bytes for {'at most ' if header.encoding == 'ascii' else ''}{held}",
+                "The file is cut short: export or download it again.",
+            )
+
+
+def read_table(header: PlyHeader, name: str) -> Table:
+    """Read the rows of one element.
+
+    Raises:
+        AssetFormatError: It is absent, has list properties, follows lists whose length is unknown, or is cut short.
+    """
+    element = header.element(name)
+    if element is None:
+        names = ", ".join(e.name for e in header.elements) or "no elements"
+        raise malformed(header.path, f"the file must have an element {name}", names, "Check that it holds Gaussians.")
+    before = header.elements[: header.elements.index(element)]
+    for other in (*before, element):
+        if other.stride is None:
+            raise malformed(
+                header.path,
+                f"element {other.name} must have no list properties{'' if other is element else f' before {name}'}",
+                ", ".join(column.name for column in other.properties if not column.code),
+                "Export Gaussians, not a mesh.",
+            )
+    if not element.properties or not element.count:
+        return Table(element.names, np.empty((element.count if element.properties else 0, len(element.names)), "f4"))
+    if header.encoding == "ascii":
+        return Table(element.names, _ascii_rows(header, element, sum(other.count for other in before)))
+    offset = header.data_start + sum(other.count * (other.stride or 0) for other in before)
+    return Table(element.names, _binary_rows(header, element, offset))
+
+
+def _binary_rows(header: PlyHeader, element: Element, offset: int) -> NDArray[Any]:
+    order = ENCODINGS[header.encoding]
+    codes = {column.code for column in element.properties}
+    uniform = len(codes) == 1
+    if uniform:
+        dtype, items = np.dtype(order + codes.pop()), element.count * len(element.properties)
+    else:
+        dtype, items = np.dtype([(c.name, order + c.code) for c in element.properties]), element.count
+    # Not memory-mapped: a file that another program cuts while it is mapped would kill the process.
+    rows = np.fromfile(header.path, dtype=dtype, count=items, offset=offset)
+    if len(rows) != items:
+        raise malformed(header.path, "the file must not change while it is read", "fewer bytes", "Read it again.")
+    return rows.reshape(element.count, -1) if uniform else rows
+
+
+def _ascii_rows(header: PlyHeader, element: Element, skipped_rows: int) -> NDArray[np.float32]:
+    with header.path.open("rb") as file:
+        file.seek(header.data_start)
+        text = io.TextIOWrapper(file, encoding="ascii", errors="replace")
+        try:
+            rows = np.loadtxt(
+                text, dtype=np.float32, comments=None, skiprows=skipped_rows, max_rows=element.count, ndmin=2
+            )
+        except ValueError as error:
+            raise malformed(
+                header.path, f"element {element.name} must hold rows of numbers", str(error), "Export the file again."
+            ) from error
+    if rows.shape != (element.count, len(element.properties)):
+        raise malformed(
+            header.path,
+            f"element {element.name} must hold {element.count} rows of {len(element.properties)} numbers",
+            f"{rows.shape[0]} rows of {rows.shape[1]}",
+            "Export or download it again.",
+        )
+    return rows

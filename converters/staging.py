@@ -1,0 +1,61 @@
+"""Outputs that appear whole or not at all: written beside their place under a temporary name, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from beam_warp.errors import OutputError
+
+
+def require_writable(path: Path) -> None:
+    """Refuse an output whose folder is missing or closed to us, before any work is done.
+
+    Raises:
+        OutputError: The folder does not exist or cannot be written, or the path is a folder itself.
+    """
+    folder = path.parent
+    if not folder.is_dir():
+        raise OutputError(f"output folder must exist, got {folder} for {path.name}. Create it first.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"output folder must be writable, got {folder}. Choose another or change its permissions.")
+    if path.is_dir():
+        raise OutputError(f"output must be a file, got the folder {path}. Name a file in it.")
+
+
+class Staging:
+    """Temporary names of the outputs of one call."""
+
+    def __init__(self) -> None:
+        """Start with no outputs."""
+        self.names: dict[Path, Path] = {}
+
+    def path_for(self, final: Path) -> Path:
+        """Return where to write an output for now."""
+        self.names[final] = final.with_name(f".{final.name}.{os.getpid()}.part")
+        return self.names[final]
+
+
+@contextmanager
+def staged_outputs() -> Iterator[Staging]:
+    """Hold outputs back until the block has ended well; then put them all in place.
+
+    Raises:
+        OutputError: The file system refused; every temporary file has been removed.
+    """
+    staging = Staging()
+    try:
+        yield staging
+        for final, temporary in staging.names.items():
+            temporary.replace(final)
+    except OSError as error:
+        if isinstance(error, OutputError) or not staging.names or error.filename is None:
+            raise
+        raise OutputError(
+            f"output must be writable, got {error.strerror} at {error.filename}. Free space or choose another folder."
+        ) from error
+    finally:
+        for temporary in staging.names.values():
+            temporary.unlink(missing_ok=True)

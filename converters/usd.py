@@ -1,0 +1,49 @@
+"""USD files: a thin row of the table; the schema room knows the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.axes import TARGETS, change_axes
+from beam_warp.converters.colors import resize_bands
+from beam_warp.converters.options import ReadOptions, WriteOptions
+from beam_warp.errors import InvalidOptionError
+from beam_warp.schema.reader import read_asset
+from beam_warp.schema.writer import write_asset
+
+
+def read(path: Path, options: ReadOptions) -> GaussianSequence:
+    """Read an asset; a stage states its own axes, units and activations.
+
+    Raises:
+        InvalidOptionError: An option says what the stage says itself.
+    """
+    given = [field.name for field in dataclasses.fields(options) if getattr(options, field.name)]
+    if given:
+        raise InvalidOptionError(
+            f"{', '.join(given)} must be left out for USD, which states it, got {path.name}. Drop the option."
+        )
+    return read_asset(path)
+
+
+def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list[Path]:
+    """Write an asset, y up and in metres.
+
+    Raises:
+        InvalidOptionError: Another target's axes are asked for.
+    """
+    if options.target not in (None, "usd"):
+        raise InvalidOptionError(
+            f"target must be usd for a USD output, got {options.target}. Write PLY for {options.target}."
+        )
+    axes, _ = TARGETS["usd"]
+
+    def prepared(frame: int) -> GaussianCloud:
+        cloud = change_axes(sequence[frame], axes)
+        if cloud.radiance is None:
+            return cloud
+        return cloud.with_arrays(radiance=resize_bands(cloud.radiance, options.sh_degree))
+
+    return write_asset(dataclasses.replace(sequence, read_frame=prepared), path, full_float=options.full_float)

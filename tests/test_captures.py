@@ -1,0 +1,186 @@
+"""Captures: poses and intrinsics come through exactly, images lazily, and every broken file in one line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from beam_warp.captures import Capture
+from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.images import write_exr
+
+INTRINSICS = {"w": 8, "h": 6, "fl_x": 10.0, "fl_y": 11.0, "cx": 4.0, "cy": 3.0}
+
+
+def opengl_pose(eye):
+    """At ``eye``, looking along +y with z up: right +x, up +z, back -y."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], float).T
+    pose[:3, 3] = eye
+    return pose.tolist()
+
+
+def write_capture(folder, records, **content):
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**INTRINSICS, "frames": records, **content}))
+    return path
+
+
+def record(**changes):
+    fields = {"file_path": "images/a/0000.exr", "transform_matrix": opengl_pose((1, -2, 3)), "camera": "a", "frame": 0}
+    return {**fields, **changes}
+
+
+def test_pose_turns_from_opengl_to_opencv(tmp_path):
+    write_capture(tmp_path, [record()])
+    camera = Capture.read(tmp_path).records[0].camera
+    np.testing.assert_array_equal(camera.position, (1, -2, 3))
+    np.testing.assert_array_equal(camera.forward, (0, 1, 0))
+    x, y, depth = camera.project([[1.5, 0, 4]])[0]  # half a metre to the right, one up, two ahead
+    assert (x, y, depth) == pytest.approx((4 + 10 * 0.25, 3 - 11 * 0.5, 2.0), abs=1e-12)
+
+
+def test_fields_of_a_performance(tmp_path):
+    truth = {"truth": "truth/a_0004.exr", "relit": {"studio": "truth/studio/a_0004.exr"}}
+    own = {"fl_x": 20.0, "k1": 0.1, "p2": -0.2}
+    (tmp_path / "environment.exr").touch()
+    write_capture(
+        tmp_path,
+        [record(split="train"), record(frame=4, time=0.5, split="test", **own, **truth)],
+        fps=24,
+        environment="environment.exr",
+    )
+    capture = Capture.read(tmp_path / "transforms.json")
+    first, second = capture.records
+    assert capture.frames == (0, 4)
+    assert capture.splits == ("test", "train")
+    assert capture.frames_per_second == 24.0
+    assert capture.environment_path == tmp_path / "environment.exr"
+    assert (first.name, first.camera.focal_x, first.is_distorted, first.truth_path) == ("a_0000", 10.0, False, None)
+    assert (second.name, second.camera.focal_x, second.time, second.split) == ("a_0004", 20.0, 0.5, "test")
+    assert second.distortion == (0.1, 0, 0, 0, 0, -0.2)
+    assert second.is_distorted
+    assert second.truth_path == tmp_path / "truth/a_0004.exr"
+    assert second.relit_paths == {"studio": tmp_path / "truth/studio/a_0004.exr"}
+    assert capture.select(split="test") == (second,)
+    assert capture.select(frames=[0, 1]) == (first,)
+    with pytest.raises(MissingFileError, match="truth must be given for a_0000, got none"):
+        first.truth()
+
+
+def test_plain_nerfstudio_file(tmp_path):
+    entry = {"file_path": "./images/frame_01.png", "transform_matrix": opengl_pose((0, 0, 0))}
+    write_capture(
+        tmp_path, [entry, {**entry, "file_path": "images/frame_02.png"}], test_filenames=["images/frame_02.png"]
+    )
+    capture = Capture.read(tmp_path)
+    assert [(r.name, r.split) for r in capture.records] == [
+        ("images_frame_01_0000", "train"),
+        ("images_frame_02_0000", "test"),
+    ]
+    assert capture.frames_per_second is None
+    assert capture.environment_path is None
+
+
+def test_images_are_read_when_asked_for(tmp_path):
+    write_capture(tmp_path, [record(), record(frame=1, file_path="images/a/0001.exr")])
+    capture = Capture.read(tmp_path)
+    with pytest.raises(MissingFileError):
+        capture.records[0].image()
+    (tmp_path / "images/a").mkdir(parents=True)
+    write_exr(tmp_path / "images/a/0000.exr", {name: np.full((6, 8), 0.5) for name in "RGBA"})
+    assert capture.records[0].image().linear_rgba().shape == (6, 8, 4)
+    write_exr(tmp_path / "images/a/0001.exr", {name: np.full((6, 9), 0.5) for name in "RGBA"})
+    with pytest.raises(AssetFormatError, match=r"image must be 8 x 6 .* got 9 x 6 at .*0001\.exr"):
+        capture.records[1].image()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transform_matrix": None}, "transform_matrix must be a 4 x 4 matrix of finite numbers, got nothing"),
+        ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix must be a 4 x 4 matrix"),
+        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "of finite numbers, got"),
+        ({"transform_matrix": (2 * np.eye(4)).tolist()}, "transform_matrix is no camera pose"),
+        ({"file_path": None}, "file_path must be a text, got nothing"),
+        ({"file_path": 7}, "file_path must be a text, got 7"),
+        ({"fl_x": "wide"}, r"fl_x must be a number in \[0.001, 1e\+09\], got 'wide'"),
+        ({"fl_y": 0}, "fl_y must be a number"),
+        ({"cx": float("nan")}, "cx must be a number"),
+        ({"w": 7.5}, "w must be an integer, got 7.5"),
+        ({"h": 10**30}, "h must be a number"),
+        ({"frame": -1}, "frame must be a number"),
+        ({"frame": True}, "frame must be a number"),
+        ({"k1": []}, "k1 must be a number"),
+        ({"camera": "../../evil"}, "camera must be fit for a file name, got '../../evil'"),
+        ({"camera": ".."}, "camera must be fit for a file name"),
+        ({"relit": ["x"]}, "relit must be an object of file names"),
+        ({"file_path": ".", "camera": None}, "camera must be a text, got"),
+        ({"truth": 3}, "truth must be a text"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model must be one of OPENCV, PINHOLE, SIMPLE_PINHOLE"),
+    ],
+)
+def test_a_broken_record_is_named(tmp_path, changes, message):
+    write_capture(tmp_path, [record(), record(camera="b", **changes) if "camera" not in changes else record(**changes)])
+    with pytest.raises(AssetFormatError, match=message) as caught:
+        Capture.read(tmp_path)
+    assert f"{tmp_path / 'transforms.json'}, frames[1]" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_intrinsic_is_named(tmp_path):
+    path = write_capture(tmp_path, [record()])
+    content = json.loads(path.read_text())
+    del content["fl_y"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(AssetFormatError, match=r"fl_y must be a number in .*, got nothing at .*frames\[0\]"):
+        Capture.read(tmp_path)
+
+
+def test_the_same_camera_and_frame_twice(tmp_path):
+    write_capture(tmp_path, [record(), record()])
+    with pytest.raises(AssetFormatError, match=r"got a_0000 at .*frames\[1\] and frames\[0\]"):
+        Capture.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"{", "capture must be JSON in UTF-8"),
+        (b"\xff\xfe", "capture must be JSON in UTF-8"),
+        (b"[" * 100_000, "capture must be JSON in UTF-8"),
+        (b"[]", r"capture must be a JSON object, got \[\]"),
+        (b"{}", "frames must be a list of 1 to 4194304 records, got None"),
+        (b'{"frames": []}', "frames must be a list of 1 to 4194304 records, got 0"),
+        (b'{"frames": [3]}', "record must be an object, got 3 at"),
+        (b'{"frames": [{}], "test_filenames": 3}', "test_filenames must be a list of texts, got 3"),
+    ],
+)
+def test_a_broken_file_is_one_line(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_bytes(text)
+    with pytest.raises(AssetFormatError, match=message) as caught:
+        Capture.read(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files(tmp_path):
+    with pytest.raises(MissingFileError, match=r"capture must be a folder with transforms\.json, got"):
+        Capture.read(tmp_path)
+    with pytest.raises(MissingFileError, match="capture must be a folder"):
+        Capture.read(tmp_path / "nowhere")
+    write_capture(tmp_path, [record()], environment="sky.exr")
+    with pytest.raises(MissingFileError, match=r"environment must be a file, got .*sky\.exr"):
+        Capture.read(tmp_path)
+
+
+def test_the_walker(data_dir):
+    capture = Capture.read(data_dir / "captures" / "walker")
+    assert len(capture.records) == 152
+    assert capture.frames == (0, 1, 2, 3, 4, 5)
+    test = [r for r in capture.select(split="test") if r.truth_path is not None]
+    assert len(test) == 8
+    for row in test[:2]:
+        coverage = row.image().alpha
+        assert coverage is not None
+        # Two renders of one view with different samples: they differ at the silhouette, a few percent of the pixels.
+        assert np.abs(coverage - row.truth().channels["A"]).mean() < 1e-2
