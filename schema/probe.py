@@ -74,7 +74,8 @@ def _limit_memory(path: Path) -> None:
     except ImportError:  # Windows has no such limit
         return
     size = sum(file.stat().st_size for file in path.parent.glob(f"{path.stem}*") if file.is_file())
-    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE + 4 * size,) * 2)
+    limit = ADDRESS_SPACE + 4 * size
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -53,7 +52,7 @@ def publish(folder: Path, names: list[str], destination: Path) -> list[Path]:
             path = destination / name
             if not path.exists():
                 fresh.append(path)
-            os.replace(folder / name, path)
+            (folder / name).replace(path)
             published.append(path)
     except BaseException:
         for path in fresh:
