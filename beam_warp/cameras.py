@@ -217,9 +217,9 @@ class Camera:
         vertical_fov: float = 35.0,
         margin: float = 1.1,
     ) -> Camera:
-        """Place an orbit camera so near that the cloud just fills the image.
+        """Place an orbit camera so near that a cloud just fills the image.
 
-        Trained clouds carry stray Gaussians far off: see `bulk` for which positions count.
+        Trained clouds carry stray Gaussians far off: `bulk` says which positions count.
 
         Args:
             positions: Centres [m], ``(N, 3)`` with N at least 1.
@@ -235,7 +235,44 @@ class Camera:
             InvalidArrayError: An array breaks its contract, or there is no Gaussian.
             InvalidOptionError: An angle, the margin or a size is out of range.
         """
-        kept = bulk(positions, opacities)
+        return cls.frame_points(
+            bulk(positions, opacities),
+            azimuth=azimuth,
+            elevation=elevation,
+            width=width,
+            height=height,
+            vertical_fov=vertical_fov,
+            margin=margin,
+        )
+
+    @classmethod
+    def frame_points(
+        cls,
+        points: ArrayLike,
+        *,
+        azimuth: float = 0.0,
+        elevation: float = 0.0,
+        width: int,
+        height: int,
+        vertical_fov: float = 35.0,
+        margin: float = 1.1,
+    ) -> Camera:
+        """Place an orbit camera so near that points just fill the image; all of them count.
+
+        Args:
+            points: World positions [m], ``(N, 3)`` with N at least 1.
+            azimuth: See `orbit` [degree].
+            elevation: See `orbit` [degree].
+            width: Image width [pixel].
+            height: Image height [pixel].
+            vertical_fov: Angle between the top and bottom edges of the image [degree].
+            margin: Half the image over the half that the points may fill, at least 1.
+
+        Raises:
+            InvalidArrayError: ``points`` breaks its contract, or is empty.
+            InvalidOptionError: An angle, the margin or a size is out of range.
+        """
+        kept = _require_points("points", points)
         center = 0.5 * (kept.min(axis=0) + kept.max(axis=0))
         room = require_number("margin", margin, 1.0, 100.0)
         trial = cls.orbit(
@@ -249,7 +286,7 @@ class Camera:
         )
         extent = float(np.linalg.norm(kept.max(axis=0) - kept.min(axis=0)))
         distance = max(float((needed - offset[:, 2]).max()), 1.05 * float(-offset[:, 2].min()), 1e-3 * extent)
-        if not distance > 0.0:  # every kept position is the same point: any distance frames it
+        if not distance > 0.0:  # every point is the same: any distance frames it
             distance = 1.0
         return cls.orbit(center, distance, azimuth, elevation, width=width, height=height, vertical_fov=vertical_fov)
 
@@ -270,12 +307,7 @@ def bulk(positions: ArrayLike, opacities: ArrayLike | None = None) -> NDArray[np
     Raises:
         InvalidArrayError: An array breaks its contract, or there is no Gaussian.
     """
-    points = require_array("positions", positions, (None, 3), np.float64)
-    if not len(points):
-        raise InvalidArrayError(
-            "positions must hold at least one Gaussian, got none. Check that the asset is not empty."
-        )
-    require_finite("positions", points)
+    points = _require_points("positions", positions)
     if opacities is None:
         weights = np.ones(len(points))
     else:
@@ -307,6 +339,15 @@ def _orbit_directions(azimuth: float, elevation: float) -> tuple[NDArray[np.floa
     ground = np.array([np.sin(a), -np.cos(a), 0.0])
     zenith = np.array([0.0, 0.0, 1.0])
     return np.cos(e) * ground + np.sin(e) * zenith, np.cos(e) * zenith - np.sin(e) * ground
+
+
+def _require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return one or more finite points, ``(N, 3)``."""
+    points = require_array(name, value, (None, 3), np.float64)
+    if not len(points):
+        raise InvalidArrayError(f"{name} must hold at least one point, got none. Check that the asset is not empty.")
+    require_finite(name, points)
+    return points
 
 
 def _point(name: str, value: ArrayLike) -> NDArray[np.float64]:

@@ -69,6 +69,25 @@ class GBuffer:
     depth: NDArray[np.float32]
     channels: Mapping[str, NDArray[np.float32]]
 
+    def layers(self) -> dict[str, NDArray[np.float32]]:
+        """Return alpha, depth and the material channels as the layers of an image file, ``(H, W)`` each.
+
+        Names: ``A``, ``depth``, ``roughness``, ``ambient_occlusion``, ``base_color.R`` …, ``normal.X`` …; values as
+        they are here, not multiplied by alpha.
+        """
+        layers = {"A": self.alpha, "depth": self.depth}
+        for name, array in self.channels.items():
+            prefix, parts = _LAYER_PARTS.get(name, (name, "RGB"))
+            if array.ndim == 2:
+                layers[prefix] = array
+            else:
+                layers.update({f"{prefix}.{part}": array[..., i] for i, part in enumerate(parts)})
+        return layers
+
+
+_LAYER_PARTS = {"normals": ("normal", "XYZ")}
+"""Channels whose layers are named otherwise than NAME.R, NAME.G and NAME.B."""
+
 
 def rasterize(
     cloud: GaussianCloud,

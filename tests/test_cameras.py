@@ -106,5 +106,5 @@ def test_errors_name_the_contract():
         Camera.look_at((0, 1, 1), (0, 0, 0), width=4, height=4, vertical_fov=180.0)
     with pytest.raises(InvalidOptionError, match="elevation must be a number"):
         Camera.orbit((0, 0, 0), 1.0, 0.0, 91.0, **SIZE)
-    with pytest.raises(InvalidArrayError, match="positions must hold at least one Gaussian"):
+    with pytest.raises(InvalidArrayError, match="positions must hold at least one point"):
         Camera.frame_cloud(np.zeros((0, 3)), width=4, height=4)

@@ -231,6 +231,22 @@ def test_channels_are_means_whatever_the_coverage(device, rng):
         np.testing.assert_allclose(buffer.channels[name][covered] - expected, 0.0, atol=WEIGHT_ROUNDING)
         assert not buffer.channels[name][~covered].any()
     assert buffer.channels["roughness"].shape == (40, 40)
+    layers = buffer.layers()
+    assert sorted(layers) == sorted(
+        [
+            "A",
+            "depth",
+            "roughness",
+            "ambient_occlusion",
+            "base_color.R",
+            "base_color.G",
+            "base_color.B",
+            "normal.X",
+            "normal.Y",
+            "normal.Z",
+        ]
+    )
+    np.testing.assert_array_equal(layers["normal.Z"], buffer.channels["normals"][..., 2])
     occlusion = buffer.channels["ambient_occlusion"][covered]
     assert occlusion.min() >= 0.0
     assert occlusion.max() <= 1.0
