@@ -7,7 +7,7 @@ persist. Nothing is divided by a small number: what was hardly lit or never seen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, Observability
 from beam_warp.brdf import specular_albedo_table
-from beam_warp.checks import require_count, require_number
+from beam_warp.checks import require_count
 from beam_warp.devices import upload
 from beam_warp.environment_sampling import environment_blocks
 from beam_warp.environments import EnvironmentMap
@@ -395,11 +395,14 @@ def _fill_from_neighbors(
     return filled, spread
 
 
-REFERENCE_WHITE = 0.8
-"""Base colour that the brightest surfaces get when the exposure of the capture is unknown: white cloth, fresh paper."""
+BRIGHTEST = (0.95, 0.8)
+"""Quantile of the largest channel, and the base colour it may reach: white cloth, fresh paper."""
 
-REFERENCE_PART = 0.98
-"""What counts as the brightest surfaces: this quantile of the largest channel."""
+DARKEST = (0.1, 0.02)
+"""Quantile of the mean of the channels, and the base colour it has at least: black cloth, asphalt."""
+
+EXPOSURE_FACTORS = np.exp2(np.arange(-10.0, 10.0 + 1e-9, 1.0 / 16.0))
+"""Candidates of `estimate_exposure`, a sixteenth of a stop apart."""
 
 
 def estimate_exposure(
@@ -414,9 +417,12 @@ def estimate_exposure(
 ) -> float:
     """Find the factor on an environment that makes display-referred captured colour physically plausible.
 
-    Display-referred colour has no absolute scale, so base colour has none either. The factor is chosen such that the
-    brightest surfaces, by quantile, have a base colour of `REFERENCE_WHITE`; the specular part makes the relation
-    nonlinear, so two steps are taken.
+    Display-referred colour has no absolute scale, so base colour has none either. The factor is the smaller of two:
+    the light under which the brightest surfaces come out white (more would darken everything), and the most light
+    under which the darkest still reflect more than their specular lobe alone (more would make them negative).
+
+    For light s times the environment, sum w L_D (L_o - L_S) / s = A - s B: two measurements with the same rays give
+    A and B, and with them the base colour under every s.
 
     Args:
         cloud: Gaussians with captured radiance.
@@ -424,25 +430,45 @@ def estimate_exposure(
         surface: Their normals.
         roughness: Their roughness.
         environment: The light of the capture up to a factor.
-        options: Rays, offset, bounce, seed.
+        options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
         subset: Gaussians to look at, spread evenly over the cloud.
 
     Returns:
         A positive factor; 1 where nothing was observed.
     """
     rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(subset, len(cloud))).astype(np.int64))
-    factor = 1.0
-    for _ in range(2):
-        light = PreparedLight.from_environment(environment.scaled(factor), scene.device)
-        measured = measure_materials(cloud, scene, surface, roughness, light, options=options, rows=rows)
-        evidence = measured.evidence
-        good = (evidence.denominator > 0.0).all(axis=1) & (evidence.openness > BURIED_VISIBILITY)
-        good &= evidence.irradiance.mean(axis=1) > UNLIT_PART * light.mean_irradiance
-        if not good.any():
-            return 1.0
-        albedo = (evidence.numerator[good] / evidence.denominator[good]).max(axis=1)
-        brightest = float(np.quantile(albedo, REFERENCE_PART))
-        if not (brightest > 0.0):
-            return 1.0
-        factor *= require_number("exposure", brightest / REFERENCE_WHITE, 1e-6, 1e6)
-    return factor
+    direct = replace(options, bounce=False)
+    full, half = (
+        measure_materials(
+            cloud,
+            scene,
+            surface,
+            roughness,
+            PreparedLight.from_environment(environment.scaled(factor), scene.device),
+            options=direct,
+            rows=rows,
+        ).evidence
+        for factor in (1.0, 0.5)
+    )
+    good = (full.denominator > 0.0).all(axis=1)
+    if not good.any():
+        return 1.0
+    specular = 2.0 * (2.0 * half.numerator - full.numerator)[good].astype(np.float64)
+    captured = full.numerator[good] + specular
+    # Well lit and opaque Gaussians say most: where the assumed light hardly reaches, the quotient is arbitrary.
+    weight = full.irradiance[good].mean(axis=1) * cloud.opacities[rows][good]
+
+    def quantile(values: NDArray[np.float64], part: float) -> float:
+        order = np.argsort(values)
+        return float(values[order][np.searchsorted(np.cumsum(weight[order]), part * weight.sum())])
+
+    chosen = float(EXPOSURE_FACTORS[0])
+    for factor in EXPOSURE_FACTORS:
+        base_color = (captured - factor * specular) / (factor * full.denominator[good])
+        chosen = float(factor)
+        if not (
+            quantile(base_color.max(axis=1), BRIGHTEST[0]) > BRIGHTEST[1]
+            and quantile(base_color.mean(axis=1), DARKEST[0]) > DARKEST[1]
+        ):
+            break
+    return chosen
