@@ -247,3 +247,51 @@ def test_a_thousand_million_vertices_ask_for_no_memory(columns, ply_bytes, tmp_p
     assert code == 2
     assert "the 1000000000 rows that the header counts" in finished.stderr
     assert grown_kib < 16 * 1024  # the reader's modules; the rows would be 56 GB
+
+
+def mutations(content, count, seed):
+    """Damaged copies: bytes changed, cut out, doubled, and numbers of the header replaced."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        damaged = bytearray(content)
+        for _ in range(rng.integers(1, 3)):
+            at, length = int(rng.integers(len(damaged))), int(rng.integers(1, 9))
+            match int(rng.integers(-4, 4)):
+                case -4 | -3 | -2 | -1 | 0:
+                    damaged[at] = int(rng.integers(256))
+                case 1:
+                    del damaged[at : at + length]
+                case 2:
+                    damaged[at:at] = damaged[at : at + length]
+                case 3:
+                    damaged[at : at + length] = rng.choice([b"-1", b"99999999", b"\n", b" list ", b"nan", b"\0"])
+        yield bytes(damaged)
+
+
+@pytest.mark.parametrize("kind", ["binary", "text", "packed"])
+def test_damaged_files_are_read_or_refused(columns, ply_bytes, tmp_path, kind):
+    names = list(columns)
+    if kind == "binary":
+        content = ply_bytes(columns, comments=["beam_axes rub", "beam_frame 0 24"])
+    elif kind == "text":
+        rows = "".join(" ".join(str(columns[name][row]) for name in names) + "\n" for row in range(3))
+        header = "".join(f"property float {name}\n" for name in names)
+        content = f"ply\nformat ascii 1.0\nelement vertex 3\n{header}end_header\n{rows}".encode()
+    else:
+        words = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+        bounds = [f"{end}{group}{axis}" for group in ("_", "_scale_") for end in ("min", "max") for axis in "xyz"]
+        header = "element chunk 1\n" + "".join(f"property float {name}\n" for name in bounds)
+        header += "element vertex 2\n" + "".join(f"property uint {name}\n" for name in words)
+        body = np.linspace(-3.0, 3.0, 12, dtype="<f4").tobytes() + bytes(range(32))
+        content = f"ply\nformat binary_little_endian 1.0\n{header}end_header\n".encode() + body
+    refusals = []
+    for damaged in mutations(content, 400, seed=len(content)):
+        (tmp_path / "a.ply").write_bytes(damaged)
+        started = time.perf_counter()
+        try:
+            converters.read(tmp_path / "a.ply")
+        except AssetFormatError as error:
+            refusals.append(str(error))
+        assert time.perf_counter() - started < 2.0
+    assert all(message.startswith("a.ply: ") for message in refusals)
+    assert 40 < len(refusals) < 400  # the damage is neither harmless nor always fatal

@@ -110,7 +110,11 @@ def schema_room(monkeypatch):
     seen = {}
 
     def write_asset(sequence, path, *, full_float=False):
-        seen.update(frames=[sequence[frame] for frame in range(len(sequence))], full_float=full_float)
+        seen.update(
+            metadata=sequence.metadata,
+            frames=[sequence[frame] for frame in range(len(sequence))],
+            full_float=full_float,
+        )
         return [path]
 
     def read_asset(path):
@@ -128,15 +132,15 @@ def schema_room(monkeypatch):
 
 def test_usd_gets_y_up_metres_and_the_asked_bands(schema_room, make_cloud, tmp_path):
     cloud = make_cloud(axes="rdf", degree=1)
-    paths = converters.write(
-        GaussianSequence.from_clouds([cloud]), tmp_path / "a.usda", WriteOptions(sh_degree=2, full_float=True)
-    )
+    sequence = GaussianSequence.from_clouds([cloud], metadata={"producer": "somebody", "notes": "of another file"})
+    paths = converters.write(sequence, tmp_path / "a.usda", WriteOptions(sh_degree=2, full_float=True))
     assert paths == [tmp_path / "a.usda"]
     assert schema_room["full_float"]
     (written,) = schema_room["frames"]
     assert written.axes == "rub"
     assert np.array_equal(written.positions, cloud.positions * [1, -1, -1])
     assert written.sh_degree == 2
+    assert schema_room["metadata"] == {"producer": "somebody"}
 
 
 def test_usd_states_its_own_axes(schema_room, make_cloud, tmp_path):
