@@ -15,13 +15,23 @@ if TYPE_CHECKING:
     from beam_warp.assets import GaussianCloud as GaussianCloud
     from beam_warp.assets import GaussianSequence as GaussianSequence
     from beam_warp.assets import Observability as Observability
+    from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
+    from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
+    from beam_warp.lighting import ambient_occlusion as ambient_occlusion
+    from beam_warp.scene import Scene as Scene
+    from beam_warp.tracing import visibility as visibility
 
 _HOMES = {
+    "AmbientOcclusion": "lighting",
+    "EnvironmentMap": "environments",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
     "Observability": "assets",
     "BeamError": "errors",
+    "Scene": "scene",
+    "ambient_occlusion": "lighting",
+    "visibility": "tracing",
 }
 """Public name → the module that defines it."""
 

@@ -1,0 +1,258 @@
+"""What a layer says: the stage's metadata, the two prims, their tokens, and the arrays of a frame.
+
+Everything is authored through Sdf with its type spelled out, so the result does not depend on whether OpenUSD knows
+our schema, and each layer is complete for a host that does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Vt
+
+from beam_warp._version import __version__
+from beam_warp.assets import LINEAR_REC709, GaussianCloud, GaussianSequence
+from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
+from beam_warp.schema.layout import (
+    ASSET_PATH,
+    CHANNELS,
+    HALF_EPSILON,
+    SH_DEGREE,
+    SPLAT_TYPE,
+    SPLATS_PATH,
+    to_vt,
+)
+from beam_warp.schema.survey import UP_AXES, Survey, display_color, stored_arrays
+
+KERNEL_EXTENT = 3.0
+"""OpenUSD's Gaussian kernel ends at three standard deviations."""
+
+_BASE_COLOR_SPACE = {"color3f[]": LINEAR_REC709, "color3h[]": LINEAR_REC709}
+
+NORMAL_SOURCES = ("authored", "shortestAxis")
+ROUGHNESS_SOURCES = ("unknown", "texture", "estimated", "constant")
+RADIANCE_MEANINGS = ("captured", "shaded")
+
+
+@dataclass(frozen=True)
+class AssetContents:
+    """A sequence and everything that was decided about it before the first layer is written.
+
+    Attributes:
+        sequence: Source of the frames.
+        survey: What the sequence holds.
+        half: Names of the arrays that are written in half precision.
+        segment_length: Frames in one value clip; 0 if the asset has none.
+    """
+
+    sequence: GaussianSequence
+    survey: Survey
+    half: frozenset[str]
+    segment_length: int = 0
+
+    def attribute(self, name: str) -> tuple[str, str]:
+        """Name and USD type of the variant that holds an array."""
+        channel = CHANNELS[name]
+        if name in self.half and channel.half_type_name is not None:
+            return channel.usd_name + "h", channel.half_type_name
+        return channel.usd_name, channel.type_name
+
+    @property
+    def varying(self) -> frozenset[str]:
+        """Names of the arrays that have time samples, the extent included."""
+        moves = not self.survey.varying.isdisjoint({"positions", "orientations", "scales"})
+        return self.survey.varying | ({"extent"} if moves else set())
+
+    @property
+    def byte_count(self) -> int:
+        """Bytes of all arrays, without the small rest of the layers."""
+        total = 0
+        for name in self.survey.names:
+            rows = sum(self.survey.counts) if name in self.survey.varying else self.survey.counts[0]
+            terms = (self.survey.sh_degree + 1) ** 2 if name == "radiance" else 1
+            width = {"ids": 8, "observability": 1}.get(name, 2 if name in self.half else 4)
+            total += rows * terms * CHANNELS[name].columns * width
+        return total
+
+    def frames(self) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+        """Read every frame in order, as it is stored.
+
+        Where rows keep their identity, a quaternion takes the sign that is nearer to its predecessor: engines that
+        blend components would otherwise spin the Gaussian.
+        """
+        keep_signs = self.sequence.topology == "constant" and "orientations" in self.survey.varying
+        previous: NDArray[Any] | None = None
+        for frame in range(len(self.sequence)):
+            arrays = self.stored(self.sequence[frame])
+            if keep_signs:
+                current = arrays["orientations"]
+                if previous is not None:
+                    opposite = np.einsum("nk,nk->n", previous, current, dtype=np.float64) < 0.0
+                    current = np.where(opposite[:, None], -current, current)
+                previous = arrays["orientations"] = current
+            yield frame, arrays
+
+    def stored(self, cloud: GaussianCloud) -> dict[str, NDArray[Any]]:
+        """Return a cloud's arrays in the shape and precision in which they are written, and its extent."""
+        arrays = stored_arrays(cloud)
+        missing = (self.survey.sh_degree + 1) ** 2 - arrays["radiance"].shape[1]
+        padded = np.pad(arrays["radiance"], ((0, 0), (0, missing), (0, 0)))
+        arrays["radiance"] = padded.reshape(-1, 3)
+        for name in self.half & arrays.keys():
+            if name in ("orientations", "normals"):
+                arrays[name] = _nearly_unit(arrays[name])
+            arrays[name] = arrays[name].astype(np.float16)
+        arrays["extent"] = _extent(cloud)
+        return arrays
+
+
+def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:
+    """Say how the stage is scaled, turned and timed; every layer says the same, or USD would retime references."""
+    rate = float(contents.sequence.frames_per_second)
+    layer.defaultPrim = ASSET_PATH.strip("/")
+    layer.timeCodesPerSecond = rate
+    layer.framesPerSecond = rate
+    layer.startTimeCode = 0.0
+    layer.endTimeCode = float(len(contents.sequence) - 1)
+    root = layer.pseudoRoot
+    root.SetInfo("metersPerUnit", 1.0)
+    root.SetInfo("upAxis", UP_AXES[contents.survey.axes])
+
+
+def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
+    """Define /Asset: how the sequence plays and where it came from."""
+    sequence, metadata = contents.sequence, contents.sequence.metadata
+    prim = _define(layer, ASSET_PATH, "Xform", SEQUENCE_API)
+    prim.SetInfo("kind", "component")
+    prim.SetInfo("customData", {"beam": {str(key): str(value) for key, value in metadata.items()}})
+    for name, type_name, value in (
+        ("frameCount", "int", len(sequence)),
+        ("framesPerSecond", "double", float(sequence.frames_per_second)),
+        ("topology", "token", sequence.topology),
+        ("segmentLength", "int", contents.segment_length),
+        ("sourceAxes", "token", metadata.get("source_axes", contents.survey.axes)),
+        ("sourceUnits", "token", metadata.get("source_units", "m")),
+        ("generator", "string", f"beam-warp {__version__}"),
+    ):
+        _uniform(prim, f"beam:sequence:{name}", type_name, value)
+
+
+def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
+    """Define /Asset/Splats: tokens, hints, constant arrays, and the declarations of what varies.
+
+    Varying attributes are declared without a value, so that a host that does not know our schema still types them.
+    """
+    survey, metadata = contents.survey, contents.sequence.metadata
+    prim = _define(layer, SPLATS_PATH, SPLAT_TYPE, MATERIAL_API, "ColorSpaceAPI")
+    normals = "normals" in survey.names
+    meaning = _choice(metadata, "radiance_meaning", RADIANCE_MEANINGS) if survey.captured else "baseColorOnly"
+    for name, type_name, value in (
+        ("projectionModeHint", "token", "perspective"),
+        ("sortingModeHint", "token", "cameraDistance"),
+        (SH_DEGREE, "int", survey.sh_degree),
+        ("colorSpace:name", "token", survey.color_space),
+        ("beam:schemaVersion", "token", SCHEMA_VERSION),
+        ("beam:brdf", "token", "ggx-metallic-roughness"),
+        ("beam:aoMeaning", "token", "hemisphericalVisibility"),
+        ("beam:normalSource", "token", _choice(metadata, "normal_source", NORMAL_SOURCES) if normals else "none"),
+        ("beam:roughnessSource", "token", _choice(metadata, "roughness_source", ROUGHNESS_SOURCES)),
+        ("beam:radianceMeaning", "token", meaning),
+        ("beam:radianceColorSpace", "token", survey.color_space),
+    ):
+        _uniform(prim, name, type_name, value)
+    first = contents.sequence[0]
+    color = Sdf.AttributeSpec(prim, "primvars:displayColor", Sdf.ValueTypeNames.Color3fArray)
+    color.SetInfo("interpolation", "constant")
+    color.colorSpace = LINEAR_REC709
+    color.default = to_vt("color3f[]", display_color(first)[None])
+    author_declarations(prim, contents, (*survey.names, "extent"))
+    arrays = contents.stored(first)
+    for name in (*survey.names, "extent"):
+        if name not in contents.varying:
+            usd_name, type_name = _attribute(contents, name)
+            prim.attributes[usd_name].default = to_vt(type_name, arrays[name])
+
+
+def author_declarations(prim: Sdf.PrimSpec, contents: AssetContents, names: tuple[str, ...]) -> None:
+    """Declare array attributes with their types and colour spaces, without values."""
+    for name in names:
+        usd_name, type_name = _attribute(contents, name)
+        spec = Sdf.AttributeSpec(prim, usd_name, Sdf.ValueTypeNames.Find(type_name))
+        if type_name in _BASE_COLOR_SPACE:
+            spec.colorSpace = _BASE_COLOR_SPACE[type_name]
+
+
+def author_frame(layer: Sdf.Layer, contents: AssetContents, frame: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Add one frame's time samples of what varies."""
+    for name in sorted(contents.varying):
+        usd_name, type_name = _attribute(contents, name)
+        layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), to_vt(type_name, arrays[name]))
+
+
+def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, str]], last_frame: int) -> None:
+    """Say which binary layer holds which frames.
+
+    Clips are explicit and their times the identity over the whole range: template clips with a stride freeze after
+    the start of the last segment.
+    """
+    clips = {
+        "primPath": SPLATS_PATH,
+        "manifestAssetPath": Sdf.AssetPath(manifest),
+        "assetPaths": Sdf.AssetPathArray([Sdf.AssetPath(path) for _, path in segments]),
+        "active": Vt.Vec2dArray([(float(start), float(index)) for index, (start, _) in enumerate(segments)]),
+        "times": Vt.Vec2dArray([(0.0, 0.0), (float(last_frame), float(last_frame))]),
+    }
+    prim.SetInfo("clips", {"default": clips})
+
+
+def _attribute(contents: AssetContents, name: str) -> tuple[str, str]:
+    return ("extent", "float3[]") if name == "extent" else contents.attribute(name)
+
+
+def _define(layer: Sdf.Layer, path: str, type_name: str, *schemas: str) -> Sdf.PrimSpec:
+    prim = Sdf.CreatePrimInLayer(layer, path)
+    prim.specifier = Sdf.SpecifierDef
+    prim.typeName = type_name
+    prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=list(schemas)))
+    return prim
+
+
+def _uniform(prim: Sdf.PrimSpec, name: str, type_name: str, value: Any) -> None:
+    spec = Sdf.AttributeSpec(prim, name, Sdf.ValueTypeNames.Find(type_name), Sdf.VariabilityUniform)
+    spec.default = value
+
+
+def _choice(metadata: Mapping[str, str], key: str, choices: tuple[str, ...]) -> str:
+    """Take a token from the metadata; what is absent or another word is the first choice (the word itself is kept in
+    the metadata)."""
+    value = metadata.get(key, choices[0])
+    return value if value in choices else choices[0]
+
+
+def _nearly_unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Renormalise the rows that are further from unit length than rounding to half explains.
+
+    Rows that came from half stay as they are: writing what was read changes no bit.
+    """
+    length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+    return np.where(np.abs(length - 1.0) > HALF_EPSILON, vectors / length, vectors).astype(np.float32)
+
+
+def _extent(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
+    if not len(cloud):
+        return np.zeros((2, 3), np.float32)
+    x, y, z, w = cloud.orientations.astype(np.float64).T
+    rotation = np.empty((len(cloud), 3, 3))
+    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
+    rotation[:, 1] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1)
+    rotation[:, 2] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+    reach = KERNEL_EXTENT * np.linalg.norm(rotation * cloud.scales[:, None, :], axis=2)
+    low, high = (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+    return np.stack(
+        [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]
+    ).astype(np.float32)

@@ -1,0 +1,235 @@
+"""Rules about the arrays of one frame: lengths, finiteness, ranges, unit lengths, and what may change between frames.
+
+A value that is not finite breaks one rule only: the others look past it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.assets import Observability
+from beam_warp.checks import UNIT_TOLERANCE
+from beam_warp.schema.rules import Fault, rule
+
+KNOWN_FLAGS = sum(Observability)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Arrays of a prim at one time, as stored.
+
+    Attributes:
+        arrays: By the names of `beam_warp.schema.layout.CHANNELS`; what has no value is left out.
+        changed: Names of those that can differ from the previous frame; in the first frame all.
+        attributes: The name of the authored variant of each array.
+        extent: ``(2, 3)``, or None.
+        sh_degree: As authored, or None.
+        constant_topology: True if the asset says that rows keep their identity.
+        previous: Arrays of the frame before, or None.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    changed: frozenset[str]
+    attributes: Mapping[str, str]
+    extent: NDArray[Any] | None
+    sh_degree: int | None
+    constant_topology: bool
+    previous: Mapping[str, NDArray[Any]] | None
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.arrays.get("positions", ()))
+
+    def to_check(self, *names: str) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Yield the attribute name and the array of those names that are there and may have changed."""
+        for name in names or tuple(self.arrays):
+            if name in self.changed and name in self.arrays:
+                yield self.attributes[name], self.arrays[name]
+
+
+@rule("BEAM-GEO-010", "error", "frame")
+def _lengths(frame: Frame) -> Iterator[Fault]:
+    """Every array has one element for each position: USD ignores shorter ones."""
+    for name, array in frame.arrays.items():
+        if name != "radiance" and len(array) != frame.count:
+            yield Fault(
+                f"the array must have {frame.count} elements, got {len(array)}. Write one each.", frame.attributes[name]
+            )
+
+
+@rule("BEAM-GEO-011", "error", "frame")
+def _finite(frame: Frame) -> Iterator[Fault]:
+    """No array holds NaN or infinity."""
+    for name, array in frame.to_check():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            row = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0]
+            yield Fault(f"values must be finite, got NaN or infinity at element {row}. Drop that Gaussian.", name)
+
+
+@rule("BEAM-GEO-012", "error", "frame")
+def _unit_quaternions(frame: Frame) -> Iterator[Fault]:
+    """Orientations are unit quaternions."""
+    return _unit(frame, "orientations")
+
+
+@rule("BEAM-GEO-013", "error", "frame")
+def _scales(frame: Frame) -> Iterator[Fault]:
+    """Scales are linear and not negative (logarithms would be)."""
+    return _range(frame, 0.0, np.inf, "scales")
+
+
+@rule("BEAM-GEO-014", "error", "frame")
+def _opacities(frame: Frame) -> Iterator[Fault]:
+    """Opacities are linear, in [0, 1] (logits are not)."""
+    return _range(frame, 0.0, 1.0, "opacities")
+
+
+@rule("BEAM-GEO-015", "error", "frame")
+def _extent(frame: Frame) -> Iterator[Fault]:
+    """extent is a box that contains every position."""
+    if frame.extent is None or not frame.count:
+        return
+    positions = frame.arrays["positions"]
+    held = positions[np.isfinite(positions).all(axis=1)]
+    whole = frame.extent.shape == (2, 3)
+    if not whole or (len(held) and not ((held >= frame.extent[0]) & (held <= frame.extent[1])).all()):
+        yield Fault("extent must contain every position, got one outside. Compute it for each frame.", "extent")
+
+
+@rule("BEAM-GEO-016", "warning", "frame")
+def _not_empty(frame: Frame) -> Iterator[Fault]:
+    """A frame holds at least one Gaussian."""
+    if not frame.count:
+        yield Fault("a frame should hold Gaussians, got none. Leave the frame out, or hide the prim.", "positions")
+
+
+@rule("BEAM-SH-002", "error", "frame")
+def _sh_size(frame: Frame) -> Iterator[Fault]:
+    """There are (degree + 1)^2 spherical-harmonics coefficients for each Gaussian."""
+    if "radiance" in frame.arrays and frame.sh_degree is not None:
+        wanted, got = frame.count * (frame.sh_degree + 1) ** 2, len(frame.arrays["radiance"])
+        if got != wanted:
+            yield Fault(
+                f"there must be {wanted} coefficients, got {got}. Mend the degree.", frame.attributes["radiance"]
+            )
+
+
+@rule("BEAM-MAT-010", "error", "frame")
+def _base_color(frame: Frame) -> Iterator[Fault]:
+    """Base colour is in [0, 1]."""
+    return _range(frame, 0.0, 1.0, "base_color")
+
+
+@rule("BEAM-MAT-011", "error", "frame")
+def _roughness(frame: Frame) -> Iterator[Fault]:
+    """Roughness is in [0, 1]."""
+    return _range(frame, 0.0, 1.0, "roughness")
+
+
+@rule("BEAM-MAT-012", "error", "frame")
+def _ambient_occlusion(frame: Frame) -> Iterator[Fault]:
+    """Ambient occlusion is a visibility in [0, 1]."""
+    return _range(frame, 0.0, 1.0, "ambient_occlusion")
+
+
+@rule("BEAM-MAT-013", "error", "frame")
+def _metallic(frame: Frame) -> Iterator[Fault]:
+    """Metallic is in [0, 1]."""
+    return _range(frame, 0.0, 1.0, "metallic")
+
+
+@rule("BEAM-MAT-014", "error", "frame")
+def _unit_normals(frame: Frame) -> Iterator[Fault]:
+    """Normals are unit vectors."""
+    return _unit(frame, "normals")
+
+
+@rule("BEAM-MAT-015", "error", "frame")
+def _confidence(frame: Frame) -> Iterator[Fault]:
+    """Normal confidence is in [0, 1]."""
+    return _range(frame, 0.0, 1.0, "normal_confidence")
+
+
+@rule("BEAM-MAT-016", "error", "frame")
+def _standard_errors(frame: Frame) -> Iterator[Fault]:
+    """Standard errors are not negative."""
+    return _range(frame, 0.0, np.inf, "ambient_occlusion_error", "base_color_error")
+
+
+@rule("BEAM-MAT-017", "warning", "frame")
+def _observability(frame: Frame) -> Iterator[Fault]:
+    """Observability has no flags that the schema does not define."""
+    for name, array in frame.to_check("observability"):
+        unknown = array & (255 - KNOWN_FLAGS)
+        if unknown.any():
+            row = np.flatnonzero(unknown)[0]
+            yield Fault(
+                f"flags should be in [0, {KNOWN_FLAGS}], got {array[row]} at element {row}. Clear others.", name
+            )
+
+
+@rule("BEAM-SEQ-005", "error", "frame")
+def _constant_count(frame: Frame) -> Iterator[Fault]:
+    """Where the topology is constant, so is the number of Gaussians."""
+    if frame.constant_topology and frame.previous is not None and len(frame.previous["positions"]) != frame.count:
+        before = len(frame.previous["positions"])
+        yield Fault(f"the count must be constant, got {frame.count} after {before}. Say perFrame.", "positions")
+
+
+@rule("BEAM-SEQ-006", "error", "frame")
+def _unique_ids(frame: Frame) -> Iterator[Fault]:
+    """Identities are unique within a frame."""
+    for name, array in frame.to_check("ids"):
+        if len(np.unique(array)) != len(array):
+            yield Fault("ids must be unique, got one twice. Number the Gaussians anew.", name)
+
+
+@rule("BEAM-SEQ-007", "error", "frame")
+def _constant_ids(frame: Frame) -> Iterator[Fault]:
+    """Where the topology is constant, so is the identity of each row."""
+    if frame.constant_topology and frame.previous is not None and "ids" in frame.changed:
+        ids, before = frame.arrays.get("ids"), frame.previous.get("ids")
+        if ids is not None and before is not None and len(ids) == len(before) and not np.array_equal(ids, before):
+            yield Fault("ids must be the same in every frame, got other ones. Say perFrame.", frame.attributes["ids"])
+
+
+@rule("BEAM-SEQ-008", "warning", "frame")
+def _continuous_quaternions(frame: Frame) -> Iterator[Fault]:
+    """Where rows keep their identity, quaternions keep their sign: engines that blend components would spin them."""
+    if not frame.constant_topology or frame.previous is None or "orientations" not in frame.changed:
+        return
+    now, before = frame.arrays.get("orientations"), frame.previous.get("orientations")
+    if now is not None and before is not None and now.shape == before.shape:
+        flipped = np.einsum("nk,nk->n", now.astype(np.float32), before.astype(np.float32)) < 0.0
+        if flipped.any():
+            row = np.flatnonzero(flipped)[0]
+            yield Fault(
+                f"quaternions should not change sign, got {flipped.sum()} that do, first at {row}. Negate them.",
+                frame.attributes["orientations"],
+            )
+
+
+def _range(frame: Frame, low: float, high: float, *names: str) -> Iterator[Fault]:
+    for name, array in frame.to_check(*names):
+        bad = np.isfinite(array) & ~((array >= low) & (array <= high))
+        if bad.any():
+            row = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0]
+            worst = array[bad].flat[0]
+            yield Fault(
+                f"values must lie in [{low:g}, {high:g}], got {worst:g} at element {row}. Clip or rescale them.", name
+            )
+
+
+def _unit(frame: Frame, channel: str) -> Iterator[Fault]:
+    for name, array in frame.to_check(channel):
+        length = np.linalg.norm(array.astype(np.float32), axis=1)
+        bad = np.isfinite(length) & ~(np.abs(length - 1.0) <= UNIT_TOLERANCE)
+        if bad.any():
+            row = np.flatnonzero(bad)[0]
+            yield Fault(f"vectors must have unit length, got {length[row]:.4g} at element {row}. Normalise them.", name)

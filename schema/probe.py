@@ -1,0 +1,91 @@
+"""Opens an asset and reads from each of its layers: ``python -m beam_warp.schema.probe ASSET``, run as a child.
+
+Prints one JSON object: empty if all went well, else with ``error``. A corrupt file may end this process instead; its
+parent takes that for an answer too.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd, UsdUtils
+
+from beam_warp.errors import AssetFormatError
+from beam_warp.schema import register
+from beam_warp.schema.files import require_whole_crate
+from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE
+
+ADDRESS_SPACE = 8 * 2**30
+"""Room for OpenUSD itself [bytes]; a corrupt length that asks for more fails instead of filling the machine."""
+
+
+def fault(path: Path) -> str | None:
+    """Return why an asset cannot be read, or None."""
+    try:
+        stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+        problems = stage.GetCompositionErrors()
+        if problems:
+            return str(problems[0])
+        layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
+        if missing:
+            return f"missing or broken layer {missing[0]}"
+        for layer in layers:
+            real = Path(layer.realPath)
+            if real.suffix == ".usdc" and real.is_file():
+                require_whole_crate(real)
+        for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
+            if prim.GetTypeName() == SPLAT_TYPE:
+                _touch(prim)
+    except AssetFormatError as error:
+        return str(error)
+    except Tf.ErrorException as error:
+        return said_by_usd(error)
+    return None
+
+
+def said_by_usd(error: Tf.ErrorException) -> str:
+    """Return OpenUSD's own words, without its source lines, each once."""
+    words = dict.fromkeys(str(getattr(item, "commentary", item)) for item in error.args)
+    return " ".join(" ".join(words).split())[:500]
+
+
+def _touch(prim: Usd.Prim) -> None:
+    """Read every array at the default time, at both ends, and where each value clip starts."""
+    starts = [time for name in Usd.ClipsAPI(prim).GetClipSets().GetAppliedItems() for time in _clip_starts(prim, name)]
+    for channel in CHANNELS.values():
+        for usd_name in channel.usd_names:
+            attribute = prim.GetAttribute(usd_name)
+            samples = attribute.GetTimeSamples() if attribute else []
+            for time in {*samples[:1], *samples[-1:], *(starts if samples else ())}:
+                attribute.Get(time)
+            if attribute:
+                attribute.Get()
+
+
+def _clip_starts(prim: Usd.Prim, name: str) -> list[float]:
+    return [float(pair[0]) for pair in Usd.ClipsAPI(prim).GetClipActive(name) or ()]
+
+
+def _limit_memory(path: Path) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    size = sum(file.stat().st_size for file in path.parent.glob(f"{path.stem}*") if file.is_file())
+    limit = ADDRESS_SPACE + 4 * size
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def main() -> None:
+    """Probe the asset named on the command line."""
+    path = Path(sys.argv[1])
+    _limit_memory(path)
+    register()
+    reason = fault(path)
+    print(json.dumps({"error": reason} if reason else {}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,316 @@
+"""Reads a Gaussian-splat asset, ours or any other, as a lazy sequence in metres."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Tf, Usd, UsdGeom
+
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence, Topology
+from beam_warp.checks import UNIT_TOLERANCE
+from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
+from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, register
+from beam_warp.schema.files import require_asset_file, require_opens
+from beam_warp.schema.layout import CHANNELS, SH_DEGREE, Channel, from_vt
+from beam_warp.schema.placement import Placement, placement_of
+from beam_warp.schema.stage_queries import (
+    applied_schemas,
+    array_attribute,
+    authored,
+    has_material_api,
+    radiance_color_space,
+    sample_times,
+    sequence_prim,
+    splat_prims,
+)
+
+_AXES = {"Y": "rub", "Z": "rfu"}
+
+_MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"})
+"""Arrays that a moving transform changes."""
+
+_ABSENT = {"orientations": (0.0, 0.0, 0.0, 1.0), "scales": (1.0, 1.0, 1.0), "opacities": 1.0}
+"""What OpenUSD's schema takes for arrays that are not authored."""
+
+_TOKENS = {
+    "radiance_meaning": "beam:radianceMeaning",
+    "normal_source": "beam:normalSource",
+    "roughness_source": "beam:roughnessSource",
+}
+
+_SEQUENCE_TOKENS = {
+    "source_axes": "beam:sequence:sourceAxes",
+    "source_units": "beam:sequence:sourceUnits",
+    "generator": "beam:sequence:generator",
+}
+
+
+def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool = False) -> GaussianSequence:
+    """Open an asset; frames are read when they are asked for, from any thread.
+
+    Any ``ParticleField3DGaussianSplat`` is read, wherever it is on the stage; without our schema it is just not
+    relightable. The transforms above the prim are applied (spherical harmonics included), units become metres, and
+    the up axis becomes the axes code: y up is ``rub``, z up is ``rfu``. Frames are the time samples of the prim.
+
+    Args:
+        path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        prim_path: Which prim to read where there are several.
+        trusted: True skips the child process that opens the file first (about 0.4 s): a corrupt file may then end
+            this process.
+
+    Returns:
+        The sequence. ``metadata`` carries what the asset says about itself and notes on what had to be assumed.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: The file is broken, holds no or several Gaussian-splat prims, arrays of wrong length, or a
+            transform that is no similarity. Faults inside a frame appear when that frame is read.
+        SchemaVersionError: The asset has a major version that this package does not read.
+    """
+    source = require_asset_file(path)
+    if not trusted:
+        require_opens(source)
+    register()
+    try:
+        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+    except Tf.ErrorException as error:
+        raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
+    prim = _find(stage, source, prim_path)
+    metadata = _metadata(prim, source)
+    frames, rate, topology = _timing(stage, prim, source, metadata)
+    space, word = radiance_color_space(prim)
+    if array_attribute(prim, CHANNELS["radiance"]) is not None and space is None:
+        metadata["radiance_color_space_note"] = f"assumed {DISPLAY_SRGB}; the asset says {word or 'nothing'!r}"
+    reader = _FrameReader(
+        stage=stage,
+        prim=prim,
+        source=source,
+        times=frames,
+        meters_per_unit=_meters_per_unit(stage, source, metadata),
+        axes=_axes(stage, source),
+        color_space=space or DISPLAY_SRGB,
+        captured=metadata.get("radiance_meaning") != "baseColorOnly",
+    )
+    return GaussianSequence(
+        frame_count=len(frames),
+        read_frame=reader.read,
+        frames_per_second=rate,
+        constant=reader.constant() if len(frames) > 1 else frozenset(reader.read(0).arrays()),
+        topology=topology,
+        metadata=metadata,
+    )
+
+
+@dataclass(frozen=True)
+class _FrameReader:
+    """Reads one prim at the time of a frame."""
+
+    stage: Usd.Stage = field(repr=False)  # a prim does not keep its stage alive
+    prim: Usd.Prim = field(repr=False)
+    source: Path
+    times: list[float]
+    meters_per_unit: float
+    axes: str
+    color_space: str
+    captured: bool
+
+    def read(self, frame: int) -> GaussianCloud:
+        """Read one frame; a fault in it is one error that names file, prim and time."""
+        time = self.times[frame]
+        where = f"{self.source}: {self.prim.GetPath()} at time {time:g}"
+        try:
+            arrays = self._arrays(time, where)
+            place = self._placement(time, where)
+            return GaussianCloud(
+                **(arrays if place.is_identity else place.apply(arrays)),
+                axes=self.axes,
+                radiance_color_space=self.color_space if "radiance" in arrays else None,
+            )
+        except InvalidArrayError as error:
+            raise AssetFormatError(f"{where}: {error}") from error
+        except Tf.ErrorException as error:
+            raise AssetFormatError(f"{where} must be readable, got {error}. Export the file again.") from error
+
+    def constant(self) -> frozenset[str]:
+        """Name the arrays that do not vary."""
+        names = set()
+        for name, channel in CHANNELS.items():
+            attribute = array_attribute(self.prim, channel)
+            if attribute is not None and name != "metallic" and not attribute.ValueMightBeTimeVarying():
+                names.add(name)
+        if not self.captured:
+            names.discard("radiance")
+        return frozenset(names - _MOVED if self._moves() else names)
+
+    def _moves(self) -> bool:
+        prim = self.prim
+        while prim and not prim.IsPseudoRoot():
+            if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
+                return True
+            prim = prim.GetParent()
+        return False
+
+    def _placement(self, time: float, where: str) -> Placement:
+        cache = UsdGeom.XformCache(time)  # per call: a cache is not safe to share between threads
+        return placement_of(np.array(cache.GetLocalToWorldTransform(self.prim)), self.meters_per_unit, where)
+
+    def _arrays(self, time: float, where: str) -> dict[str, NDArray[Any]]:
+        positions = self._array(CHANNELS["positions"], time, where)
+        if positions is None:
+            raise AssetFormatError(f"{where} must have positions, got none. Export it again.")
+        count = len(positions)
+        arrays: dict[str, NDArray[Any]] = {"positions": positions}
+        for name, channel in CHANNELS.items():
+            if name in ("positions", "metallic") or (name == "radiance" and not self.captured):
+                continue
+            array = self._array(channel, time, where)
+            if array is None:
+                if name in _ABSENT:
+                    arrays[name] = np.broadcast_to(np.float32(_ABSENT[name]), (count, *np.shape(_ABSENT[name]))).copy()
+                continue
+            terms = self._sh_terms(where) if name == "radiance" else 1
+            if len(array) < count * terms:
+                raise AssetFormatError(
+                    f"{where}: {channel.usd_name} must have {count * terms} elements, got {len(array)}. "
+                    "USD would ignore the array; export it again."
+                )
+            array = array[: count * terms]  # USD's rule for arrays that are too long
+            arrays[name] = array.reshape(count, terms, 3) if name == "radiance" else array
+        for name in ("orientations", "normals"):
+            if name in arrays:
+                arrays[name] = _unit(name, arrays[name], where)
+        return arrays
+
+    def _array(self, channel: Channel, time: float, where: str) -> NDArray[Any] | None:
+        attribute = array_attribute(self.prim, channel)
+        if attribute is None:
+            return None
+        value = attribute.Get(time)
+        try:
+            if value is None:
+                raise ValueError("no value")
+            array = from_vt(channel, value)
+            return array.astype(np.float32) if array.dtype.kind == "f" else array
+        except (TypeError, ValueError) as error:
+            raise AssetFormatError(
+                f"{where}: {attribute.GetName()} must be {channel.type_name}, got {attribute.GetTypeName()} "
+                f"({error}). Export it again."
+            ) from error
+
+    def _sh_terms(self, where: str) -> int:
+        degree = self.prim.GetAttribute(SH_DEGREE).Get()
+        if not isinstance(degree, int) or not 0 <= degree <= 4:
+            raise AssetFormatError(f"{where}: {SH_DEGREE} must be 0 to 4, got {degree!r}. Drop the higher bands.")
+        return (degree + 1) ** 2
+
+
+def _find(stage: Usd.Stage, source: Path, prim_path: str | None) -> Usd.Prim:
+    """Return the one splat prim, or the one that was asked for."""
+    prims = splat_prims(stage)
+    paths = [str(prim.GetPath()) for prim in prims]
+    if prim_path is not None and prim_path in paths:
+        return prims[paths.index(prim_path)]
+    if prim_path is None and len(prims) == 1:
+        return prims[0]
+    if not prims:
+        raise AssetFormatError(
+            f"{source} must hold a ParticleField3DGaussianSplat, got none. Convert the splats with beam-convert."
+        )
+    wanted = "one Gaussian-splat prim" if prim_path is None else f"a Gaussian-splat prim {prim_path}"
+    raise AssetFormatError(f"{source} must hold {wanted}, got {', '.join(paths)}. Pass one of them as prim_path.")
+
+
+def _metadata(prim: Usd.Prim, source: Path) -> dict[str, str]:
+    """Collect what the asset says about itself, after checking that its version can be read."""
+    notes: dict[str, str] = {}
+    newer = [name for name in applied_schemas(prim) if name.startswith(f"{MATERIAL_API}_")]
+    if newer:
+        raise SchemaVersionError(
+            f"{source} must have schema major version {SCHEMA_VERSION.partition('.')[0]}, got the schema {newer[0]} "
+            f"at {prim.GetPath()}. Upgrade beam-warp."
+        )
+    playing = sequence_prim(prim)
+    if playing is not None:
+        stored = playing.GetCustomDataByKey("beam")
+        notes.update({str(key): str(value) for key, value in (stored if isinstance(stored, Mapping) else {}).items()})
+        for key, name in _SEQUENCE_TOKENS.items():
+            word = authored(playing, name)
+            if word:
+                notes[key] = str(word)
+    if not has_material_api(prim):
+        return notes
+    version = str(authored(prim, "beam:schemaVersion") or "")
+    major, _, minor = version.partition(".")
+    if major != SCHEMA_VERSION.partition(".")[0] or not minor.isdecimal():
+        raise SchemaVersionError(
+            f"{source} must have schema version {SCHEMA_VERSION}, got {version or 'none'!r} at {prim.GetPath()}. "
+            "Upgrade beam-warp, or export the asset again."
+        )
+    notes["schema_version"] = version
+    if int(minor) > int(SCHEMA_VERSION.partition(".")[2]):
+        notes["schema_note"] = f"version {version} is newer than {SCHEMA_VERSION}: what it added is not read"
+        warnings.warn(f"{source}: schema {notes['schema_note']}.", UserWarning, stacklevel=3)
+    for key, name in _TOKENS.items():
+        word = authored(prim, name)
+        if word is not None:
+            notes[key] = notes.get(key, str(word)) if key == "roughness_source" else str(word)
+    if array_attribute(prim, CHANNELS["metallic"]) is not None:
+        notes["metallic_note"] = "the asset has a metallic channel, which is not read"
+    return notes
+
+
+def _timing(
+    stage: Usd.Stage, prim: Usd.Prim, source: Path, metadata: dict[str, str]
+) -> tuple[list[float], float, Topology]:
+    """Return the time of each frame, the playback rate, and whether rows keep their identity."""
+    times = sample_times(prim)
+    rate = stage.GetTimeCodesPerSecond()
+    if not rate > 0.0:
+        raise AssetFormatError(f"{source} must have a positive timeCodesPerSecond, got {rate:g}. Set it.")
+    playing = sequence_prim(prim)
+    topology = str(authored(playing, "beam:sequence:topology") or "perFrame") if playing is not None else "perFrame"
+    count = authored(playing, "beam:sequence:frameCount") if playing is not None else None
+    if count is not None and len(times) != count:
+        if count < 1:
+            raise AssetFormatError(f"{source}: beam:sequence:frameCount must be at least 1, got {count}. Mend it.")
+        start = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
+        times = [start + frame for frame in range(count)]
+    elif len(times) > 1:
+        steps = np.diff(times)
+        rate /= float(np.median(steps))
+        if not np.allclose(steps, steps[0], rtol=1e-6):
+            metadata["timing_note"] = "time samples are unevenly spaced; the rate is that of the median step"
+    times = times or [stage.GetStartTimeCode()]
+    return times, rate, "constant" if topology == "constant" or len(times) == 1 else "perFrame"
+
+
+def _meters_per_unit(stage: Usd.Stage, source: Path, metadata: dict[str, str]) -> float:
+    meters = UsdGeom.GetStageMetersPerUnit(stage)
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        metadata["units_note"] = f"assumed {meters:g} m per unit, which is USD's default; the asset states none"
+    if not 0.0 < meters < np.inf:
+        raise AssetFormatError(f"{source} must have a positive metersPerUnit, got {meters:g}. Set it.")
+    return meters
+
+
+def _axes(stage: Usd.Stage, source: Path) -> str:
+    up = str(UsdGeom.GetStageUpAxis(stage))
+    if up not in _AXES:
+        raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
+    return _AXES[up]
+
+
+def _unit(name: str, vectors: NDArray[np.float32], where: str) -> NDArray[np.float32]:
+    """Normalise the rows that are visibly not unit, as renderers do; rows without a direction are refused."""
+    length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+    if not (length > 1e-12).all():
+        row = int(np.flatnonzero(~(length[:, 0] > 1e-12))[0])
+        raise AssetFormatError(f"{where}: {name} must have unit length, got {length[row, 0]:g} at row {row}. Mend it.")
+    off = np.abs(length - 1.0) > 0.5 * UNIT_TOLERANCE
+    return np.where(off, vectors / length, vectors).astype(np.float32) if off.any() else vectors

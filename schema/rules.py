@@ -1,0 +1,383 @@
+"""The rules of an asset, one function each, with a stable id and a severity; the docstring is the rule's text.
+
+Rules of this file ask a stage or a prim; those of `beam_warp.schema.frame_rules` ask the arrays of a frame. Ids are
+never reused: a rule that goes leaves a gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from beam_warp.assets import COLOR_SPACES, LINEAR_REC709, MAX_SH_DEGREE
+from beam_warp.errors import AssetFormatError
+from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
+from beam_warp.schema.layout import CHANNELS, SH_DEGREE
+from beam_warp.schema.placement import placement_of
+from beam_warp.schema.report import Severity
+from beam_warp.schema.stage_queries import (
+    array_attribute,
+    authored,
+    clip_sets,
+    has_material_api,
+    sample_times,
+    sequence_prim,
+    splat_prims,
+)
+
+
+class Fault(NamedTuple):
+    """What a rule found wrong; the id and the severity are the rule's."""
+
+    message: str
+    attribute: str = ""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule: ``check`` takes a stage, a prim or a frame, as ``subject`` says, and yields what is wrong."""
+
+    id: str
+    severity: Severity
+    subject: Literal["stage", "prim", "frame"]
+    text: str
+    check: Callable[[Any], Iterator[Fault]]
+
+
+RULES: list[Rule] = []
+"""Every rule that has been defined, in the order of definition."""
+
+
+def rule(
+    rule_id: str, severity: Severity, subject: Literal["stage", "prim", "frame"]
+) -> Callable[[Callable[[Any], Iterator[Fault]]], Callable[[Any], Iterator[Fault]]]:
+    """Enter a function in the table of rules."""
+
+    def enter(check: Callable[[Any], Iterator[Fault]]) -> Callable[[Any], Iterator[Fault]]:
+        assert all(known.id != rule_id for known in RULES), rule_id
+        RULES.append(Rule(rule_id, severity, subject, (check.__doc__ or "").strip(), check))
+        return check
+
+    return enter
+
+
+REQUIRED = ("positions", "orientations", "scales", "opacities", "radiance")
+RELIGHTABLE = ("base_color", "roughness", "ambient_occlusion", "normals")
+TOKENS = {
+    "beam:brdf": ("ggx-metallic-roughness",),
+    "beam:aoMeaning": ("hemisphericalVisibility",),
+    "beam:normalSource": ("authored", "shortestAxis", "none"),
+    "beam:radianceMeaning": ("captured", "shaded", "baseColorOnly"),
+}
+
+
+@rule("BEAM-STAGE-001", "error", "stage")
+def _default_prim(stage: Usd.Stage) -> Iterator[Fault]:
+    """The stage names a default prim that exists, so that it can be referenced."""
+    if not stage.GetDefaultPrim():
+        yield Fault(f"defaultPrim must name a prim, got {stage.GetRootLayer().defaultPrim or 'none'!r}. Set it.")
+
+
+@rule("BEAM-STAGE-002", "error", "stage")
+def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
+    """metersPerUnit is authored and positive; USD would assume centimetres."""
+    meters = UsdGeom.GetStageMetersPerUnit(stage)
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        yield Fault("metersPerUnit must be authored, got none. Set it, for example to 1.")
+    elif not 0.0 < meters < np.inf:
+        yield Fault(f"metersPerUnit must be positive, got {meters:g}. Set it, for example to 1.")
+
+
+@rule("BEAM-STAGE-003", "error", "stage")
+def _up_axis(stage: Usd.Stage) -> Iterator[Fault]:
+    """upAxis is authored and Y or Z."""
+    up = stage.GetRootLayer().pseudoRoot.GetInfo("upAxis") if stage.HasAuthoredMetadata("upAxis") else None
+    if up not in ("Y", "Z"):
+        yield Fault(f"upAxis must be Y or Z, got {up!r}. Author it.")
+
+
+@rule("BEAM-STAGE-004", "error", "stage")
+def _holds_splats(stage: Usd.Stage) -> Iterator[Fault]:
+    """The stage holds at least one ParticleField3DGaussianSplat."""
+    if not splat_prims(stage):
+        yield Fault("the stage must hold a ParticleField3DGaussianSplat, got none. Convert the splats first.")
+
+
+@rule("BEAM-STAGE-005", "error", "stage")
+def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
+    """A stage on which something varies states its time range and timeCodesPerSecond."""
+    if not any(len(sample_times(prim)) > 1 for prim in splat_prims(stage)):
+        return
+    if not stage.HasAuthoredTimeCodeRange() or not stage.GetStartTimeCode() <= stage.GetEndTimeCode():
+        yield Fault("startTimeCode and endTimeCode must be authored in order, got none or reversed ones. Author them.")
+    if not stage.HasAuthoredMetadata("timeCodesPerSecond") or not stage.GetTimeCodesPerSecond() > 0.0:
+        yield Fault("timeCodesPerSecond must be authored and positive, got none. Author the frame rate.")
+
+
+@rule("BEAM-STAGE-006", "error", "stage")
+def _composes(stage: Usd.Stage) -> Iterator[Fault]:
+    """Every layer that the stage references is there and composes."""
+    for problem in stage.GetCompositionErrors():
+        yield Fault(f"the stage must compose, got: {' '.join(str(problem).split())} Restore the missing layer.")
+
+
+@rule("BEAM-GEO-001", "error", "prim")
+def _required_arrays(prim: Usd.Prim) -> Iterator[Fault]:
+    """Positions, orientations, scales, opacities and spherical harmonics are authored."""
+    for name in REQUIRED:
+        channel = CHANNELS[name]
+        if array_attribute(prim, channel) is None:
+            yield Fault(f"{channel.usd_name} must be authored, got none. Write the array.", channel.usd_name)
+
+
+@rule("BEAM-GEO-002", "error", "prim")
+def _one_precision(prim: Usd.Prim) -> Iterator[Fault]:
+    """Of an array's float and half variants one is authored, so that no host can pick a stale one."""
+    for channel in CHANNELS.values():
+        if len([name for name in channel.usd_names if authored_at_all(prim, name)]) > 1:
+            yield Fault("one precision must be authored, got float and half. Clear one of them.", channel.usd_name)
+
+
+@rule("BEAM-GEO-003", "error", "prim")
+def _similarity(prim: Usd.Prim) -> Iterator[Fault]:
+    """The transform to the world is rotation, uniform scale and translation."""
+    for time in sample_times(prim) or [Usd.TimeCode.Default()]:
+        matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+        try:
+            placement_of(matrix, 1.0, str(prim.GetPath()))
+        except AssetFormatError as error:
+            yield Fault(str(error))
+            return
+
+
+@rule("BEAM-GEO-004", "error", "prim")
+def _extent_authored(prim: Usd.Prim) -> Iterator[Fault]:
+    """extent is authored: USD computes none for Gaussian splats."""
+    if not authored_at_all(prim, "extent"):
+        yield Fault("extent must be authored, got none. Write the bounds of each frame.", "extent")
+
+
+@rule("BEAM-SH-001", "error", "prim")
+def _sh_degree(prim: Usd.Prim) -> Iterator[Fault]:
+    """The spherical-harmonics degree is authored (USD would assume 3) and 0 to 4."""
+    degree = authored(prim, SH_DEGREE)
+    if not isinstance(degree, int) or not 0 <= degree <= MAX_SH_DEGREE:
+        yield Fault(f"the degree must be authored, 0 to {MAX_SH_DEGREE}, got {degree!r}. Author it.", SH_DEGREE)
+
+
+@rule("BEAM-API-001", "warning", "prim")
+def _is_relightable(prim: Usd.Prim) -> Iterator[Fault]:
+    """The prim has BeamRelightableGaussianAPI; without it, it is an ordinary splat that cannot be relit."""
+    if not has_material_api(prim) and not _beam_attributes(prim):
+        yield Fault(f"{MATERIAL_API} should be applied, got ordinary splats. Decompose them to relight them.")
+
+
+@rule("BEAM-API-002", "error", "prim")
+def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
+    """A prim that authors beam: attributes has BeamRelightableGaussianAPI applied."""
+    names = _beam_attributes(prim)
+    if names and not has_material_api(prim):
+        yield Fault(f"{MATERIAL_API} must be applied, got beam: attributes without it. Apply it.", names[0])
+
+
+@rule("BEAM-MAT-001", "warning", "prim")
+def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
+    """Base colour, roughness, ambient occlusion and normals are all authored: relighting reads them."""
+    missing = [CHANNELS[name].usd_name for name in RELIGHTABLE if array_attribute(prim, CHANNELS[name]) is None]
+    if has_material_api(prim) and missing:
+        yield Fault(f"relighting needs {', '.join(missing)}, got none. Decompose the asset.", missing[0])
+
+
+@rule("BEAM-MAT-002", "error", "prim")
+def _normal_source(prim: Usd.Prim) -> Iterator[Fault]:
+    """normalSource is none exactly if there are no normals."""
+    source = authored(prim, "beam:normalSource")
+    has_normals = array_attribute(prim, CHANNELS["normals"]) is not None
+    if has_material_api(prim) and source in TOKENS["beam:normalSource"] and (source == "none") == has_normals:
+        got = "normals" if has_normals else "no normals"
+        yield Fault(f"normalSource must fit the normals, got {source} with {got}. Mend it.", "beam:normalSource")
+
+
+@rule("BEAM-COLOR-001", "error", "prim")
+def _base_color_space(prim: Usd.Prim) -> Iterator[Fault]:
+    """The base colour's colour space is authored as lin_rec709_scene, not left to a fallback."""
+    attribute = array_attribute(prim, CHANNELS["base_color"])
+    if attribute is not None:
+        spaces = [spec.colorSpace for spec in attribute.GetPropertyStack() if spec.HasColorSpace()]
+        if not spaces or spaces[0] != LINEAR_REC709:
+            got = spaces[0] if spaces else "none"
+            yield Fault(f"colorSpace must be {LINEAR_REC709}, got {got}. Author it.", attribute.GetName())
+
+
+@rule("BEAM-COLOR-002", "error", "prim")
+def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
+    """The colour space of the radiance is authored and one that we know."""
+    space = authored(prim, "beam:radianceColorSpace")
+    if has_material_api(prim) and space not in COLOR_SPACES:
+        wanted = " or ".join(COLOR_SPACES)
+        yield Fault(f"the colour space must be {wanted}, got {space!r}. Author it.", "beam:radianceColorSpace")
+
+
+@rule("BEAM-TOKEN-001", "error", "prim")
+def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
+    """brdf, aoMeaning, normalSource and radianceMeaning are authored: fallbacks are invisible without the plug-in."""
+    for name in TOKENS:
+        if has_material_api(prim) and authored(prim, name) is None:
+            yield Fault(f"{name} must be authored, got none. Author it.", name)
+
+
+@rule("BEAM-TOKEN-002", "error", "prim")
+def _tokens_known(prim: Usd.Prim) -> Iterator[Fault]:
+    """Tokens hold one of their allowed values."""
+    for name, allowed in TOKENS.items():
+        value = authored(prim, name)
+        if value is not None and value not in allowed:
+            yield Fault(f"{name} must be one of {', '.join(allowed)}, got {value!r}. Choose one.", name)
+
+
+@rule("BEAM-VERSION-001", "error", "prim")
+def _version_authored(prim: Usd.Prim) -> Iterator[Fault]:
+    """schemaVersion is authored as major.minor."""
+    version = authored(prim, "beam:schemaVersion")
+    if has_material_api(prim) and _parsed(version) is None:
+        yield Fault(f"the version must be major.minor, got {version!r}. Author it.", "beam:schemaVersion")
+
+
+@rule("BEAM-VERSION-002", "error", "prim")
+def _version_major(prim: Usd.Prim) -> Iterator[Fault]:
+    """The schema's major version is one that this validator knows."""
+    version = _parsed(authored(prim, "beam:schemaVersion"))
+    if has_material_api(prim) and version is not None and version[0] != _KNOWN[0]:
+        yield Fault(f"the major version must be {_KNOWN[0]}, got {version[0]}. Upgrade.", "beam:schemaVersion")
+
+
+@rule("BEAM-VERSION-003", "warning", "prim")
+def _version_minor(prim: Usd.Prim) -> Iterator[Fault]:
+    """The schema's minor version is not newer than this validator."""
+    version = _parsed(authored(prim, "beam:schemaVersion"))
+    if has_material_api(prim) and version is not None and version[0] == _KNOWN[0] and version[1] > _KNOWN[1]:
+        yield Fault(f"what is newer than {SCHEMA_VERSION} was not checked, got 1.{version[1]}. Upgrade.")
+
+
+@rule("BEAM-SEQ-001", "error", "prim")
+def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
+    """An ancestor of a relightable prim says how it plays: BeamSequenceAPI with frameCount, rate and topology."""
+    if not has_material_api(prim):
+        return
+    playing = sequence_prim(prim)
+    if playing is None:
+        yield Fault(f"an ancestor must have {SEQUENCE_API}, got none. Apply it to the default prim.")
+        return
+    for name in ("frameCount", "framesPerSecond", "topology"):
+        if authored(playing, f"beam:sequence:{name}") is None:
+            yield Fault(f"beam:sequence:{name} must be authored on {playing.GetPath()}, got none. Author it.")
+
+
+@rule("BEAM-SEQ-002", "error", "prim")
+def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
+    """frameCount is the number of time codes of the stage's range, framesPerSecond its timeCodesPerSecond."""
+    playing, stage = sequence_prim(prim), prim.GetStage()
+    if playing is None or not stage.HasAuthoredTimeCodeRange():
+        return
+    count = authored(playing, "beam:sequence:frameCount")
+    codes = stage.GetEndTimeCode() - stage.GetStartTimeCode() + 1
+    if count is not None and count != codes:
+        yield Fault(f"frameCount must be the length of the range, {codes:g}, got {count}. Mend either.")
+    rate = authored(playing, "beam:sequence:framesPerSecond")
+    if rate is not None and rate != stage.GetTimeCodesPerSecond():
+        got = stage.GetTimeCodesPerSecond()
+        yield Fault(f"framesPerSecond must equal timeCodesPerSecond, {got:g}, got {rate:g}. Mend either.")
+
+
+@rule("BEAM-SEQ-003", "error", "prim")
+def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
+    """Arrays that vary share one set of time samples, so that each frame is whole."""
+    samples = _own_samples(prim)
+    union = sorted(set().union(*samples.values())) if samples else []
+    for name, times in samples.items():
+        if times != union:
+            gap = min(set(union) - set(times))
+            yield Fault(f"samples must be those of all arrays, got none at time {gap:g}. Write every frame.", name)
+
+
+@rule("BEAM-SEQ-004", "error", "prim")
+def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
+    """Time samples are every whole time code from startTimeCode to endTimeCode."""
+    stage = prim.GetStage()
+    union = sorted(set().union(*_own_samples(prim).values()))
+    if not has_material_api(prim) or not union or not stage.HasAuthoredTimeCodeRange():
+        return
+    wanted = list(np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1.0))
+    if union != wanted:
+        strange = min(set(union) ^ set(wanted))
+        yield Fault(f"samples must be every whole time code of the range, got a difference at {strange:g}. Mend them.")
+
+
+@rule("BEAM-CLIP-001", "error", "prim")
+def _clips_resolve(prim: Usd.Prim) -> Iterator[Fault]:
+    """Every layer that value clips name opens, and every clip that becomes active exists."""
+    for clips in clip_sets(prim):
+        for path in clips.missing_layers():
+            yield Fault(f"a clip layer must open, got {path}, which does not. Restore it.")
+        if any(not 0 <= index < len(clips.paths) for _, index in clips.active):
+            yield Fault("active clips must be among the clip layers, got another index. Mend clips:active.")
+
+
+@rule("BEAM-CLIP-002", "error", "prim")
+def _clip_manifest(prim: Usd.Prim) -> Iterator[Fault]:
+    """The manifest declares exactly the attributes that the clip layers sample."""
+    for clips in clip_sets(prim):
+        if clips.missing_layers():
+            continue
+        declared, sampled = clips.declared(), set().union(*(clips.sampled(index) for index in range(len(clips.paths))))
+        for name in sorted(declared ^ sampled):
+            got = "no samples of what it declares" if name in declared else "samples of what it does not declare"
+            yield Fault(f"the manifest must declare what clips sample, got {got}. Write it anew.", name)
+
+
+@rule("BEAM-CLIP-003", "error", "prim")
+def _clips_cover(prim: Usd.Prim) -> Iterator[Fault]:
+    """At every time code of the range the active clip has a sample of every declared attribute."""
+    stage = prim.GetStage()
+    for clips in clip_sets(prim):
+        if clips.missing_layers() or not clips.active or not stage.HasAuthoredTimeCodeRange():
+            continue
+        for name in sorted(clips.declared() & clips.sampled(0)):
+            for time in np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1.0):
+                if not clips.has_sample(name, float(time)):
+                    yield Fault(f"the active clip must have a sample at time {time:g}, got none. Write it.", name)
+                    break
+
+
+def authored_at_all(prim: Usd.Prim, name: str) -> bool:
+    """Say whether an attribute has a value anywhere, samples and clips included."""
+    attribute = prim.GetAttribute(name)
+    return bool(attribute) and attribute.HasAuthoredValue()
+
+
+def _beam_attributes(prim: Usd.Prim) -> list[str]:
+    return [name for name in prim.GetAuthoredPropertyNames() if name.startswith("beam:")]
+
+
+def _own_samples(prim: Usd.Prim) -> dict[str, list[float]]:
+    """Sample times of every array that varies by time samples of its own, not by clips."""
+    clipped = set().union(*(clips.declared() for clips in clip_sets(prim)))
+    samples = {}
+    for channel in CHANNELS.values():
+        attribute = array_attribute(prim, channel)
+        if attribute is not None and attribute.GetName() not in clipped and attribute.GetNumTimeSamples():
+            samples[attribute.GetName()] = attribute.GetTimeSamples()
+    return samples
+
+
+def _parsed(version: Any) -> tuple[int, int] | None:
+    """Split major.minor; None if it is something else."""
+    major, _, minor = str(version or "").partition(".")
+    return (int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else None
+
+
+_KNOWN = _parsed(SCHEMA_VERSION) or (0, 0)

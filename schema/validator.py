@@ -1,0 +1,170 @@
+"""Runs every rule, and OpenUSD's own validators beside them, on an asset or on an open stage.
+
+``python -m beam_warp.schema.validator ASSET`` is the child process of `validate`: a corrupt file may end it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from pxr import Tf, Usd, UsdValidation
+
+from beam_warp.errors import AssetFormatError
+from beam_warp.schema import frame_rules, register
+from beam_warp.schema.files import require_asset_file, run_child
+from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
+from beam_warp.schema.probe import said_by_usd
+from beam_warp.schema.report import Finding, Report, Severity
+from beam_warp.schema.rules import RULES, Rule
+from beam_warp.schema.stage_queries import array_attribute, authored, sample_times, sequence_prim, splat_prims
+
+SECONDS = 120.0
+"""How long a validation may take, beside what the size of the asset allows."""
+
+BYTES_PER_SECOND = 20e6
+"""The slowest reading and checking that is still waited for."""
+
+HOST_VALIDATOR = "beam_warp.schema.host_validator:AssetRules"
+"""Our rules as OpenUSD knows them; not run again beside our rules."""
+
+
+def validate(path: str | Path) -> Report:
+    """Check an asset against every rule and every validator of OpenUSD.
+
+    The asset is opened in a child process, so that a corrupt file costs an error and not this process.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: The file cannot be opened at all.
+    """
+    source = require_asset_file(path)
+    size = sum(file.stat().st_size for file in source.parent.glob(f"{source.stem}*") if file.is_file())
+    answer = run_child("beam_warp.schema.validator", source, SECONDS + size / BYTES_PER_SECOND)
+    if "error" in answer:
+        raise AssetFormatError(f"{source} must open in OpenUSD, got {answer['error']}. Export or copy the file again.")
+    return Report.from_dict(answer)
+
+
+def validate_stage(stage: Usd.Stage) -> Report:
+    """Check a stage that is open in this process; see `validate`."""
+    register()
+    report = check_rules(stage)
+    findings = sorted(
+        [*report.findings, *_usd_findings(stage)],
+        key=lambda found: (found.severity, found.rule, found.prim, found.attribute),
+    )
+    return Report(report.path, tuple(findings), report.frames, report.gaussians)
+
+
+def check_rules(stage: Usd.Stage) -> Report:
+    """Check a stage against our own rules only, holding two frames at a time."""
+    findings = [finding for rule in _of("stage") for finding in _ask(rule, stage, "/")]
+    frames = gaussians = 0
+    for prim in splat_prims(stage):
+        path = str(prim.GetPath())
+        findings += [finding for rule in _of("prim") for finding in _ask(rule, prim, path)]
+        seen: dict[tuple[str, str], Finding] = {}
+        for index, (time, frame) in enumerate(_frames(prim)):
+            frames = max(frames, index + 1)
+            gaussians += frame.count if index == 0 else 0
+            for rule in _of("frame"):
+                for found in _ask(rule, frame, path):
+                    first = seen.get((found.rule, found.attribute))
+                    seen[found.rule, found.attribute] = Finding(
+                        found.rule,
+                        found.severity,
+                        first.message if first else found.message,
+                        path,
+                        found.attribute,
+                        first.time if first else time,
+                        first.frames + 1 if first else 1,
+                    )
+        findings += seen.values()
+    return Report(stage.GetRootLayer().identifier, tuple(findings), frames, gaussians)
+
+
+def _of(subject: str) -> list[Rule]:
+    return [rule for rule in RULES if rule.subject == subject]
+
+
+def _ask(rule: Rule, subject: object, path: str) -> Iterator[Finding]:
+    for fault in rule.check(subject):
+        yield Finding(rule.id, rule.severity, fault.message, path, fault.attribute)
+
+
+def _frames(prim: Usd.Prim) -> Iterator[tuple[float, frame_rules.Frame]]:
+    """Read a prim frame by frame; arrays that do not vary are read and checked once."""
+    attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items()}
+    attributes = {name: attribute for name, attribute in attributes.items() if attribute is not None}
+    varying = frozenset(name for name, attribute in attributes.items() if attribute.ValueMightBeTimeVarying())
+    playing = sequence_prim(prim)
+    topology = authored(playing, "beam:sequence:topology") if playing is not None else None
+    degree = authored(prim, SH_DEGREE)
+    arrays: dict[str, np.ndarray] = {}
+    previous = None
+    for time in sample_times(prim) or [prim.GetStage().GetStartTimeCode()]:
+        changed = frozenset(attributes) if previous is None else varying
+        arrays = dict(arrays)
+        for name in changed:
+            arrays.pop(name, None)
+            value = _value(attributes[name], time)
+            if value is not None:
+                arrays[name] = from_vt(CHANNELS[name], value)
+        extent = _value(prim.GetAttribute("extent"), time)
+        yield (
+            time,
+            frame_rules.Frame(
+                arrays={name: arrays[name] for name in CHANNELS if name in arrays},
+                changed=changed,
+                attributes={name: attribute.GetName() for name, attribute in attributes.items()},
+                extent=None if extent is None else np.asarray(extent),
+                sh_degree=degree if isinstance(degree, int) else None,
+                constant_topology=topology == "constant",
+                previous=previous,
+            ),
+        )
+        previous = arrays if "positions" in arrays else None
+
+
+def _value(attribute: Usd.Attribute, time: float) -> object | None:
+    """Read a value; what a broken clip layer cannot give is None, and a rule about clips says so."""
+    try:
+        return attribute.Get(time)
+    except Tf.ErrorException:
+        return None
+
+
+def _usd_findings(stage: Usd.Stage) -> Iterator[Finding]:
+    """Run every validator of OpenUSD and its plug-ins except our own."""
+    registry = UsdValidation.ValidationRegistry()
+    names = [
+        data.name for data in registry.GetAllValidatorMetadata() if not data.isSuite and data.name != HOST_VALIDATOR
+    ]
+    # The context takes validators: lists of names or metadata are mistaken for types.
+    context = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names))
+    for error in context.Validate(stage):
+        severity: Severity = "error" if error.GetType() == UsdValidation.ValidationErrorType.Error else "warning"
+        site = next(iter(error.GetSites()), None)
+        prim = site.GetPrim() if site is not None and site.IsPrim() else None
+        path = str(prim.GetPath()) if prim else "/"
+        yield Finding(f"USD-{error.GetName()}", severity, " ".join(error.GetMessage().split()), path)
+
+
+def main() -> None:
+    """Validate the asset named on the command line and print the report, or why it cannot be opened."""
+    register()
+    try:
+        stage = Usd.Stage.Open(sys.argv[1], Usd.Stage.LoadAll)
+    except Tf.ErrorException as error:
+        print(json.dumps({"error": said_by_usd(error)}))
+        return
+    report = validate_stage(stage)
+    print(json.dumps(report.as_dict(), allow_nan=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""Writes a sequence as a USD asset: decides which files there are and puts them in place.
+
+The layout of the files is in SPEC.md; what a layer says is in `beam_warp.schema.authoring`.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import islice
+from pathlib import Path
+
+from pxr import Sdf
+
+from beam_warp.assets import GaussianSequence
+from beam_warp.checks import require_count
+from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.schema import register
+from beam_warp.schema.authoring import (
+    AssetContents,
+    author_asset_prim,
+    author_clips,
+    author_declarations,
+    author_frame,
+    author_splats_prim,
+    author_stage,
+)
+from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
+from beam_warp.schema.staging import publish, staged_folder
+from beam_warp.schema.survey import survey_sequence
+
+SUFFIXES = (".usda", ".usdc", ".usdz")
+
+MAX_FRAMES_IN_ONE_LAYER = 60
+"""Above this many frames a ``.usda`` or ``.usdz`` asset is cut into value clips."""
+
+USDZ_LIMIT = 2**32
+"""OpenUSD reads no ZIP64: an archive must stay below 4 GiB."""
+
+
+def write_asset(
+    sequence: GaussianSequence,
+    path: str | Path,
+    *,
+    full_float: bool = False,
+    segment_length: int = 30,
+) -> list[Path]:
+    """Write a relightable 4D Gaussian asset.
+
+    Reads every frame twice (first to learn what varies and which precision is safe) and holds one segment at a time.
+    Arrays that are the same in every frame are written once. Arrays are written in half precision where that is safe
+    (see `beam_warp.schema.layout`); positions always in float.
+
+    Args:
+        sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
+            ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units`` set
+            the attributes of these names; all keys are kept in ``customData`` of ``/Asset``.
+        path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
+            ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
+        full_float: Write every array in float.
+        segment_length: Frames in one value clip, and held in memory at once.
+
+    Returns:
+        The files written, the one to open last.
+
+    Raises:
+        InvalidOptionError: Axes, file name or options break their contract.
+        InvalidArrayError: The frames do not hold the same arrays.
+        OutputError: The files cannot be written, or a package would reach 4 GiB. Nothing is left behind.
+    """
+    target = _require_target(path)
+    require_count("segment_length", segment_length)
+    register()
+    survey = survey_sequence(sequence)
+    half = frozenset() if full_float else survey.half
+    clipped = len(sequence) > MAX_FRAMES_IN_ONE_LAYER and bool(survey.varying) and target.suffix != ".usdc"
+    contents = AssetContents(sequence, survey, half, segment_length if clipped else 0)
+    if target.suffix == ".usdz":
+        _require_below_limit(target, contents.byte_count)
+    with staged_folder(target) as folder:
+        if clipped:
+            names = _write_clips(contents, folder, target.stem)
+        elif target.suffix == ".usda":
+            names = _write_text_and_data(contents, folder, target.stem, segment_length)
+        else:
+            names = _write_single(contents, folder, f"{target.stem}.usdc", segment_length)
+        if target.suffix == ".usdz":
+            names = [_pack(folder, names, target)]
+        return publish(folder, names, target.parent)
+
+
+def _write_single(contents: AssetContents, folder: Path, name: str, save_every: int) -> list[str]:
+    """Write one binary layer with everything; saving as we go keeps memory flat, since USD maps what is on disk."""
+    layer = Sdf.Layer.CreateNew(str(folder / name))
+    author_stage(layer, contents)
+    author_asset_prim(layer, contents)
+    author_splats_prim(layer, contents)
+    if contents.varying:
+        for frame, arrays in contents.frames():
+            author_frame(layer, contents, frame, arrays)
+            if (frame + 1) % save_every == 0:
+                _save(layer)
+    _save(layer)
+    return [name]
+
+
+def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, save_every: int) -> list[str]:
+    """Write a text root layer and one binary layer with all frames."""
+    data = f"{stem}.static.usdc" if not contents.varying else f"{stem}.frames.usdc"
+    names = _write_single(contents, folder, data, save_every)
+    return [*names, _write_root(contents, folder, stem, data, [])]
+
+
+def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
+    """Write a text root layer, a binary layer of what is constant, a manifest, and a binary layer per segment."""
+    static = Sdf.Layer.CreateNew(str(folder / f"{stem}.static.usdc"))
+    author_stage(static, contents)
+    author_asset_prim(static, contents)
+    author_splats_prim(static, contents)
+    _save(static)
+
+    manifest = _clip_layer(contents, folder / f"{stem}.manifest.usda")
+    _save(manifest)
+
+    segments: list[tuple[int, str]] = []
+    frames = contents.frames()
+    for start in range(0, len(contents.sequence), contents.segment_length):
+        name = f"{stem}.{start:06d}.usdc"
+        layer = _clip_layer(contents, folder / name)
+        for frame, arrays in islice(frames, contents.segment_length):
+            author_frame(layer, contents, frame, arrays)
+        _save(layer)
+        del layer  # frees the segment: a layer lives as long as somebody holds it
+        segments.append((start, name))
+    data = [name for _, name in segments]
+    root = _write_root(contents, folder, stem, f"{stem}.static.usdc", segments)
+    return [f"{stem}.static.usdc", f"{stem}.manifest.usda", *data, root]
+
+
+def _clip_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
+    """Create a layer that declares exactly what varies: USD takes everything else from the static layer."""
+    layer = Sdf.Layer.CreateNew(str(path))
+    author_stage(layer, contents)
+    author_declarations(Sdf.CreatePrimInLayer(layer, SPLATS_PATH), contents, tuple(sorted(contents.varying)))
+    return layer
+
+
+def _write_root(contents: AssetContents, folder: Path, stem: str, data: str, segments: list[tuple[int, str]]) -> str:
+    """Write the text layer that is opened: stage metadata, a reference to the data, and clips if there are any."""
+    name = f"{stem}.usda"
+    layer = Sdf.Layer.CreateNew(str(folder / name))
+    author_stage(layer, contents)
+    prim = Sdf.CreatePrimInLayer(layer, ASSET_PATH)
+    prim.specifier = Sdf.SpecifierDef
+    prim.typeName = "Xform"
+    prim.referenceList.prependedItems = [Sdf.Reference(f"./{data}", ASSET_PATH)]
+    if segments:
+        relative = [(start, f"./{segment}") for start, segment in segments]
+        splats = Sdf.CreatePrimInLayer(layer, SPLATS_PATH)
+        author_clips(splats, f"./{stem}.manifest.usda", relative, len(contents.sequence) - 1)
+    _save(layer)
+    return name
+
+
+def _save(layer: Sdf.Layer) -> None:
+    if not layer.Save():
+        raise OutputError(
+            f"{Path(layer.realPath).name} must be writable, got a failed save. Free space or choose another place; "
+            "nothing was left behind."
+        )
+
+
+def _pack(folder: Path, names: list[str], target: Path) -> str:
+    """Pack staged layers into a package, the one to open first, as USDZ wants."""
+    _require_below_limit(target, sum((folder / name).stat().st_size for name in names))
+    archive = Sdf.ZipFileWriter.CreateNew(str(folder / target.name))
+    for name in reversed(names):
+        archive.AddFile(str(folder / name), name)
+    if not archive.Save():
+        raise OutputError(f"{target} must be writable, got a failed save. Free space or choose another place.")
+    return target.name
+
+
+def _require_below_limit(target: Path, size: int) -> None:
+    if size >= USDZ_LIMIT:
+        raise OutputError(
+            f"{target} must stay below 4 GiB, got {size / 2**30:.1f} GiB of data. "
+            f"Write {target.stem}.usda, or fewer frames."
+        )
+
+
+def _require_target(path: str | Path) -> Path:
+    """Refuse names that USD's asset paths cannot spell."""
+    target = Path(path)
+    if target.suffix not in SUFFIXES:
+        raise InvalidOptionError(
+            f"path must end in {', '.join(SUFFIXES)}, got {target.name!r}. Choose .usda for long sequences."
+        )
+    if re.search(r"[\[\]@:*?\"<>|\\\x00-\x1f]", target.name):
+        raise InvalidOptionError(
+            f'path must name a file without []@:*?"<>|\\ or control characters, got {target.name!r}. Rename it.'
+        )
+    return target
