@@ -1,0 +1,302 @@
+"""``beam render``: a relightable asset under a given light, from one camera or from those of a capture."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tyro.conf import Positional, arg
+
+from beam_warp import converters
+from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.axes import change_axes
+from beam_warp.cameras import MAX_SIDE, Camera, bulk
+from beam_warp.captures import Capture, CaptureRecord
+from beam_warp.checks import require_count, require_range
+from beam_warp.cli.console import print_json, progress
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.images import display_image, srgb_to_linear, write_exr, write_png
+
+if TYPE_CHECKING:
+    from beam_warp.deferred import EnvironmentLighting
+
+DEFAULT_SIDE = 1024
+"""Width and height where none is given [pixel]."""
+
+FRAMING_FRAMES = 3
+"""A camera that frames a moving subject looks at this many of its frames: first, last and between."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Light a relightable asset and draw it.
+
+    Without a camera, the asset is framed from the front. With --capture, every test record of the capture is drawn
+    into the folder --out as CAMERA_FRAME.exr: with --aov, in the layers and units of the capture's ground truth.
+
+    Example: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
+    """
+
+    asset: Annotated[Positional[Path], arg(metavar="ASSET", help="PLY or USD file, or a folder of numbered PLY files.")]
+    out: Annotated[
+        Path, arg(metavar="FILE", help=".png or .exr, numbered if there are several frames; a folder with --capture.")
+    ]
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Lat-long light, .exr or .hdr; by default the capture's own.")
+    ] = None
+    orbit: Annotated[
+        tuple[float, float] | None,
+        arg(metavar="AZIMUTH ELEVATION", help="Frame the asset from here, in degrees; 0 0 looks along +y."),
+    ] = None
+    look_at: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="EX EY EZ TX TY TZ", help="Camera position and what it looks at, in metres, z up."),
+    ] = None
+    capture: Annotated[Path | None, arg(metavar="DIR", help="Draw from the cameras of this capture.")] = None
+    split: Annotated[str, arg(help="Which records of the capture.")] = "test"
+    frame: Annotated[int | None, arg(metavar="N", help="Only this frame, counted from 0; all by default.")] = None
+    width: Annotated[int | None, arg(metavar="PX", help=f"Image width; {DEFAULT_SIDE} by default.")] = None
+    height: Annotated[int | None, arg(metavar="PX", help="Image height; the width by default.")] = None
+    fov: Annotated[float | None, arg(metavar="DEG", help="Vertical field of view; 35 by default.")] = None
+    rotate: Annotated[float, arg(metavar="DEG", help="Turn the light about z, counter-clockwise from above.")] = 0.0
+    exposure: Annotated[float, arg(metavar="STOPS", help="Brighten the light by powers of two.")] = 0.0
+    background: Annotated[
+        tuple[float, float, float] | Literal["transparent"],
+        arg(metavar="R G B", help="Display colour behind the asset, 0 to 1; transparent by default."),
+    ] = "transparent"
+    aov: Annotated[bool, arg(help="Also write base colour, roughness, occlusion, normal and depth (.exr).")] = False
+    antialiased: Annotated[bool, arg(help="For an asset trained with the 2D anti-aliasing filter.")] = False
+    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+
+
+@dataclass(frozen=True)
+class View:
+    """One image to draw: which frame, from where, into which file."""
+
+    frame: int
+    camera: Camera
+    path: Path
+
+
+def render(args: Render) -> int:
+    """Draw what was asked for, and say what was written."""
+    started = time.perf_counter()
+    _require_consistent(args)
+    environment_path, capture = args.environment, None
+    if args.capture is not None:
+        capture = Capture.read(args.capture)
+        environment_path = environment_path or capture.environment_path
+    if environment_path is None:
+        raise InvalidOptionError(
+            "environment must be given, got none. Pass --environment with a lat-long .exr or .hdr image."
+        )
+    environment = EnvironmentMap.read(environment_path).rotated(args.rotate).exposed(args.exposure)
+    sequence = converters.read(args.asset, source_axes=args.source_axes)
+    _require_frame(args, len(sequence))
+    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    if capture is not None:
+        views = _capture_views(args, capture, len(sequence), notes)
+    else:
+        views = _numbered_views(args, sequence)
+
+    import warp as wp
+
+    from beam_warp.deferred import EnvironmentLighting
+
+    wp.config.log_level = wp.LOG_WARNING  # Warp greets on stdout, which belongs to the result
+    lighting = EnvironmentLighting.from_environment(environment, device=args.device)
+    gaussian_count = 0
+    with progress(args.quiet or args.json) as report:
+        for done, (view, cloud) in enumerate(_with_clouds(args, views, sequence), start=1):
+            _draw(args, view, cloud, lighting)
+            gaussian_count = max(gaussian_count, len(cloud))
+            report("render", done, len(views))
+    seconds = time.perf_counter() - started
+    if args.json:
+        print_json(
+            {
+                "outputs": [str(view.path) for view in views],
+                "frames": sorted({view.frame for view in views}),
+                "gaussian_count": gaussian_count,
+                "device": lighting.device,
+                "notes": notes,
+                "seconds": round(seconds, 3),
+            }
+        )
+    elif not args.quiet:
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
+        last = f" … {views[-1].path.name}" if len(views) > 1 else ""
+        images = f"{len(views)} images, " if len(views) > 1 else ""
+        print(f"wrote {views[0].path}{last}: {images}{gaussian_count:,} Gaussians, {seconds:.2f} s")
+    return 0
+
+
+def _require_consistent(args: Render) -> None:
+    """Refuse options that contradict each other, before anything is read."""
+    given = [
+        flag
+        for flag, value in (("orbit", args.orbit), ("look-at", args.look_at), ("capture", args.capture))
+        if value is not None
+    ]
+    if len(given) > 1:
+        raise InvalidOptionError(f"camera must be given once, got --{' and --'.join(given)}. Leave one out.")
+    if args.background != "transparent":
+        require_range("background", np.asarray(args.background), 0.0, 1.0, "Use display values from 0 to 1.")
+    if args.capture is not None:
+        sized = [name for name in ("width", "height", "fov") if getattr(args, name) is not None]
+        if sized:
+            raise InvalidOptionError(
+                f"{sized[0]} must be left out with --capture, got {getattr(args, sized[0])}. "
+                "Its cameras have their own."
+            )
+        if args.out.exists() and not args.out.is_dir():
+            raise OutputError(f"out must be a folder with --capture, got the file {args.out}. Name a folder.")
+        return
+    if args.out.suffix.lower() not in (".png", ".exr"):
+        raise InvalidOptionError(f"out must end in .png or .exr, got {args.out.name}. Rename it.")
+    if args.aov and args.out.suffix.lower() != ".exr":
+        raise InvalidOptionError(f"out must end in .exr to hold the layers of --aov, got {args.out.name}. Rename it.")
+    if not args.out.parent.is_dir():
+        raise OutputError(f"out must be in a folder that exists, got {args.out.parent}. Create it first.")
+
+
+def _require_frame(args: Render, frame_count: int) -> None:
+    """Refuse a frame that the asset lacks."""
+    if args.frame is not None:
+        require_count("frame", args.frame, 0, frame_count - 1)
+
+
+def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list[str]) -> list[View]:
+    """Plan one image for each record of the split whose frame the asset has; say what is left out."""
+    records = capture.select(split=args.split, frames=None if args.frame is None else (args.frame,))
+    if not records:
+        frame = "" if args.frame is None else f" of frame {args.frame}"
+        raise InvalidOptionError(
+            f"split must name records of the capture{frame}, got {args.split!r} "
+            f"(it has {', '.join(capture.splits)}). Choose one of them."
+        )
+    within = [record for record in records if record.frame < frame_count]
+    if len(within) < len(records):
+        beyond = sorted({record.frame for record in records if record.frame >= frame_count})
+        notes.append(
+            f"{len(records) - len(within)} records are of frames that the asset lacks "
+            f"({', '.join(map(str, beyond[:5]))}{', …' if len(beyond) > 5 else ''}): not drawn"
+        )
+    if not within:
+        raise InvalidOptionError(
+            f"asset must have a frame that the records of split {args.split!r} show, got {frame_count} frames in "
+            f"{args.asset}. Choose another split."
+        )
+    for record in within:
+        _require_pinhole(record)
+    try:
+        args.out.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"out must be a folder that can be made, got {args.out} ({error.strerror}).") from error
+    return [View(record.frame, record.camera, args.out / f"{record.name}.exr") for record in within]
+
+
+def _require_pinhole(record: CaptureRecord) -> None:
+    """Refuse to draw through a lens that bends lines: the picture would not lie over the photograph."""
+    if record.is_distorted:
+        raise InvalidOptionError(
+            f"camera must be free of distortion to be rendered, got {list(record.distortion)} at {record.name}. "
+            "Undistort the capture's images first."
+        )
+
+
+def _numbered_views(args: Render, sequence: GaussianSequence) -> list[View]:
+    """Plan one image for each frame, all from one camera."""
+    frames = range(len(sequence)) if args.frame is None else range(args.frame, args.frame + 1)
+    camera = _camera(args, sequence, frames)
+    if len(frames) == 1:
+        return [View(frames[0], camera, args.out)]
+    return [View(frame, camera, converters.numbered_path(args.out, frame)) for frame in frames]
+
+
+def _camera(args: Render, sequence: GaussianSequence, frames: range) -> Camera:
+    """Place the camera that was asked for; one that frames the asset sees several of its frames."""
+    width = require_count("width", DEFAULT_SIDE if args.width is None else args.width, 1, MAX_SIDE)
+    lens = {
+        "width": width,
+        "height": width if args.height is None else args.height,
+        "vertical_fov": 35.0 if args.fov is None else args.fov,
+    }
+    if args.look_at is not None:
+        return Camera.look_at(args.look_at[:3], args.look_at[3:], **lens)
+    picked = sorted({frames[round(i)] for i in np.linspace(0, len(frames) - 1, FRAMING_FRAMES)})
+    clouds = (_cloud(args, sequence, frame) for frame in picked)
+    seen = np.concatenate([bulk(cloud.positions, cloud.opacities) for cloud in clouds])
+    azimuth, elevation = (0.0, 0.0) if args.orbit is None else args.orbit
+    return Camera.frame_points(seen, azimuth=azimuth, elevation=elevation, **lens)
+
+
+def _with_clouds(args: Render, views: list[View], sequence: GaussianSequence) -> Iterator[tuple[View, GaussianCloud]]:
+    """Give each view its cloud, frame by frame, so that each is read once and one is held at a time."""
+    held, cloud = -1, None
+    for view in sorted(views, key=lambda view: view.frame):
+        if cloud is None or view.frame != held:
+            held, cloud = view.frame, _cloud(args, sequence, view.frame)
+        yield view, cloud
+
+
+def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianCloud:
+    """Read a frame into the internal world; it must be relightable."""
+    cloud = sequence[frame]
+    if not cloud.is_relightable:
+        missing = [
+            name for name in ("base_color", "roughness", "ambient_occlusion", "normals") if getattr(cloud, name) is None
+        ]
+        raise InvalidOptionError(
+            f"asset must be relightable, got one without {', '.join(missing)} at {args.asset}. "
+            "Estimate its materials with beam run."
+        )
+    return change_axes(cloud, WORLD_AXES)
+
+
+def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting) -> None:
+    """Draw one image and write it."""
+    from beam_warp.deferred import shade
+    from beam_warp.rasterizing import rasterize
+
+    buffer = rasterize(cloud, view.camera, device=args.device, antialiased=args.antialiased)
+    radiance = shade(
+        base_color=buffer.channels["base_color"],
+        roughness=buffer.channels["roughness"],
+        ambient_occlusion=buffer.channels["ambient_occlusion"],
+        normals=buffer.channels["normals"],
+        alpha=buffer.alpha,
+        view_directions=view.camera.directions(),
+        lighting=lighting,
+    )
+    alpha = buffer.alpha
+    if args.background != "transparent":
+        behind = srgb_to_linear(np.asarray(args.background, np.float32))
+        radiance = radiance + (1.0 - alpha[..., None]) * behind
+        alpha = np.ones_like(alpha)
+    if view.path.suffix.lower() == ".png":
+        write_png(view.path, _display(radiance, alpha))
+        return
+    layers = buffer.layers() if args.aov else {}
+    layers.update({"R": radiance[..., 0], "G": radiance[..., 1], "B": radiance[..., 2], "A": alpha})
+    write_exr(view.path, layers)
+
+
+def _display(radiance: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Encode premultiplied radiance for a PNG, whose alpha is straight; without alpha if it is 1 everywhere."""
+    straight = np.divide(radiance, alpha[..., None], out=np.zeros_like(radiance), where=alpha[..., None] > 0.0)
+    color = display_image(straight)
+    if (alpha == 1.0).all():
+        return color
+    return np.concatenate([color, np.rint(alpha[..., None] * 255.0).astype(np.uint8)], axis=-1)

@@ -1,0 +1,268 @@
+"""``beam render``: pictures of a known asset under known light, the capture's layers, and every refusal."""
+
+import json
+
+import numpy as np
+import pytest
+import tyro
+from tyro.conf import FlagCreatePairsOff
+
+from beam_warp import converters
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.cameras import Camera
+from beam_warp.cli.console import run_command
+from beam_warp.cli.render import Render, render
+from beam_warp.images import linear_to_srgb, read_image, write_exr
+
+SIDE = ["--width", "48"]
+
+LAYERS = {"R", "G", "B", "A", "depth", "roughness", "ambient_occlusion"} | {
+    f"{name}.{part}" for name, parts in (("base_color", "RGB"), ("normal", "XYZ")) for part in parts
+}
+
+CODED = 2e-3
+"""A PLY keeps materials as 32-bit floats; compositing and half a hundred splats a pixel round below this."""
+
+
+def run(*words):
+    args = tyro.cli(Render, args=[str(word) for word in words], config=(FlagCreatePairsOff,))
+    return run_command(lambda: render(args))
+
+
+def sphere(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
+    """Opaque flat discs on a ball of radius 0.5 m."""
+    index = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * index / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
+    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
+    return GaussianCloud(
+        positions=0.5 * normals + center,
+        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        scales=np.tile([0.015, 0.015, 1e-4], (count, 1)),
+        opacities=np.full(count, 0.99),
+        radiance=np.zeros((count, 1, 3)),
+        radiance_color_space="lin_rec709_scene",
+        base_color=np.tile(color, (count, 1)),
+        roughness=np.full(count, 0.5),
+        ambient_occlusion=np.ones(count),
+        normals=normals,
+    )
+
+
+def see_ball(camera):
+    """Normals and depth of the ball by intersecting its sphere; NaN where it is not seen."""
+    rays = camera.directions()
+    along = rays @ -camera.position
+    with np.errstate(invalid="ignore"):
+        distance = along - np.sqrt(along**2 - camera.position @ camera.position + 0.25)
+    return (camera.position + distance[..., None] * rays) / 0.5, distance * (rays @ camera.forward)
+
+
+def save(clouds, path):
+    converters.write(GaussianSequence.from_clouds(clouds), path, converters.WriteOptions(profile="beam"))
+
+
+@pytest.fixture
+def ball(tmp_path):
+    save([sphere()], tmp_path / "ball.ply")
+    return tmp_path / "ball.ply"
+
+
+@pytest.fixture
+def white_light(tmp_path):
+    path = tmp_path / "white.exr"
+    write_exr(path, {name: np.ones((8, 16)) for name in "RGB"})
+    return path
+
+
+@pytest.fixture
+def sided_light(tmp_path):
+    """Light from +x alone, which is the middle of the image."""
+    path = tmp_path / "sided.exr"
+    texels = np.zeros((16, 32))
+    texels[6:10, 14:18] = 100.0
+    write_exr(path, dict.fromkeys("RGB", texels))
+    return path
+
+
+def write_capture(folder, cameras, **changes):
+    """A capture of one camera per (name, frame, split), without images: none are needed to draw over them."""
+    folder.mkdir()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera = Camera.orbit((0, 0, 0), 3.0, 30.0, 20.0, width=40, height=32, vertical_fov=30.0)
+    content = {
+        "w": 40, "h": 32, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 20, "cy": 16,
+        "frames": [
+            {"file_path": f"images/{name}/{frame:04d}.exr", "camera": name, "frame": frame, "split": split,
+             "transform_matrix": (camera.camera_to_world @ flip).tolist(), **changes}
+            for name, frame, split in cameras
+        ],
+    }  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return camera
+
+
+def test_exr_shows_the_white_furnace(ball, white_light, tmp_path):
+    assert run(ball, "--environment", white_light, "--out", tmp_path / "x.exr", *SIDE, "--aov", "--device", "cpu") == 0
+    layers = read_image(tmp_path / "x.exr").channels
+    assert set(layers) == LAYERS
+    solid = layers["A"] > 0.99
+    assert 0.4 < solid.mean() < np.pi / 4
+    np.testing.assert_allclose(layers["base_color.G"][solid], 0.4, atol=CODED)
+    np.testing.assert_allclose(layers["roughness"][solid], 0.5, atol=CODED)
+    expected_normals, expected_depth = see_ball(Camera.frame_points(sphere().positions, width=48, height=48))
+    facing = solid & (expected_depth < 1.5)  # where the surface is turned by 53 degrees at most
+    normals = np.stack([layers[f"normal.{part}"] for part in "XYZ"], axis=-1)
+    # A disc's deviation is 0.015 m, the low-pass's 0.55 pixel or 0.01 m, 0.017 m on the turned surface: 0.023 together.
+    # Discs nearer to the camera cover others up to three of these away, and the ball's radius is 0.5 m: 0.14 rad.
+    assert (normals * expected_normals).sum(axis=-1)[facing].min() > np.cos(0.14)
+    np.testing.assert_allclose(layers["depth"][facing], expected_depth[facing], atol=0.01)
+    # Under uniform light of 1, the reflected light lies between the base colour and 1, and follows the colour.
+    for part, low in (("R", 0.8), ("G", 0.4), ("B", 0.2)):
+        radiance = layers[part][solid] / layers["A"][solid]
+        assert radiance.min() > low - 1e-2
+        assert radiance.max() < 1.0
+    assert (layers["R"][solid] > layers["G"][solid]).all()
+
+
+def test_light_from_the_right_lights_the_right_and_turns(ball, sided_light, tmp_path):
+    def sides(*more):
+        assert run(ball, "--environment", sided_light, "--out", tmp_path / "x.exr", *SIDE, *more) == 0
+        green = read_image(tmp_path / "x.exr").channels["G"]
+        return green[:, 30:].mean(), green[:, :18].mean()
+
+    right, left = sides()
+    assert right > 5 * left
+    _, turned_left = sides("--rotate", 180, "--exposure", 1)
+    assert turned_left == pytest.approx(2 * right, rel=0.02)  # the ball's discs are not laid out symmetrically
+    right, left = sides("--orbit", 180, 0)
+    assert left > 5 * right
+
+
+def test_png_is_display_encoded_with_straight_alpha(ball, white_light, tmp_path):
+    common = [ball, "--environment", white_light, *SIDE]
+    assert run(*common, "--out", tmp_path / "x.exr") == 0
+    assert run(*common, "--out", tmp_path / "x.png") == 0
+    linear, coded = read_image(tmp_path / "x.exr").channels, read_image(tmp_path / "x.png").channels
+    solid = linear["A"] > 0.99
+    expected = linear_to_srgb(linear["G"][solid] / linear["A"][solid])
+    np.testing.assert_allclose(coded["G"][solid], expected, atol=0.51 / 255)
+    np.testing.assert_allclose(coded["A"], linear["A"], atol=0.51 / 255)
+    assert run(*common, "--out", tmp_path / "y.png", "--background", 0, 0.5, 1) == 0
+    picture = read_image(tmp_path / "y.png")
+    assert picture.alpha is None
+    np.testing.assert_allclose(picture.rgb()[0, 0], [0, 0.5, 1], atol=0.51 / 255)
+
+
+def test_look_at_and_size(ball, white_light, tmp_path):
+    out = tmp_path / "x.exr"
+    look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, "--aov"]
+    assert run(ball, "--environment", white_light, "--out", out, *look) == 0
+    image = read_image(out)
+    assert (image.width, image.height) == (60, 30)
+    assert image.channels["depth"][15, 30] == pytest.approx(4.5, abs=2e-3)
+
+
+def test_several_frames_are_numbered_and_share_a_camera(white_light, tmp_path, capsys):
+    (tmp_path / "walk").mkdir()
+    save([sphere((x, 0, 0)) for x in (-0.5, 0.0, 0.5)], tmp_path / "walk" / "walk.ply")
+    common = [tmp_path / "walk", "--environment", white_light, *SIDE, "--height", 24, "--json"]
+    assert run(*common, "--out", tmp_path / "x.png") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["outputs"] == [str(tmp_path / f"x{n:06d}.png") for n in range(3)]
+    assert result["frames"] == [0, 1, 2]
+    assert result["gaussian_count"] == 10_000
+    middles = []
+    for n in range(3):
+        alpha = read_image(tmp_path / f"x{n:06d}.png").channels["A"]
+        middles.append((alpha * np.arange(48)).sum() / alpha.sum())
+    assert middles[0] < middles[1] - 3 < middles[2] - 6
+    assert run(*common, "--out", tmp_path / "one.png", "--frame", 2) == 0
+    np.testing.assert_array_equal(read_image(tmp_path / "one.png").channels["A"].shape, (24, 48))
+    assert not (tmp_path / "one000002.png").exists()
+
+
+def test_capture_gives_a_file_for_each_record(ball, white_light, tmp_path, capsys):
+    cameras = [("a", 0, "train"), ("b", 0, "test"), ("c", 0, "test"), ("b", 7, "test")]
+    camera = write_capture(tmp_path / "capture", cameras)
+    out = tmp_path / "out"
+    common = [ball, "--capture", tmp_path / "capture", "--environment", white_light, "--out", out]
+    assert run(*common, "--aov") == 0
+    assert sorted(path.name for path in out.iterdir()) == ["b_0000.exr", "c_0000.exr"]
+    assert "1 records are of frames that the asset lacks (7): not drawn" in capsys.readouterr().err
+    layers = read_image(out / "b_0000.exr").channels
+    assert set(layers) == LAYERS
+    assert layers["A"].shape == (32, 40)
+    assert layers["depth"][16, 20] == pytest.approx(2.5, abs=2e-3)
+    toward = -camera.forward  # the ball's nearest point faces the camera
+    found = [layers[f"normal.{part}"][15:17, 19:21].mean() for part in "XYZ"]
+    np.testing.assert_allclose(found, toward, atol=0.03)
+    assert run(*common, "--split", "train", "--frame", 0, "--quiet") == 0
+    assert (out / "a_0000.exr").exists()
+    assert set(read_image(out / "a_0000.exr").channels) == set("RGBA")
+
+
+def test_the_capture_brings_its_light(ball, white_light, tmp_path):
+    write_capture(tmp_path / "capture", [("b", 0, "test")])
+    white_light.rename(tmp_path / "capture" / "environment.exr")
+    assert run(ball, "--capture", tmp_path / "capture", "--out", tmp_path / "out") == 0
+    assert read_image(tmp_path / "out" / "b_0000.exr").channels["G"].max() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "x.jpg"], "out must end in .png or .exr, got x.jpg. Rename it."),
+        (["--out", "x.png", "--aov"], "out must end in .exr to hold the layers of --aov, got x.png"),
+        (["--out", "nowhere/x.png"], "out must be in a folder that exists, got nowhere"),
+        (["--out", "x.png", "--orbit", "0", "0", "--capture", "c"], "got --orbit and --capture. Leave one out."),
+        (["--out", "o", "--capture", "c", "--width", "9"], "width must be left out with --capture, got 9"),
+        (["--out", "x.png", "--background", "0", "0", "2"], "background must lie in [0, 1], got 2"),
+        (["--out", "x.png", "--frame", "3"], "frame must be an integer in [0, 0], got 3"),
+        (["--out", "x.png", "--width", "0"], "width must be an integer in [1, 65536], got 0"),
+        (["--out", "x.png", "--orbit", "0", "100"], "elevation must be a number in [-90, 90], got 100.0"),
+        (["--out", "x.png", "--fov", "nan"], "vertical_fov must be a number in"),
+        (["--out", "x.png", "--device", "cuda:9"], "device must be one of cpu"),
+        (["--out", "x.png", "--exposure", "nan"], "must be a number in"),
+    ],
+)
+def test_refusals_are_one_line(ball, white_light, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert run(ball, "--environment", white_light, *words) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
+    out = tmp_path / "x.png"
+    assert run(ball, "--out", out) == 2
+    assert "environment must be given, got none" in capsys.readouterr().err
+    assert run(ball, "--environment", tmp_path / "no.exr", "--out", out) == 2
+    assert "no.exr" in capsys.readouterr().err
+    converters.write(GaussianSequence.from_clouds([sphere()]), tmp_path / "plain.ply")
+    assert run(tmp_path / "plain.ply", "--environment", white_light, "--out", out) == 2
+    error = capsys.readouterr().err
+    assert "asset must be relightable, got one without base_color, roughness, ambient_occlusion at" in error
+    assert "beam run" in error
+    assert not out.exists()
+
+
+def test_capture_refusals(ball, white_light, tmp_path, capsys):
+    write_capture(tmp_path / "bent", [("b", 0, "test")], k1=0.1)
+    write_capture(tmp_path / "late", [("b", 5, "test")])
+    out = tmp_path / "out"
+    common = [ball, "--environment", white_light, "--out", out]
+    assert run(*common, "--capture", tmp_path / "bent") == 2
+    assert "camera must be free of distortion to be rendered, got [0.1" in capsys.readouterr().err
+    assert run(*common, "--capture", tmp_path / "late") == 2
+    assert "asset must have a frame that the records of split 'test' show, got 1 frames" in capsys.readouterr().err
+    assert run(*common, "--capture", tmp_path / "late", "--split", "val") == 2
+    assert "split must name records of the capture, got 'val' (it has test)" in capsys.readouterr().err
+    assert not out.exists()
+    out.touch()
+    assert run(*common, "--capture", tmp_path / "bent") == 2
+    assert "out must be a folder with --capture, got the file" in capsys.readouterr().err
