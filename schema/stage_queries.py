@@ -89,6 +89,11 @@ def radiance_color_space(prim: Usd.Prim) -> tuple[str | None, str]:
     return _COLOR_SPACES.get(str(word)), str(word or "")
 
 
+def has_whole_clips(prim: Usd.Prim) -> bool:
+    """Say whether all clip layers of a prim open; where one does not, every question about samples raises."""
+    return not any(clips.missing_layers() for clips in clip_sets(prim))
+
+
 @dataclass(frozen=True)
 class ClipSet:
     """One set of explicit value clips of a prim.

@@ -125,18 +125,18 @@ def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
 
 def _require_same_kind(sequence: GaussianSequence, frame: int, cloud: GaussianCloud, first: GaussianCloud) -> None:
     """Refuse a frame that one prim cannot hold together with frame 0."""
-    for label, got, wanted in _kinds(cloud, first):
-        if got != wanted:
-            raise InvalidOptionError(
-                f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
-                "Convert the frames to one form."
-            )
     names, wanted_names = set(cloud.arrays()), set(first.arrays())
     if names != wanted_names:
         raise InvalidArrayError(
             f"frames must hold the same arrays, got a difference in {', '.join(sorted(names ^ wanted_names))} "
             f"at frame {frame}. Fill or drop these arrays everywhere."
         )
+    for label, got, wanted in _kinds(cloud, first):
+        if got != wanted:
+            raise InvalidOptionError(
+                f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
+                "Convert the frames to one form."
+            )
     if len(cloud) != len(first) and (sequence.topology == "constant" or "positions" in sequence.constant):
         raise InvalidOptionError(
             f"topology must be perFrame where counts change, got {len(cloud)} Gaussians after {len(first)} at frame "
