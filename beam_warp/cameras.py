@@ -16,6 +16,9 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 MAX_SIDE = 65_536
 """Largest image side in pixels: beyond it a size is a mistake, not a picture."""
 
+MAX_PIXELS = 2**28
+"""Most pixels of one image, 16,384 x 16,384: a G-buffer of it takes 12 GB."""
+
 RIGID_TOLERANCE = 1e-4
 """Largest entry of |R^T R - I| accepted as a rotation: single-precision poses printed with six digits are within it."""
 
@@ -53,6 +56,10 @@ class Camera:
         """Check every field once."""
         for name in ("width", "height"):
             object.__setattr__(self, name, require_count(name, getattr(self, name), 1, MAX_SIDE))
+        if self.width * self.height > MAX_PIXELS:
+            raise InvalidOptionError(
+                f"width x height must be at most {MAX_PIXELS}, got {self.width} x {self.height}. Choose a smaller image."
+            )
         for name in ("focal_x", "focal_y"):
             object.__setattr__(self, name, require_number(name, getattr(self, name), 1e-3, 1e9))
         for name in ("center_x", "center_y"):

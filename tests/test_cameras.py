@@ -88,6 +88,8 @@ def test_errors_name_the_contract():
 
     with pytest.raises(InvalidOptionError, match=r"width must be an integer in \[1, 65536\], got 0"):
         camera(width=0)
+    with pytest.raises(InvalidOptionError, match="width x height must be at most 268435456, got 65536 x 65536"):
+        camera(width=65536, height=65536)
     with pytest.raises(InvalidOptionError, match="focal_y must be a number"):
         camera(focal_y=float("nan"))
     with pytest.raises(InvalidArrayError, match=r"must hold a rotation, got .* determinant -1"):

@@ -203,7 +203,9 @@ def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list
     try:
         args.out.mkdir(exist_ok=True)
     except OSError as error:
-        raise OutputError(f"out must be a folder that can be made, got {args.out} ({error.strerror}).") from error
+        raise OutputError(
+            f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
+        ) from error
     return [View(record.frame, record.camera, args.out / f"{record.name}.exr") for record in within]
 
 
