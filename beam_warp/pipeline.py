@@ -23,11 +23,14 @@ from beam_warp import converters
 from beam_warp._version import __version__
 from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence, Observability
 from beam_warp.axes import change_axes
+from beam_warp.cameras import Camera, bulk
 from beam_warp.checks import require_number
+from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError, OutputError
 from beam_warp.frame_store import frame_key, read_frame, write_frame
+from beam_warp.images import write_png
 from beam_warp.kernels.launching import thread_count
 from beam_warp.materials import (
     BaseColor,
@@ -85,18 +88,37 @@ class RunOptions:
     device: str | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class OverviewOptions:
+    """What the contact sheet shows.
+
+    Attributes:
+        second_light: Shown beside the light of the capture; that light turned by 180 degrees if None.
+        azimuth: Camera angle; 0 looks along +y [degree].
+        elevation: Camera angle above the horizon [degree].
+        height: Height of a panel [pixel].
+    """
+
+    second_light: Relighting | None = None
+    azimuth: float = 0.0
+    elevation: float = 5.0
+    height: int = 640
+
+
 @dataclass(frozen=True)
 class RunResult:
     """Where things are, and what was done.
 
     Attributes:
         asset: Root layer of the asset.
+        overview: The contact sheet.
         sequence: The relightable sequence, read lazily from the store, axes "rfu".
         environment: The light as used: the given one times the exposure.
         report: What was measured, JSON-able; also written to ``report.json``.
     """
 
     asset: Path
+    overview: Path
     sequence: GaussianSequence
     environment: EnvironmentMap
     report: dict[str, Any]
@@ -107,9 +129,11 @@ def run(
     environment: EnvironmentMap,
     out: Path,
     options: RunOptions | None = None,
+    *,
+    overview: OverviewOptions | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
-    """Decompose a sequence and write ``out/asset.usda``, its layers and ``out/report.json``.
+    """Decompose a sequence; write ``out/asset.usda``, its layers, ``out/report.json`` and ``out/overview.png``.
 
     Every finished frame is kept in ``out/frames``; a second call with the same input and options takes up where the
     first was stopped, and one with other input or options starts over.
@@ -119,6 +143,7 @@ def run(
         environment: The light of the capture, in the world "rfu".
         out: Folder; made if its parent exists.
         options: See `RunOptions`.
+        overview: See `OverviewOptions`.
         progress: Called with (stage, done, total).
 
     Raises:
@@ -139,10 +164,35 @@ def run(
     with job.timer("write asset"):
         asset = out / ASSET_NAME
         converters.write(relightable, asset)
+    picture = out / "overview.png"
+    with job.timer("overview"):
+        progress("overview", 0, 1)
+        _draw_overview(job, relightable, picture, overview or OverviewOptions())
+        progress("overview", 1, 1)
     report = job.report()
     report["seconds"]["total"] = time.perf_counter() - started
     write_report(out, report)
-    return RunResult(asset, relightable, job.lit, report)
+    return RunResult(asset, picture, relightable, job.lit, report)
+
+
+def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: OverviewOptions) -> None:
+    """Draw the middle frame; panels are as wide as the subject needs."""
+    cloud = sequence[len(sequence) // 2]
+    extent = np.ptp(bulk(cloud.positions, cloud.opacities), axis=0)
+    aspect = float(np.clip(np.hypot(extent[0], extent[1]) / max(extent[2], 1e-9), 0.5, 1.8))
+    camera = Camera.frame_cloud(
+        cloud.positions,
+        cloud.opacities,
+        azimuth=options.azimuth,
+        elevation=options.elevation,
+        width=round(options.height * aspect),
+        height=options.height,
+    )
+    lights = [
+        Relighting("relit by the light of the capture", job.lit),
+        options.second_light or Relighting("relit by that light turned by 180°", job.lit.rotated(180.0)),
+    ]
+    write_png(path, contact_sheet(cloud, camera, lights, device=str(job.device)))
 
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:
