@@ -304,8 +304,8 @@ class _Job:
                 factor = estimate_exposure(
                     first.cloud, scene, surface, roughness, environment, options=self.options.materials
                 )
-            write_frame(path, key, {"stops": np.array(np.log2(factor))})
-        return float(read_frame(path)["stops"])
+            write_frame(path, key, {"stops": np.array([np.log2(factor)])})
+        return float(read_frame(path)["stops"][0])
 
     def path(self, frame: int) -> Path:
         return self.folder / f"frame_{frame:06d}.h5"
