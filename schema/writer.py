@@ -53,7 +53,8 @@ def write_asset(
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
             ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units`` set
-            the attributes of these names; all keys are kept in ``customData`` of ``/Asset``.
+            the attributes of these names; all keys but
+            ``notes`` are kept in ``customData`` of ``/Asset``.
         path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
             ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
         full_float: Write every array in float.

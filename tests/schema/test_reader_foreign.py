@@ -63,7 +63,7 @@ def test_half_positions_in_centimetres_below_a_transform(tmp_path, rng):
     directions = Rotation.random(5, rng=rng).apply([0.0, 0.0, 1.0])
     seen = sh_color(cloud.radiance, TURN.apply(directions))
     assert np.abs(seen - sh_color(harmonics, directions)).max() < 1e-6
-    assert "assumed srgb_rec709_display" in found.metadata["radiance_color_space_note"]
+    assert "taken as srgb_rec709_display; the asset says nothing" in found.metadata["notes"]
 
 
 def test_a_mirror_keeps_ellipsoids_and_colours(tmp_path, rng):
@@ -101,7 +101,7 @@ def test_absent_arrays_take_the_defaults_of_usd(tmp_path, rng):
     assert np.allclose(cloud.scales, 0.01)  # one unit, and USD's unit is a centimetre
     assert np.array_equal(cloud.opacities, np.ones(5))
     assert cloud.radiance is None
-    assert found.metadata["units_note"].startswith("assumed 0.01 m per unit")
+    assert found.metadata["notes"] == "one unit is taken as 0.01 m, USD's default; the asset states none"
 
 
 def test_float_is_preferred_and_long_arrays_are_cut(tmp_path, rng):
@@ -169,7 +169,7 @@ def test_colour_space_comes_from_an_ancestor(tmp_path, rng, name, space):
     stage.Save()
     found = read_asset(tmp_path / "a.usda")
     assert found[0].radiance_color_space == space
-    assert "radiance_color_space_note" not in found.metadata
+    assert "notes" not in found.metadata
 
 
 def broken(match, error=AssetFormatError):
@@ -248,7 +248,7 @@ def test_versions(tmp_path, sequence):
     rewritten_version(path, "1.7")
     with pytest.warns(UserWarning, match=r"version 1.7 is newer than 1.0: what it added is not read"):
         found = read_asset(path, trusted=True)
-    assert found.metadata["schema_note"].startswith("version 1.7 is newer")
+    assert found.metadata["notes"].startswith("schema version 1.7 is newer")
     for version in ("2.0", "banana", ""):
         rewritten_version(path, version)
         with pytest.raises(
