@@ -101,14 +101,16 @@ def _over(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[
 
 
 def _grid(panels: Sequence[tuple[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
-    """Lay panels out with their titles, in the number of columns that comes closest to 16:9."""
+    """Lay panels out with their titles, close to 16:9 and with few empty places."""
     height, width = panels[0][1].shape[:2]
     cell = (height + TITLE_HEIGHT + MARGIN, width + MARGIN)
 
-    def aspect(columns: int) -> float:
-        return columns * cell[1] / (-(-len(panels) // columns) * cell[0])
+    def cost(columns: int) -> float:
+        rows = -(-len(panels) // columns)
+        aspect = columns * cell[1] / (rows * cell[0])
+        return abs(float(np.log(aspect * 9.0 / 16.0))) + 0.3 * (rows * columns - len(panels))
 
-    columns = min(range(1, len(panels) + 1), key=lambda n: abs(np.log(aspect(n) * 9.0 / 16.0)))
+    columns = min(range(1, len(panels) + 1), key=cost)
     rows = -(-len(panels) // columns)
     sheet = PillowImage.new(
         "RGB", (columns * cell[1] + MARGIN, rows * cell[0] + MARGIN), (round(255 * BACKGROUND * 0.7),) * 3

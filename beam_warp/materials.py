@@ -315,7 +315,7 @@ class BaseColor:
         base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
         standard_error: ``(N, 3)`` float32.
         observability: `Observability` flags, ``(N,)`` uint8.
-        clipped_part: Part of the observed Gaussians with a channel cut at 1: a sign of light stated too dim.
+        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
     """
 
     base_color: NDArray[np.float32]
@@ -365,7 +365,8 @@ def solve_base_color(
     degrees = max(VIEW_COUNT * evidence.frames - 1, 1)
     noise = np.sqrt(evidence.noise) / evidence.frames
     error = np.sqrt(residual / safe / degrees + (base_color * noise[:, None]) ** 2)
-    clipped = float((raw[~missing] > 1.0).any(axis=1).mean()) if (~missing).any() else 0.0
+    weight = np.where(missing, 0.0, cloud.opacities)
+    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = _fill_from_neighbors(cloud.positions, base_color, error, missing)
     flags[missing] |= np.uint8(Observability.FILLED)
     return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)

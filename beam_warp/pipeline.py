@@ -417,8 +417,8 @@ class _Job:
         warnings = []
         if self._statistics["clipped_part"] > CLIPPED_WARNING:
             warnings.append(
-                f"{self._statistics['clipped_part']:.0%} of the Gaussians have base colour cut at 1: the environment "
-                "is too dim for the captured colour; use --exposure auto or a positive number of stops"
+                f"{self._statistics['clipped_part']:.0%} of what is opaque has base colour cut at 1: the environment "
+                "is too dim, or comes from other sides than the light of the capture; see --exposure and --rotate"
             )
         if self._statistics["flags"]["UNCERTAIN_NORMAL"] > 0.5 * self._statistics["gaussians"]:
             warnings.append("most normals are uncertain: the Gaussians do not form a surface; relighting is a guess")
@@ -459,6 +459,7 @@ class _Tally:
 
     def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:
         count = len(cloud)
+        measured = (solved.observability & np.uint8(Observability.FILLED)) == 0
         assert cloud.ambient_occlusion is not None
         assert cloud.normal_confidence is not None
         self._rows += count
@@ -467,7 +468,8 @@ class _Tally:
             ("from_shape", stored["from_shape"].sum()),
             ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
             ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
-            ("error", solved.standard_error.mean(axis=1).sum(dtype=np.float64)),
+            ("error", solved.standard_error[measured].mean(axis=1).sum(dtype=np.float64)),
+            ("measured", measured.sum()),
             ("dropped", stored["report"][1]),
             ("raised", stored["report"][2]),
         ):
@@ -484,7 +486,7 @@ class _Tally:
             "normals_from_shape": self._sums["from_shape"] / rows,
             "mean_ambient_occlusion": self._sums["openness"] / rows,
             "mean_normal_confidence": self._sums["confidence"] / rows,
-            "mean_base_color_error": self._sums["error"] / rows,
+            "mean_base_color_error_where_measured": self._sums["error"] / max(self._sums["measured"], 1.0),
             "dropped_transparent": int(self._sums["dropped"]),
             "raised_scales": int(self._sums["raised"]),
             "flags": self._flags,

@@ -110,7 +110,7 @@ def run(args: Run) -> int:
             f"{result.report['device']['name']}\n"
             f"exposure {result.report['exposure_stops']:+.2f} stops, mean ambient occlusion "
             f"{materials['mean_ambient_occlusion']:.3f}, mean standard error of base colour "
-            f"{materials['mean_base_color_error']:.3f}, {materials['flags']['FILLED']:,} filled from neighbours\n"
+            f"{materials['mean_base_color_error_where_measured']:.3f}, {materials['flags']['FILLED']:,} filled from neighbours\n"
             f"overview: {result.overview}"
         )
     return 0
