@@ -56,7 +56,8 @@ BURIED_VISIBILITY = 0.02
 SATURATION = 0.995
 """Captured display colour above which the sensor's or the training's ceiling may have cut it."""
 
-UNCERTAIN_NORMAL = 0.1
+UNCERTAIN_NORMAL = 0.2
+"""Confidence below which a normal counts as uncertain: fog has a median of 0.1, closed surfaces are above 0.5."""
 
 FILL_NEIGHBORS = 8
 

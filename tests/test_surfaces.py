@@ -4,6 +4,7 @@ import numpy as np
 from shapes import cloud_of, random_cloud, sphere_points, tiles
 
 from beam_warp import GaussianCloud, Scene
+from beam_warp.materials import UNCERTAIN_NORMAL
 from beam_warp.surfaces import estimate_normals
 
 
@@ -51,7 +52,7 @@ def test_noise_in_the_axes_is_smoothed_but_certainty_is_kept(rng):
 def test_fog_has_no_confident_normal(rng):
     fog = random_cloud(rng, 1500, scale=(-2.0, 0.1), opacity=(0.05, 0.2))
     surface = normals_of(fog)
-    assert np.median(surface.confidence) < 0.05
+    assert np.median(surface.confidence) < UNCERTAIN_NORMAL
     assert np.isfinite(surface.normals).all()
 
 
