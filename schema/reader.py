@@ -89,9 +89,8 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
     meters_per_unit = _meters_per_unit(stage, source, notes)
     space, word = radiance_color_space(prim)
     if array_attribute(prim, CHANNELS["radiance"]) is not None and space is None:
-        notes.append(
-            f"the colour space of the radiance is taken as {DISPLAY_SRGB}; the asset says {word or 'nothing'!r}"
-        )
+        stated = repr(word) if word else "nothing"
+        notes.append(f"the colour space of the radiance is taken as {DISPLAY_SRGB}; the asset says {stated}")
     reader = _FrameReader(
         stage=stage,
         prim=prim,

@@ -126,7 +126,9 @@ class ClipSet:
         """Return the attributes that one clip layer has samples of."""
         layer = _open_layer(self.paths[index])
         prim = layer.GetPrimAtPath(self.prim_path) if layer else None
-        names = set(prim.attributes.keys()) if prim else set()
+        if layer is None or not prim:
+            return set()
+        names = prim.attributes.keys()
         return {name for name in names if layer.GetNumTimeSamplesForPath(f"{self.prim_path}.{name}")}
 
     def has_sample(self, name: str, time: float) -> bool:

@@ -48,7 +48,8 @@ def write_asset(
 
     Reads every frame twice (first to learn what varies and which precision is safe) and holds one segment at a time.
     Arrays that are the same in every frame are written once. Arrays are written in half precision where that is safe
-    (see `beam_warp.schema.layout`); positions always in float.
+    (see `beam_warp.schema.layout`); positions always in float. Layers of an earlier asset of the same name are
+    replaced where names meet; its further segments stay, unused.
 
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys

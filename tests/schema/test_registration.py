@@ -9,6 +9,8 @@ import pytest
 from pxr import Usd, UsdGeom, UsdVol
 
 from beam_warp.schema import MATERIAL_API, PLUGIN_FOLDER, SCHEMA_VERSION, SEQUENCE_API, generate, register
+from beam_warp.schema.layout import CHANNELS
+from beam_warp.schema.rules import OPTIONAL_TOKENS, TOKENS
 
 
 @pytest.fixture
@@ -64,6 +66,39 @@ def test_every_array_says_range_and_units():
         if attribute.GetTypeName().isArray and attribute.GetName().startswith("beam:"):
             assert "Range:" in attribute.GetDocumentation(), attribute
             assert "Units:" in attribute.GetDocumentation(), attribute
+
+
+def schema_attributes():
+    stage = Usd.Stage.Open(str(PLUGIN_FOLDER / "schema.usda"))
+    for api in (MATERIAL_API, SEQUENCE_API):
+        for attribute in stage.GetPrimAtPath(f"/{api}").GetAttributes():
+            if attribute.GetName().startswith("beam:"):
+                yield attribute.GetName(), attribute.GetMetadata("allowedTokens")
+
+
+def test_the_specification_names_every_attribute_and_token():
+    text = (PLUGIN_FOLDER / "SPEC.md").read_text(encoding="utf-8")
+    names = {name for name, _ in schema_attributes()}
+    for name, tokens in schema_attributes():
+        if name.endswith("h") and name[:-1] in names:
+            continue  # the half variant of a named array
+        assert name in text or name.replace("beam:sequence", "…") in text, name
+        assert all(f"`{token}`" in text for token in tokens or ()), name
+
+
+def test_the_rules_know_the_tokens_of_the_schema():
+    allowed = {name: tuple(tokens) for name, tokens in schema_attributes() if tokens}
+    del allowed["beam:radianceColorSpace"]  # has a rule of its own
+    assert allowed == {**TOKENS, **OPTIONAL_TOKENS}
+
+
+def test_the_channels_have_the_types_of_the_schema():
+    known = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(MATERIAL_API)
+    for channel in CHANNELS.values():
+        if channel.usd_name.startswith("beam:"):
+            types = (channel.type_name, channel.half_type_name)
+            for name, type_name in zip(channel.usd_names, types, strict=False):
+                assert known.GetAttributeDefinition(name).GetTypeName() == type_name
 
 
 def test_generated_files_have_not_drifted(tmp_path):

@@ -1,9 +1,12 @@
 """What is written is read back: exactly in float, within the rounding of half otherwise."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from pxr import Usd
 
+from beam_warp.assets import GaussianSequence
 from beam_warp.schema.layout import HALF_ABSOLUTE, HALF_EPSILON
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
@@ -89,17 +92,29 @@ def test_an_asset_can_be_rewritten_from_itself(tmp_path, sequence):
     assert_same(again[64], sequence(65)[64], True)
 
 
-def test_reading_sees_a_replaced_file(tmp_path, sequence, cloud):
-    write_asset(sequence(2), tmp_path / "a.usdc")
-    held = read_asset(tmp_path / "a.usdc", trusted=True)
-    write_asset(sequence(2, count=9), tmp_path / "a.usdc")
-    assert len(read_asset(tmp_path / "a.usdc", trusted=True)[1]) == 9
-    assert len(held) == 2
+@pytest.mark.parametrize(
+    ("name", "frames"), [("a.usda", 2), ("a.usdc", 2), ("a.usdz", 2), ("a.usda", 65), ("a.usdz", 65)]
+)
+def test_reading_sees_a_replaced_file(tmp_path, sequence, name, frames):
+    write_asset(sequence(frames), tmp_path / name)
+    held = read_asset(tmp_path / name, trusted=True)
+    assert len(held[1]) == 6  # OpenUSD shares the open layers with the next reader
+    write_asset(sequence(frames, count=9), tmp_path / name)
+    assert len(read_asset(tmp_path / name, trusted=True)[1]) == 9
+
+
+def test_frames_can_be_read_from_any_thread(tmp_path, sequence):
+    source = sequence(65, count=200)
+    write_asset(source, tmp_path / "a.usda", full_float=True)
+    found = read_asset(tmp_path / "a.usda", trusted=True)
+    order = [(7 * frame) % 65 for frame in range(65)]
+    with ThreadPoolExecutor(4) as threads:
+        for frame, got in zip(order, threads.map(found.read_frame, order), strict=True):
+            assert np.array_equal(got.positions, source[frame].positions)
+            assert np.array_equal(got.base_color, source[frame].base_color)
 
 
 def test_still_frames_keep_their_number(tmp_path, cloud):
-    from beam_warp.assets import GaussianSequence
-
     write_asset(GaussianSequence.from_clouds([cloud()] * 5), tmp_path / "a.usda")
     found = read_asset(tmp_path / "a.usda", trusted=True)
     assert len(found) == 5
@@ -107,8 +122,6 @@ def test_still_frames_keep_their_number(tmp_path, cloud):
 
 
 def test_counts_may_change(tmp_path, cloud):
-    from beam_warp.assets import GaussianSequence
-
     source = GaussianSequence.from_clouds([cloud(0, 4), cloud(1, 7), cloud(2, 0)])
     write_asset(source, tmp_path / "a.usdc", full_float=True)
     found = read_asset(tmp_path / "a.usdc", trusted=True)
