@@ -23,8 +23,9 @@ from beam_warp.environment_sampling import environment_blocks
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
 from beam_warp.images import srgb_to_linear
-from beam_warp.kernels.product_sampling import launch_accumulate_block_weights
+from beam_warp.kernels.product_sampling import EnvironmentBlocks, launch_accumulate_block_weights
 from beam_warp.kernels.residues import (
+    CapturedColor,
     ColorFit,
     LightRays,
     SurfacePoints,
@@ -34,11 +35,14 @@ from beam_warp.kernels.residues import (
 )
 from beam_warp.lighting import ambient_occlusion, ray_offsets, stratum_bits
 from beam_warp.scene import Scene
-from beam_warp.spherical_harmonics import SH_C0, sh_color
+from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfaceNormals
 
 POINTS_AT_ONCE = 1 << 14
 """Gaussians whose rays are held at a time: 64 rays of 28 bytes and 512 block weights each, 60 MiB."""
+
+POINTS_AT_ONCE_ON_CUDA = 1 << 16
+"""The same on a GPU, which wants more work at once: 240 MiB."""
 
 BOUNCE_PART = 4
 """The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
@@ -86,9 +90,15 @@ class MaterialOptions:
 
 @dataclass(frozen=True, eq=False)
 class PreparedLight:
-    """An environment on a device, ready to be sampled; make it once, use it for every frame."""
+    """An environment on a device, ready to be sampled; make it once, use it for every frame.
 
-    blocks: Any
+    Attributes:
+        blocks: What drawing directions needs.
+        irradiance_map: Unshadowed irradiance by normal, lat-long.
+        mean_irradiance: Its mean over channels, for uniform light of the same mean radiance.
+    """
+
+    blocks: EnvironmentBlocks
     irradiance_map: wp.array
     mean_irradiance: float
 
@@ -101,6 +111,18 @@ class PreparedLight:
             upload(irradiance.astype(np.float32), wp.vec3, device),
             float(np.pi * environment.mean_radiance().mean()),
         )
+
+    def scaled(self, factor: float) -> PreparedLight:
+        """Return the same light times a factor; cheaper than preparing it again, and its directions are the same."""
+        device = self.irradiance_map.device
+        blocks = EnvironmentBlocks()
+        for name in ("block_direction", "block_sine", "row_cdf", "column_cdf"):
+            setattr(blocks, name, getattr(self.blocks, name))
+        for name in ("radiance", "luminance", "block_power"):
+            array = getattr(self.blocks, name)
+            setattr(blocks, name, upload(array.numpy() * np.float32(factor), array.dtype, device))
+        irradiance = upload(self.irradiance_map.numpy() * np.float32(factor), wp.vec3, device)
+        return PreparedLight(blocks, irradiance, self.mean_irradiance * factor)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,45 +173,13 @@ class MaterialMeasurement:
     evidence: ColorEvidence
 
 
-def linear_radiance(cloud: GaussianCloud, directions: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return captured radiance in scene-linear Rec.709.
-
-    Args:
-        cloud: With radiance.
-        directions: Unit vectors from the camera to each Gaussian, ``(N, 3)``.
-
-    Returns:
-        ``(N, 3)`` float32. Display sRGB is decoded per Gaussian: exact for opaque Gaussians, an approximation where
-        training blended several in gamma space.
-    """
-    assert cloud.radiance is not None
-    color = sh_color(cloud.radiance, directions)
-    if cloud.radiance_color_space == DISPLAY_SRGB:
-        color = srgb_to_linear(np.minimum(color, 1.0))
-    return color.astype(np.float32)
-
-
-def hemisphere_views(normals: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return ``VIEW_COUNT`` directions evenly over each Gaussian's visible side, and the cosines they make.
-
-    Args:
-        normals: ``(N, 3)``.
-
-    Returns:
-        Unit directions towards the viewer ``(N, VIEW_COUNT, 3)`` and their cosines ``(VIEW_COUNT,)``.
-    """
+def view_set() -> NDArray[np.float32]:
+    """Return ``VIEW_COUNT`` unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
     index = np.arange(VIEW_COUNT) + 0.5
     z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
     phi = np.pi * (1.0 + np.sqrt(5.0)) * index
     radius = np.sqrt(1.0 - z * z)
-    n = normals.astype(np.float64)
-    sign = np.where(n[:, 2] >= 0.0, 1.0, -1.0)
-    a = -1.0 / (sign + n[:, 2])
-    b = n[:, 0] * n[:, 1] * a
-    tangent = np.stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], axis=-1)
-    bitangent = np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], axis=-1)
-    local = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
-    return np.einsum("vk,nki->nvi", local, np.stack([tangent, bitangent, n], axis=1)), z
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1).astype(np.float32)
 
 
 def measure_materials(
@@ -247,22 +237,22 @@ def measure_materials(
         )
     }
     table = upload(specular_albedo_table(), float, device)
+    views = upload(view_set(), wp.vec3, device)
+    is_display = cloud.radiance_color_space == DISPLAY_SRGB
+    radiance = upload(cloud.radiance, wp.vec3, device)
     # Hits are taken as diffuse: the band of degree 0 is their mean colour over views.
     mean_color = 0.5 + SH_C0 * cloud.radiance[:, 0]
-    if cloud.radiance_color_space == DISPLAY_SRGB:
+    if is_display:
         mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
     hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32)[scene.rows], wp.vec3, device)
     samples = options.sample_count
     # What is buried is filled from neighbours anyway: its light is not traced.
     seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY) if scene.bvh is not None else np.zeros(0, np.intp)
-    for start in range(0, len(seen), POINTS_AT_ONCE):
-        here = seen[start : start + POINTS_AT_ONCE]
+    step = POINTS_AT_ONCE_ON_CUDA if device.is_cuda else POINTS_AT_ONCE
+    for start in range(0, len(seen), step):
+        here = seen[start : start + step]
         at = chosen[here]
         size = len(at)
-        views, cosines = hemisphere_views(surface.normals[at])
-        part = cloud.select(at)
-        captured = np.stack([linear_radiance(part, -views[:, v]) for v in range(VIEW_COUNT)], axis=1)
-
         points = SurfacePoints()
         points.positions = upload(cloud.positions[at], wp.vec3, device)
         points.normals = upload(surface.normals[at], wp.vec3, device)
@@ -281,6 +271,10 @@ def measure_materials(
         if options.bounce:
             bounce_samples = max(samples // BOUNCE_PART, 2)
             launch_trace_bounce(scene, points, hit_radiance, (options.seed, frame), start, bounce_samples, bounce)
+        captured = CapturedColor()
+        captured.radiance = radiance
+        captured.rows = upload(at.astype(np.int32), int, device)
+        captured.display_srgb = int(is_display)
         irradiance = wp.empty(size, dtype=wp.vec3, device=device)
         fit = ColorFit()
         for name in ("numerator", "denominator", "observed"):
@@ -293,9 +287,8 @@ def measure_materials(
             light.irradiance_map,
             bounce,
             table,
-            upload(views.astype(np.float32), wp.vec3, device),
-            upload(np.broadcast_to(cosines.astype(np.float32), (size, VIEW_COUNT)), float, device),
-            upload(captured, wp.vec3, device),
+            views,
+            captured,
             irradiance,
             fit,
             device,
@@ -414,7 +407,7 @@ def estimate_exposure(
     scene: Scene,
     surface: SurfaceNormals,
     roughness: NDArray[np.float32],
-    environment: EnvironmentMap,
+    light: PreparedLight,
     *,
     options: MaterialOptions,
     subset: int = 4096,
@@ -435,7 +428,7 @@ def estimate_exposure(
         scene: The same, uploaded.
         surface: Their normals.
         roughness: Their roughness.
-        environment: The light of the capture up to a factor.
+        light: The light of the capture up to a factor.
         options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
         subset: Gaussians to look at, spread evenly over the cloud.
 
@@ -450,7 +443,7 @@ def estimate_exposure(
             scene,
             surface,
             roughness,
-            PreparedLight.from_environment(environment.scaled(factor), scene.device),
+            light.scaled(factor),
             options=direct,
             rows=rows,
         ).evidence

@@ -269,9 +269,11 @@ class _Job:
         self.persistent = options.persistent or sequence.topology == "constant"
         self.resumed = 0
         self.first = _Frame(0, sequence[0], self)
-        self.exposure = self._find_exposure(environment)
+        with self.timer("prepare light"):
+            given = PreparedLight.from_environment(environment, self.device)
+        self.exposure = self._find_exposure(environment, given)
         self.lit = environment.scaled(2.0**self.exposure)
-        self.light = PreparedLight.from_environment(self.lit, self.device)
+        self.light = given.scaled(2.0**self.exposure)
         self.key = _digest(self._described(), self.lit.radiance)
         self._statistics: dict[str, Any] = {}
 
@@ -289,7 +291,7 @@ class _Job:
             sort_keys=True,
         )
 
-    def _find_exposure(self, environment: EnvironmentMap) -> float:
+    def _find_exposure(self, environment: EnvironmentMap, light: PreparedLight) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
             return require_number("exposure", self.options.exposure, -32.0, 32.0)
@@ -302,7 +304,7 @@ class _Job:
             scene, surface, roughness = first.scene, first.surface, first.roughness
             with self.timer("exposure"):
                 factor = estimate_exposure(
-                    first.cloud, scene, surface, roughness, environment, options=self.options.materials
+                    first.cloud, scene, surface, roughness, light, options=self.options.materials
                 )
             write_frame(path, key, {"stops": np.array([np.log2(factor)])})
         return float(read_frame(path)["stops"][0])

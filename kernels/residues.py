@@ -22,6 +22,7 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
     unit_float,
 )
+from beam_warp.kernels.spherical_harmonics import captured_radiance
 from beam_warp.kernels.trace import sampled_hit, transmittance
 
 wp.set_module_options({"enable_backward": False})
@@ -48,6 +49,15 @@ class LightRays:
     directions: wp.array[wp.vec3]
     radiance_over_pdf: wp.array[wp.vec3]
     visibility: wp.array[float]
+
+
+@wp.struct
+class CapturedColor:
+    """Spherical harmonics of the whole cloud, the row of each point in it, and whether they are display sRGB."""
+
+    radiance: wp.array2d[wp.vec3]
+    rows: wp.array[int]
+    display_srgb: int
 
 
 @wp.struct
@@ -139,9 +149,8 @@ def fit_color_kernel(
     irradiance_map: wp.array2d[wp.vec3],
     bounce: wp.array[wp.vec3],
     albedo_table: wp.array2d[float],
-    view_directions: wp.array2d[wp.vec3],
-    view_weights: wp.array2d[float],
-    captured: wp.array2d[wp.vec3],
+    views: wp.array[wp.vec3],
+    captured: CapturedColor,
     out_irradiance: wp.array[wp.vec3],
     out_fit: ColorFit,
 ):
@@ -184,28 +193,28 @@ def fit_color_kernel(
             before = term
         relative_error = wp.sqrt(spread) / seen_sum
 
+    basis = tangent_frame(n)
     numerator = wp.vec3()
     denominator = wp.vec3()
     observed = wp.vec3()
-    for view in range(view_directions.shape[1]):
-        v = view_directions[point, view]
-        weight = view_weights[point, view]
-        if weight > 0.0:
-            specular = wp.vec3()
-            for k in range(sample_count):
-                light = rays.directions[start + k]
-                cosine = wp.dot(n, light)
-                if cosine > 0.0:
-                    specular += rays.radiance_over_pdf[start + k] * (
-                        rays.visibility[start + k] * cosine * specular_brdf(n, v, light, roughness)
-                    )
-            albedo = specular_albedo(albedo_table, wp.dot(n, v), roughness)
-            specular = specular / float(sample_count) + bounce[point] * albedo
-            diffuse = (irradiance / PI + bounce[point]) * (1.0 - albedo)
-            target = captured[point, view] - specular
-            numerator += wp.cw_mul(diffuse, target) * weight
-            denominator += wp.cw_mul(diffuse, diffuse) * weight
-            observed += wp.cw_mul(target, target) * weight
+    for view in range(views.shape[0]):
+        v = basis * views[view]
+        weight = views[view][2]  # projected area: what a camera there sees of the surface
+        specular = wp.vec3()
+        for k in range(sample_count):
+            light = rays.directions[start + k]
+            cosine = wp.dot(n, light)
+            if cosine > 0.0:
+                specular += rays.radiance_over_pdf[start + k] * (
+                    rays.visibility[start + k] * cosine * specular_brdf(n, v, light, roughness)
+                )
+        albedo = specular_albedo(albedo_table, weight, roughness)
+        specular = specular / float(sample_count) + bounce[point] * albedo
+        diffuse = (irradiance / PI + bounce[point]) * (1.0 - albedo)
+        target = captured_radiance(captured.radiance, captured.rows[point], -v, captured.display_srgb) - specular
+        numerator += wp.cw_mul(diffuse, target) * weight
+        denominator += wp.cw_mul(diffuse, diffuse) * weight
+        observed += wp.cw_mul(target, target) * weight
     out_fit.numerator[point] = numerator
     out_fit.denominator[point] = denominator
     out_fit.observed[point] = observed
@@ -265,8 +274,7 @@ def launch_fit_color(
     irradiance_map,
     bounce,
     albedo_table,
-    view_directions,
-    view_weights,
+    views,
     captured,
     out_irradiance,
     out_fit,
@@ -283,8 +291,7 @@ def launch_fit_color(
             irradiance_map,
             bounce,
             albedo_table,
-            view_directions,
-            view_weights,
+            views,
             captured,
         ],
         outputs=[out_irradiance, out_fit],

@@ -13,9 +13,9 @@ from beam_warp.materials import (
     MaterialOptions,
     PreparedLight,
     estimate_exposure,
-    hemisphere_views,
     measure_materials,
     solve_base_color,
+    view_set,
 )
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfaceNormals
@@ -257,16 +257,25 @@ class TestExposure:
             scene,
             certain(points),
             np.full(1500, ROUGHNESS, np.float32),
-            EnvironmentMap.constant((1.0, 1.0, 1.0), height=32).exposed(stops),
+            PreparedLight.from_environment(
+                EnvironmentMap.constant((1.0, 1.0, 1.0), height=32).exposed(stops), scene.device
+            ),
             options=MaterialOptions(),
         )
         assert abs(np.log2(factor) + stops) < 0.25
 
 
-def test_views_are_unit_and_on_the_visible_side(rng):
-    normals = rng.normal(size=(40, 3))
-    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    views, cosines = hemisphere_views(normals)
-    assert np.abs(np.linalg.norm(views, axis=2) - 1.0).max() < 1e-6
-    assert np.abs(np.einsum("nvk,nk->nv", views, normals) - cosines).max() < 1e-6
-    assert cosines.min() > 0.2
+def test_views_are_unit_and_on_the_visible_side():
+    views = view_set()
+    assert np.abs(np.linalg.norm(views, axis=1) - 1.0).max() < 1e-6
+    assert views[:, 2].min() > 0.2
+    assert np.abs(views[:, :2].mean(axis=0)).max() < 0.15  # evenly around the normal
+
+
+def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
+    scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
+    one = PreparedLight.from_environment(sky(), scene.device).scaled(4.0)
+    other = PreparedLight.from_environment(sky().scaled(4.0), scene.device)
+    assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
+    for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
+        assert np.allclose(getattr(one.blocks, name).numpy(), getattr(other.blocks, name).numpy(), rtol=1e-5, atol=1e-6)
