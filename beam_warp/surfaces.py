@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.assets import GaussianCloud
+from beam_warp.devices import upload
+from beam_warp.kernels.neighborhoods import launch_consult_neighbors, launch_thinnest_direction
 from beam_warp.lighting import ambient_occlusion
 from beam_warp.reference import rotation_matrices
 from beam_warp.scene import Scene
@@ -60,84 +63,55 @@ def estimate_normals(cloud: GaussianCloud, scene: Scene, *, seed: int = 0) -> Su
     count = len(cloud)
     if count == 0:
         return SurfaceNormals(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, bool))
-    positions = cloud.positions.astype(np.float64)
-    neighbors = cKDTree(positions).query(positions, k=min(NEIGHBOR_COUNT + 1, count), workers=-1)[1]
-    neighbors = neighbors.reshape(count, -1)
-
-    rotations = rotation_matrices(cloud.orientations)
-    scales = cloud.scales.astype(np.float64)
-    axis_normal, planarity = _thinnest_direction(positions, rotations, scales, cloud.opacities, neighbors)
-    order = np.argsort(scales, axis=1)
-    shortest = np.take_along_axis(scales, order, axis=1)
-    own_normal = np.take_along_axis(rotations, order[:, None, :1], axis=2)[..., 0]
-    flatness = 1.0 - shortest[:, 0] / np.maximum(shortest[:, 1], 1e-30)
+    device = scene.device
+    found = cKDTree(cloud.positions).query(cloud.positions, k=min(NEIGHBOR_COUNT + 1, count), workers=-1)[1]
+    neighbors = upload(found.reshape(count, -1).astype(np.int32), int, device)
+    direction = wp.empty(count, dtype=wp.vec3, device=device)
+    planarity = wp.empty(count, dtype=float, device=device)
+    launch_thinnest_direction(
+        upload(cloud.positions, wp.vec3, device),
+        upload(cloud.orientations, wp.quat, device),
+        upload(cloud.scales, wp.vec3, device),
+        upload(cloud.opacities, float, device),
+        neighbors,
+        direction,
+        planarity,
+        device,
+    )
+    own, flatness = _shortest_axes(cloud)
     from_shape = flatness > 1.0 - FLAT_RATIO
-    normals = np.where(from_shape[:, None], own_normal, axis_normal)
-    certainty = np.where(from_shape, flatness, planarity)
+    normals = np.where(from_shape[:, None], own, direction.numpy())
+    certainty = np.where(from_shape, flatness, planarity.numpy())
 
     openness = _open_side(scene, cloud.positions, normals, seed)
     normals *= np.where(openness < 0.0, -1.0, 1.0)[:, None]
     openness = np.abs(openness)
-    certainty = np.clip(certainty, 0.0, 1.0)
 
-    agreement = np.ones(count)
+    current, following = upload(normals, wp.vec3, device), wp.empty(count, dtype=wp.vec3, device=device)
+    agreement = wp.empty(count, dtype=float, device=device)
+    weight, sides = upload(certainty * cloud.opacities, float, device), upload(openness, float, device)
     for _ in range(SMOOTHING_PASSES):
-        normals, agreement = _consult_neighbors(normals, certainty * cloud.opacities, openness, neighbors)
-    confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement, 0.0, 1.0)
-    return SurfaceNormals(normals.astype(np.float32), confidence.astype(np.float32), from_shape)
+        launch_consult_neighbors(current, weight, sides, neighbors, following, agreement, device)
+        current, following = following, current
+    confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement.numpy(), 0.0, 1.0)
+    return SurfaceNormals(current.numpy(), confidence.astype(np.float32), from_shape)
 
 
-def _thinnest_direction(
-    positions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    scales: NDArray[np.float64],
-    opacities: NDArray[np.float32],
-    neighbors: NDArray[np.intp],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest principal axis of each neighbourhood's mixture, and 1 - lambda_0 / lambda_1."""
-    covariances = np.einsum("nij,nj,nkj->nik", rotations, scales**2, rotations)
-    at = positions[neighbors]
-    distance = np.linalg.norm(at - positions[:, None], axis=2)
-    reach = np.maximum(distance[:, -1:], 1e-12)
-    weight = opacities[neighbors] * np.exp(-2.0 * (distance / reach) ** 2)
-    weight /= np.maximum(weight.sum(1, keepdims=True), 1e-12)
-    centered = at - np.einsum("nk,nki->ni", weight, at)[:, None]
-    spread = np.einsum("nk,nki,nkj->nij", weight, centered, centered)
-    spread += np.einsum("nk,nkij->nij", weight, covariances[neighbors])
-    values, vectors = np.linalg.eigh(spread)
-    return vectors[..., 0], 1.0 - values[:, 0] / np.maximum(values[:, 1], 1e-30)
+def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return each Gaussian's shortest axis in the world, and 1 - smallest scale / middle scale."""
+    order = np.argsort(cloud.scales, axis=1)
+    ordered = np.take_along_axis(cloud.scales, order, axis=1)
+    axis = np.take_along_axis(rotation_matrices(cloud.orientations), order[:, None, :1], axis=2)[..., 0]
+    flatness = 1.0 - ordered[:, 0] / np.maximum(ordered[:, 1], 1e-30)
+    return axis.astype(np.float32), flatness
 
 
 def _open_side(
-    scene: Scene, positions: NDArray[np.float32], normals: NDArray[np.float64], seed: int
-) -> NDArray[np.float64]:
+    scene: Scene, positions: NDArray[np.float32], normals: NDArray[np.float32], seed: int
+) -> NDArray[np.float32]:
     """Return how much more open the normal's side is than the other, in [-1, 1]."""
-    up = normals.astype(np.float32)
-    sides = [
-        ambient_occlusion(scene, positions, sign * up, sample_count=ORIENTATION_RAYS, seed=seed).visibility
-        for sign in (1.0, -1.0)
-    ]
-    return (sides[0] - sides[1]) / np.maximum(sides[0] + sides[1], 1e-3)
-
-
-def _consult_neighbors(
-    normals: NDArray[np.float64],
-    certainty: NDArray[np.float64],
-    openness: NDArray[np.float64],
-    neighbors: NDArray[np.intp],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move each normal towards its neighbours' weighted mean as far as it is uncertain; with their agreement."""
-    weight = (certainty * openness)[neighbors] + 1e-6
-    weight[:, 0] = 0.0  # column 0 is the Gaussian itself
-    mean = np.einsum("nk,nki->ni", weight, normals[neighbors]) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
-    length = np.linalg.norm(mean, axis=1)
-    direction = mean / np.maximum(length, 1e-12)[:, None]
-    along = np.einsum("ni,ni->n", normals, direction)
-    # Where rays do not tell the sides apart, the neighbours decide the sign.
-    undecided = (openness < 0.25) & (length > 0.5)
-    normals = np.where((undecided & (along < 0.0))[:, None], -normals, normals)
-    share = (1.0 - np.minimum(certainty * (0.5 + openness), 1.0)) * np.minimum(length, 1.0)
-    mixed = (1.0 - share)[:, None] * normals + share[:, None] * direction
-    norm = np.linalg.norm(mixed, axis=1, keepdims=True)
-    mixed = np.where(norm > 1e-6, mixed / np.maximum(norm, 1e-12), normals)
-    return mixed, np.clip(length, 0.0, 1.0)
+    one, other = (
+        ambient_occlusion(scene, positions, sign * normals, sample_count=ORIENTATION_RAYS, seed=seed).visibility
+        for sign in (np.float32(1.0), np.float32(-1.0))
+    )
+    return (one - other) / np.maximum(one + other, np.float32(1e-3))
