@@ -56,7 +56,8 @@ BURIED_VISIBILITY = 0.02
 SATURATION = 0.995
 """Captured display colour above which the sensor's or the training's ceiling may have cut it."""
 
-UNCERTAIN_NORMAL = 0.1
+UNCERTAIN_NORMAL = 0.2
+"""Confidence below which a normal counts as uncertain: fog has a median of 0.1, closed surfaces are above 0.5."""
 
 FILL_NEIGHBORS = 8
 
@@ -315,7 +316,7 @@ class BaseColor:
         base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
         standard_error: ``(N, 3)`` float32.
         observability: `Observability` flags, ``(N,)`` uint8.
-        clipped_part: Part of the observed Gaussians with a channel cut at 1: a sign of light stated too dim.
+        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
     """
 
     base_color: NDArray[np.float32]
@@ -326,7 +327,6 @@ class BaseColor:
 
 def solve_base_color(
     cloud: GaussianCloud,
-    surface_confidence: NDArray[np.float32],
     evidence: ColorEvidence,
     mean_irradiance: float,
 ) -> BaseColor:
@@ -336,14 +336,14 @@ def solve_base_color(
     badly one rho explains all views and frames, and the noise of the irradiance, averaged over frames.
 
     Args:
-        cloud: The Gaussians, of any one of the frames.
-        surface_confidence: Confidence of their normals, ``(N,)``.
+        cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
         evidence: Of one frame, or the sum over frames of the same Gaussians.
         mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
 
     Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
     """
     assert cloud.radiance is not None
+    assert cloud.normal_confidence is not None
     numerator, denominator, observed = (
         np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
     )
@@ -356,7 +356,7 @@ def solve_base_color(
     )
     flags[~(openness > BURIED_VISIBILITY)] |= np.uint8(Observability.UNSEEN)
     flags[(0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)] |= np.uint8(Observability.SATURATED)
-    flags[~(surface_confidence > UNCERTAIN_NORMAL)] |= np.uint8(Observability.UNCERTAIN_NORMAL)
+    flags[~(cloud.normal_confidence > UNCERTAIN_NORMAL)] |= np.uint8(Observability.UNCERTAIN_NORMAL)
     missing = (flags & np.uint8(Observability.UNLIT | Observability.UNSEEN)) != 0
 
     safe = np.where(denominator > 0.0, denominator, 1.0)
@@ -366,7 +366,8 @@ def solve_base_color(
     degrees = max(VIEW_COUNT * evidence.frames - 1, 1)
     noise = np.sqrt(evidence.noise) / evidence.frames
     error = np.sqrt(residual / safe / degrees + (base_color * noise[:, None]) ** 2)
-    clipped = float((raw[~missing] > 1.0).any(axis=1).mean()) if (~missing).any() else 0.0
+    weight = np.where(missing, 0.0, cloud.opacities)
+    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = _fill_from_neighbors(cloud.positions, base_color, error, missing)
     flags[missing] |= np.uint8(Observability.FILLED)
     return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
@@ -396,10 +397,13 @@ def _fill_from_neighbors(
 
 
 BRIGHTEST = (0.95, 0.8)
-"""Quantile of the largest channel, and the base colour it may reach: white cloth, fresh paper."""
+"""Quantile of the largest channel, and the base colour it is given where the bounds leave a choice: white cloth."""
 
-DARKEST = (0.1, 0.02)
-"""Quantile of the mean of the channels, and the base colour it has at least: black cloth, asphalt."""
+MISFIT_SLACK = 1e-2
+"""Exposures whose misfit is within this part of the captured radiance of the least one count as equally good."""
+
+WELL_LIT_PART = 0.5
+"""Gaussians that get at least this part of the mean irradiance have a say in the exposure."""
 
 EXPOSURE_FACTORS = np.exp2(np.arange(-10.0, 10.0 + 1e-9, 1.0 / 16.0))
 """Candidates of `estimate_exposure`, a sixteenth of a stop apart."""
@@ -417,9 +421,11 @@ def estimate_exposure(
 ) -> float:
     """Find the factor on an environment that makes display-referred captured colour physically plausible.
 
-    Display-referred colour has no absolute scale, so base colour has none either. The factor is the smaller of two:
-    the light under which the brightest surfaces come out white (more would darken everything), and the most light
-    under which the darkest still reflect more than their specular lobe alone (more would make them negative).
+    Display-referred colour has no absolute scale, so base colour has none either; but it lies in [0, 1]. Too little
+    light asks for more than 1, too much lets the specular lobe alone exceed what was captured. The factor is the one
+    whose bounds cut least of the captured radiance (in absolute
+    values: outliers must not decide); among those that are equally good, the one that gives the
+    brightest surfaces `BRIGHTEST`.
 
     For light s times the environment, sum w L_D (L_o - L_S) / s = A - s B: two measurements with the same rays give
     A and B, and with them the base colour under every s.
@@ -450,25 +456,26 @@ def estimate_exposure(
         ).evidence
         for factor in (1.0, 0.5)
     )
-    good = (full.denominator > 0.0).all(axis=1)
+    # Where the assumed light hardly reaches the quotient is arbitrary; such Gaussians have no say.
+    lit = full.irradiance.mean(axis=1)
+    good = (full.denominator > 0.0).all(axis=1) & (lit > WELL_LIT_PART * lit.mean())
     if not good.any():
         return 1.0
     specular = 2.0 * (2.0 * half.numerator - full.numerator)[good].astype(np.float64)
     captured = full.numerator[good] + specular
-    # Well lit and opaque Gaussians say most: where the assumed light hardly reaches, the quotient is arbitrary.
-    weight = full.irradiance[good].mean(axis=1) * cloud.opacities[rows][good]
+    denominator = full.denominator[good].astype(np.float64)
+    weight = cloud.opacities[rows][good].astype(np.float64)
+    amplitude = weight[:, None] * np.sqrt(denominator)  # turns base colour into radiance
 
-    def quantile(values: NDArray[np.float64], part: float) -> float:
-        order = np.argsort(values)
-        return float(values[order][np.searchsorted(np.cumsum(weight[order]), part * weight.sum())])
-
-    chosen = float(EXPOSURE_FACTORS[0])
+    misfit, brightest = [], []
     for factor in EXPOSURE_FACTORS:
-        base_color = (captured - factor * specular) / (factor * full.denominator[good])
-        chosen = float(factor)
-        if not (
-            quantile(base_color.max(axis=1), BRIGHTEST[0]) > BRIGHTEST[1]
-            and quantile(base_color.mean(axis=1), DARKEST[0]) > DARKEST[1]
-        ):
-            break
-    return chosen
+        base_color = (captured - factor * specular) / (factor * denominator)
+        misfit.append(float((amplitude * factor * np.abs(base_color - np.clip(base_color, 0.0, 1.0))).sum()))
+        largest = base_color.max(axis=1)
+        order = np.argsort(largest)
+        middle = np.searchsorted(np.cumsum(weight[order]), BRIGHTEST[0] * weight.sum())
+        brightest.append(max(float(largest[order][min(middle, len(order) - 1)]), 1e-9))
+    energy = float((amplitude * captured / denominator).sum())
+    equally_good = np.array(misfit) <= min(misfit) + MISFIT_SLACK * energy
+    distance = np.where(equally_good, np.abs(np.log(np.array(brightest) / BRIGHTEST[1])), np.inf)
+    return float(EXPOSURE_FACTORS[int(np.argmin(distance))])

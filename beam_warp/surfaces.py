@@ -78,11 +78,11 @@ def estimate_normals(cloud: GaussianCloud, scene: Scene, *, seed: int = 0) -> Su
     openness = _open_side(scene, cloud.positions, normals, seed)
     normals *= np.where(openness < 0.0, -1.0, 1.0)[:, None]
     openness = np.abs(openness)
-    certainty = np.clip(certainty, 0.0, 1.0) * cloud.opacities
+    certainty = np.clip(certainty, 0.0, 1.0)
 
     agreement = np.ones(count)
     for _ in range(SMOOTHING_PASSES):
-        normals, agreement = _consult_neighbors(normals, certainty, openness, neighbors)
+        normals, agreement = _consult_neighbors(normals, certainty * cloud.opacities, openness, neighbors)
     confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement, 0.0, 1.0)
     return SurfaceNormals(normals.astype(np.float32), confidence.astype(np.float32), from_shape)
 

@@ -10,6 +10,8 @@ Source: PlayCanvas user manual, "The PLY Format", and the files that SuperSplat 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +34,7 @@ def is_compressed(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in vertex.names
 
 
-def decode(header: PlyHeader) -> dict[str, object]:
+def decode(header: PlyHeader) -> dict[str, Any]:
     """Unpack a file into the fields of a cloud, in its own axes and units.
 
     Returns:

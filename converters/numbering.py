@@ -6,7 +6,7 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
-from beam_warp.errors import AssetFormatError, OutputError
+from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 
 DIGITS = 6
 """Digits of a frame number that we write: prefix000000.ply."""
@@ -23,9 +23,13 @@ def numbered_files(folder: Path) -> list[Path]:
     """Return the frames of a folder in the order of their numbers.
 
     Raises:
+        MissingFileError: The folder cannot be listed.
         AssetFormatError: There are none, several sequences share the folder, a number is missing or comes twice.
     """
-    found = [(match, path) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))]
+    try:
+        found = [(match, path) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))]
+    except OSError as error:
+        raise MissingFileError(f"input folder must be readable, got {error.strerror} at {folder}. Check it.") from error
     if not found:
         raise AssetFormatError(
             f"folder {folder.name} must hold numbered files (walk000000.ply, walk000001.ply, …), got none. "

@@ -19,7 +19,7 @@ from beam_warp.axes import AXIS_CODES
 from beam_warp.checks import require_number
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
-from beam_warp.converters.colors import BASE_COLOR_ONLY, NO_COLOR
+from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.options import ReadOptions
 from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types, rows_at
 from beam_warp.converters.ply_container import PlyHeader, Table, malformed, read_header, read_table
@@ -51,6 +51,7 @@ class PlyFrame:
 
     cloud: GaussianCloud
     frames_per_second: float
+    provenance: dict[str, str]
     notes: tuple[str, ...]
 
 
@@ -73,9 +74,12 @@ def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequen
         frame_count=len(paths),
         read_frame=lambda frame: first.cloud if frame == 0 else read_frame(read_header(paths[frame]), options).cloud,
         frames_per_second=first.frames_per_second,
+        constant=frozenset(first.cloud.arrays()) if len(paths) == 1 else frozenset(),
+        topology="constant" if len(paths) == 1 else "perFrame",  # rows of separate files have no identity
         metadata={
             "source": paths[0].name,
             "producer": guess_producer(headers[0]),
+            **first.provenance,
             **({"notes": "\n".join(first.notes)} if first.notes else {}),
         },
     )
@@ -96,7 +100,7 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
     units = statements.meters_per_unit if options.meters_per_unit is None else options.meters_per_unit
     if units != 1.0:
         for name in ("positions", "scales"):
-            fields[name] = fields[name] * units  # pyright: ignore[reportOperatorIssue]
+            fields[name] = fields[name] * units
     axes = options.source_axes or statements.axes
     if axes is None:
         axes = DEFAULT_AXES
@@ -107,7 +111,10 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
         raise AssetFormatError(f"{header.path.name}: {error}") from error
     if not len(cloud):
         notes.append("holds no Gaussians")
-    return PlyFrame(cloud, statements.frames_per_second, tuple(notes))
+    provenance = {"source_axes": axes, "source_units": "m" if units == 1.0 else f"{units:g} m"}
+    if cloud.radiance is not None:
+        provenance["radiance_meaning"] = statements.radiance_meaning or CAPTURED
+    return PlyFrame(cloud, statements.frames_per_second, provenance, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -134,6 +141,7 @@ class _Statements:
             ("beam_material", ("linear",)),
             ("beam_base_color_space", (LINEAR_REC709,)),
             ("beam_radiance_color_space", COLOR_SPACES),
+            ("beam_radiance_meaning", (CAPTURED, BASE_COLOR_ONLY, NO_COLOR)),
         ):
             if key in said and said[key] not in allowed:
                 choices = ", ".join(allowed) if len(allowed) < 5 else "an axis code such as rdf"

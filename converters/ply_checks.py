@@ -38,7 +38,7 @@ def require_types(path: Path, element: Element, names: tuple[str, ...], codes: t
 def require_log_scales(path: Path, log_scales: NDArray[np.floating]) -> None:
     """Refuse scales that cannot be natural logs of standard deviations; NaN cannot."""
     low, high = LOG_SCALE_LIMITS
-    bad = ~((log_scales >= low) & (log_scales <= high)).all(axis=1)
+    bad = np.any(~((log_scales >= low) & (log_scales <= high)), axis=1)
     if bad.any():
         row = log_scales[int(np.flatnonzero(bad)[0])]
         worst = row[int(np.argmax(~((row >= low) & (row <= high))))]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,10 @@ SCALAR_TYPES = {
     for word in words
 }
 """Type words, old and new, by NumPy code."""
+
+
+_CONTROL_CHARACTERS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n\r"}
+"""What a header must not smuggle into the terminal that its names and comments are shown on."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:
     if end is None:
         got = f"none in the first {MAX_HEADER_BYTES // 1024} KiB" if len(start) == MAX_HEADER_BYTES else "a cut file"
         raise malformed(path, "the header must end with the line end_header", got, "Export or download it again.")
-    text = start[: end.start()].decode("utf-8", "replace")
+    text = start[: end.start()].decode("utf-8", "replace").translate(_CONTROL_CHARACTERS)
     return [line.strip() for line in text.split("\n")], end.end()
 
 
@@ -221,7 +226,7 @@ def _check_limits(header: PlyHeader) -> None:
 def _least_row_bytes(header: PlyHeader, element: Element) -> int | None:
     """Return the fewest bytes a row can take, or None if nothing can be said."""
     if header.encoding == "ascii":
-        return 2 * len(element.properties)  # a digit and a separator each
+        return max(1, 2 * len(element.properties))  # a digit and a separator each; at least a line end
     return element.stride
 
 
@@ -286,10 +291,11 @@ def _binary_rows(header: PlyHeader, element: Element, offset: int) -> NDArray[An
 
 
 def _ascii_rows(header: PlyHeader, element: Element, skipped_rows: int) -> NDArray[np.float32]:
-    with header.path.open("rb") as file:
+    with header.path.open("rb") as file, warnings.catch_warnings():
         file.seek(header.data_start)
         text = io.TextIOWrapper(file, encoding="ascii", errors="replace")
         try:
+            warnings.simplefilter("ignore", UserWarning)  # of blank lines and missing rows: counted below
             rows = np.loadtxt(
                 text, dtype=np.float32, comments=None, skiprows=skipped_rows, max_rows=element.count, ndmin=2
             )

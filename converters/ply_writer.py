@@ -104,7 +104,7 @@ def _write_cloud(cloud: GaussianCloud, path: Path, options: WriteOptions, frame_
     size = len(header) + 4 * len(names) * len(cloud)
     if size > MAX_FILE_BYTES:
         raise OutputError(
-            f"{path.name} must be under 2 GB for importers to read it, got {size / 1e9:.2f} GB. "
+            f"a PLY file must be under 2 GB for importers to read it, got {size / 1e9:.2f} GB. "
             "Write fewer bands (sh_degree) or fewer Gaussians."
         )
     rows = _row_source(cloud, radiance, extras, len(names))

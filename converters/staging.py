@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from beam_warp.errors import OutputError
+from beam_warp.errors import BeamError, OutputError
 
 
 def require_writable(path: Path) -> None:
@@ -51,10 +51,11 @@ def staged_outputs() -> Iterator[Staging]:
         for final, temporary in staging.names.items():
             temporary.replace(final)
     except OSError as error:
-        if isinstance(error, OutputError) or not staging.names or error.filename is None:
+        if isinstance(error, BeamError):
             raise
+        place = next(reversed(staging.names)).parent if staging.names else "the output"
         raise OutputError(
-            f"output must be writable, got {error.strerror} at {error.filename}. Free space or choose another folder."
+            f"output must be writable, got {error.strerror or error} at {place}. Free space or choose another folder."
         ) from error
     finally:
         for temporary in staging.names.values():

@@ -46,4 +46,7 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
             return cloud
         return cloud.with_arrays(radiance=resize_bands(cloud.radiance, options.sh_degree))
 
-    return write_asset(dataclasses.replace(sequence, read_frame=prepared), path, full_float=options.full_float)
+    # Notes tell of the reading of another file; in this asset they would be told again of a file that is sound.
+    provenance = {key: value for key, value in sequence.metadata.items() if key != "notes"}
+    prepared_sequence = dataclasses.replace(sequence, read_frame=prepared, metadata=provenance)
+    return write_asset(prepared_sequence, path, full_float=options.full_float)

@@ -128,7 +128,9 @@ def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     sequence, metadata = contents.sequence, contents.sequence.metadata
     prim = _define(layer, ASSET_PATH, "Xform", SEQUENCE_API)
     prim.SetInfo("kind", "component")
-    prim.SetInfo("customData", {"beam": {str(key): str(value) for key, value in metadata.items()}})
+    # Notes tell of the reading of another file, not of this one.
+    provenance = {str(key): str(value) for key, value in metadata.items() if key != "notes"}
+    prim.SetInfo("customData", {"beam": provenance})
     for name, type_name, value in (
         ("frameCount", "int", len(sequence)),
         ("framesPerSecond", "double", float(sequence.frames_per_second)),

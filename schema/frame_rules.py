@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from beam_warp.assets import Observability
 from beam_warp.checks import UNIT_TOLERANCE
-from beam_warp.schema.rules import Fault, rule
+from beam_warp.schema.rules import Fault, Rule, entering
 
 KNOWN_FLAGS = sum(Observability)
+
+FRAME_RULES: list[Rule] = []
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Frame:
                 yield self.attributes[name], self.arrays[name]
 
 
-@rule("BEAM-GEO-010", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-010", "error")
 def _lengths(frame: Frame) -> Iterator[Fault]:
     """Every array has one element for each position: USD ignores shorter ones."""
     for name, array in frame.arrays.items():
@@ -63,7 +65,7 @@ def _lengths(frame: Frame) -> Iterator[Fault]:
             )
 
 
-@rule("BEAM-GEO-011", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-011", "error")
 def _finite(frame: Frame) -> Iterator[Fault]:
     """No array holds NaN or infinity."""
     for name, array in frame.to_check():
@@ -72,25 +74,25 @@ def _finite(frame: Frame) -> Iterator[Fault]:
             yield Fault(f"values must be finite, got NaN or infinity at element {row}. Drop that Gaussian.", name)
 
 
-@rule("BEAM-GEO-012", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-012", "error")
 def _unit_quaternions(frame: Frame) -> Iterator[Fault]:
     """Orientations are unit quaternions."""
     return _unit(frame, "orientations")
 
 
-@rule("BEAM-GEO-013", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-013", "error")
 def _scales(frame: Frame) -> Iterator[Fault]:
     """Scales are linear and not negative (logarithms would be)."""
     return _range(frame, 0.0, np.inf, "scales")
 
 
-@rule("BEAM-GEO-014", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-014", "error")
 def _opacities(frame: Frame) -> Iterator[Fault]:
     """Opacities are linear, in [0, 1] (logits are not)."""
     return _range(frame, 0.0, 1.0, "opacities")
 
 
-@rule("BEAM-GEO-015", "error", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-015", "error")
 def _extent(frame: Frame) -> Iterator[Fault]:
     """extent is a box that contains every position."""
     if frame.extent is None or not frame.count:
@@ -102,14 +104,14 @@ def _extent(frame: Frame) -> Iterator[Fault]:
         yield Fault("extent must contain every position, got one outside. Compute it for each frame.", "extent")
 
 
-@rule("BEAM-GEO-016", "warning", "frame")
+@entering(FRAME_RULES, "BEAM-GEO-016", "warning")
 def _not_empty(frame: Frame) -> Iterator[Fault]:
     """A frame holds at least one Gaussian."""
     if not frame.count:
         yield Fault("a frame should hold Gaussians, got none. Leave the frame out, or hide the prim.", "positions")
 
 
-@rule("BEAM-SH-002", "error", "frame")
+@entering(FRAME_RULES, "BEAM-SH-002", "error")
 def _sh_size(frame: Frame) -> Iterator[Fault]:
     """There are (degree + 1)^2 spherical-harmonics coefficients for each Gaussian."""
     if "radiance" in frame.arrays and frame.sh_degree is not None:
@@ -120,49 +122,49 @@ def _sh_size(frame: Frame) -> Iterator[Fault]:
             )
 
 
-@rule("BEAM-MAT-010", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-010", "error")
 def _base_color(frame: Frame) -> Iterator[Fault]:
     """Base colour is in [0, 1]."""
     return _range(frame, 0.0, 1.0, "base_color")
 
 
-@rule("BEAM-MAT-011", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-011", "error")
 def _roughness(frame: Frame) -> Iterator[Fault]:
     """Roughness is in [0, 1]."""
     return _range(frame, 0.0, 1.0, "roughness")
 
 
-@rule("BEAM-MAT-012", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-012", "error")
 def _ambient_occlusion(frame: Frame) -> Iterator[Fault]:
     """Ambient occlusion is a visibility in [0, 1]."""
     return _range(frame, 0.0, 1.0, "ambient_occlusion")
 
 
-@rule("BEAM-MAT-013", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-013", "error")
 def _metallic(frame: Frame) -> Iterator[Fault]:
     """Metallic is in [0, 1]."""
     return _range(frame, 0.0, 1.0, "metallic")
 
 
-@rule("BEAM-MAT-014", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-014", "error")
 def _unit_normals(frame: Frame) -> Iterator[Fault]:
     """Normals are unit vectors."""
     return _unit(frame, "normals")
 
 
-@rule("BEAM-MAT-015", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-015", "error")
 def _confidence(frame: Frame) -> Iterator[Fault]:
     """Normal confidence is in [0, 1]."""
     return _range(frame, 0.0, 1.0, "normal_confidence")
 
 
-@rule("BEAM-MAT-016", "error", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-016", "error")
 def _standard_errors(frame: Frame) -> Iterator[Fault]:
     """Standard errors are not negative."""
     return _range(frame, 0.0, np.inf, "ambient_occlusion_error", "base_color_error")
 
 
-@rule("BEAM-MAT-017", "warning", "frame")
+@entering(FRAME_RULES, "BEAM-MAT-017", "warning")
 def _observability(frame: Frame) -> Iterator[Fault]:
     """Observability has no flags that the schema does not define."""
     for name, array in frame.to_check("observability"):
@@ -174,7 +176,7 @@ def _observability(frame: Frame) -> Iterator[Fault]:
             )
 
 
-@rule("BEAM-SEQ-005", "error", "frame")
+@entering(FRAME_RULES, "BEAM-SEQ-005", "error")
 def _constant_count(frame: Frame) -> Iterator[Fault]:
     """Where the topology is constant, so is the number of Gaussians."""
     if frame.constant_topology and frame.previous is not None and len(frame.previous["positions"]) != frame.count:
@@ -182,7 +184,7 @@ def _constant_count(frame: Frame) -> Iterator[Fault]:
         yield Fault(f"the count must be constant, got {frame.count} after {before}. Say perFrame.", "positions")
 
 
-@rule("BEAM-SEQ-006", "error", "frame")
+@entering(FRAME_RULES, "BEAM-SEQ-006", "error")
 def _unique_ids(frame: Frame) -> Iterator[Fault]:
     """Identities are unique within a frame."""
     for name, array in frame.to_check("ids"):
@@ -190,7 +192,7 @@ def _unique_ids(frame: Frame) -> Iterator[Fault]:
             yield Fault("ids must be unique, got one twice. Number the Gaussians anew.", name)
 
 
-@rule("BEAM-SEQ-007", "error", "frame")
+@entering(FRAME_RULES, "BEAM-SEQ-007", "error")
 def _constant_ids(frame: Frame) -> Iterator[Fault]:
     """Where the topology is constant, so is the identity of each row."""
     if frame.constant_topology and frame.previous is not None and "ids" in frame.changed:
@@ -199,7 +201,7 @@ def _constant_ids(frame: Frame) -> Iterator[Fault]:
             yield Fault("ids must be the same in every frame, got other ones. Say perFrame.", frame.attributes["ids"])
 
 
-@rule("BEAM-SEQ-008", "warning", "frame")
+@entering(FRAME_RULES, "BEAM-SEQ-008", "warning")
 def _continuous_quaternions(frame: Frame) -> Iterator[Fault]:
     """Where rows keep their identity, quaternions keep their sign: engines that blend components would spin them."""
     if not frame.constant_topology or frame.previous is None or "orientations" not in frame.changed:

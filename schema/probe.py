@@ -15,7 +15,8 @@ from pxr import Sdf, Tf, Usd, UsdUtils
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
 from beam_warp.schema.files import require_whole_crate
-from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE
+from beam_warp.schema.layout import CHANNELS
+from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
 ADDRESS_SPACE = 8 * 2**30
 """Room for OpenUSD itself [bytes]; a corrupt length that asks for more fails instead of filling the machine."""
@@ -28,6 +29,10 @@ def fault(path: Path) -> str | None:
         problems = stage.GetCompositionErrors()
         if problems:
             return str(problems[0])
+        prims = splat_prims(stage)
+        cut = [path for prim in prims for clips in clip_sets(prim) for path in clips.missing_layers()]
+        if cut:
+            return f"missing or broken layer {cut[0]}"
         layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
         if missing:
             return f"missing or broken layer {missing[0]}"
@@ -35,9 +40,8 @@ def fault(path: Path) -> str | None:
             real = Path(layer.realPath)
             if real.suffix == ".usdc" and real.is_file():
                 require_whole_crate(real)
-        for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-            if prim.GetTypeName() == SPLAT_TYPE:
-                _touch(prim)
+        for prim in prims:
+            _touch(prim)
     except AssetFormatError as error:
         return str(error)
     except Tf.ErrorException as error:
@@ -53,7 +57,7 @@ def said_by_usd(error: Tf.ErrorException) -> str:
 
 def _touch(prim: Usd.Prim) -> None:
     """Read every array at the default time, at both ends, and where each value clip starts."""
-    starts = [time for name in Usd.ClipsAPI(prim).GetClipSets().GetAppliedItems() for time in _clip_starts(prim, name)]
+    starts = [start for clips in clip_sets(prim) for start, _ in clips.active]
     for channel in CHANNELS.values():
         for usd_name in channel.usd_names:
             attribute = prim.GetAttribute(usd_name)
@@ -62,10 +66,6 @@ def _touch(prim: Usd.Prim) -> None:
                 attribute.Get(time)
             if attribute:
                 attribute.Get()
-
-
-def _clip_starts(prim: Usd.Prim, name: str) -> list[float]:
-    return [float(pair[0]) for pair in Usd.ClipsAPI(prim).GetClipActive(name) or ()]
 
 
 def _limit_memory(path: Path) -> None:

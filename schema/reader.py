@@ -65,7 +65,8 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
             this process.
 
     Returns:
-        The sequence. ``metadata`` carries what the asset says about itself and notes on what had to be assumed.
+        The sequence. ``metadata`` carries what the asset says about itself; what had to be assumed is in
+        ``metadata["notes"]``, one line each.
 
     Raises:
         MissingFileError: There is no such file.
@@ -82,17 +83,20 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
     except Tf.ErrorException as error:
         raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
     prim = _find(stage, source, prim_path)
-    metadata = _metadata(prim, source)
-    frames, rate, topology = _timing(stage, prim, source, metadata)
+    notes: list[str] = []
+    metadata = _metadata(prim, source, notes)
+    frames, rate, topology = _timing(stage, prim, source, notes)
+    meters_per_unit = _meters_per_unit(stage, source, notes)
     space, word = radiance_color_space(prim)
     if array_attribute(prim, CHANNELS["radiance"]) is not None and space is None:
-        metadata["radiance_color_space_note"] = f"assumed {DISPLAY_SRGB}; the asset says {word or 'nothing'!r}"
+        stated = repr(word) if word else "nothing"
+        notes.append(f"the colour space of the radiance is taken as {DISPLAY_SRGB}; the asset says {stated}")
     reader = _FrameReader(
         stage=stage,
         prim=prim,
         source=source,
         times=frames,
-        meters_per_unit=_meters_per_unit(stage, source, metadata),
+        meters_per_unit=meters_per_unit,
         axes=_axes(stage, source),
         color_space=space or DISPLAY_SRGB,
         captured=metadata.get("radiance_meaning") != "baseColorOnly",
@@ -103,7 +107,7 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
         frames_per_second=rate,
         constant=reader.constant() if len(frames) > 1 else frozenset(reader.read(0).arrays()),
         topology=topology,
-        metadata=metadata,
+        metadata={**metadata, **({"notes": "\n".join(notes)} if notes else {})},
     )
 
 
@@ -119,6 +123,7 @@ class _FrameReader:
     axes: str
     color_space: str
     captured: bool
+    kept: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)  # converted arrays that do not vary
 
     def read(self, frame: int) -> GaussianCloud:
         """Read one frame; a fault in it is one error that names file, prim and time."""
@@ -189,19 +194,23 @@ class _FrameReader:
 
     def _array(self, channel: Channel, time: float, where: str) -> NDArray[Any] | None:
         attribute = array_attribute(self.prim, channel)
-        if attribute is None:
-            return None
+        if attribute is None or channel.name in self.kept:
+            return self.kept.get(channel.name)
         value = attribute.Get(time)
         try:
             if value is None:
                 raise ValueError("no value")
             array = from_vt(channel, value)
-            return array.astype(np.float32) if array.dtype.kind == "f" else array
+            array = array.astype(np.float32) if array.dtype.kind == "f" else array
         except (TypeError, ValueError) as error:
             raise AssetFormatError(
                 f"{where}: {attribute.GetName()} must be {channel.type_name}, got {attribute.GetTypeName()} "
                 f"({error}). Export it again."
             ) from error
+        if not attribute.ValueMightBeTimeVarying():
+            array.flags.writeable = False  # shared between frames
+            self.kept[channel.name] = array
+        return array
 
     def _sh_terms(self, where: str) -> int:
         degree = self.prim.GetAttribute(SH_DEGREE).Get()
@@ -226,9 +235,9 @@ def _find(stage: Usd.Stage, source: Path, prim_path: str | None) -> Usd.Prim:
     raise AssetFormatError(f"{source} must hold {wanted}, got {', '.join(paths)}. Pass one of them as prim_path.")
 
 
-def _metadata(prim: Usd.Prim, source: Path) -> dict[str, str]:
+def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
     """Collect what the asset says about itself, after checking that its version can be read."""
-    notes: dict[str, str] = {}
+    said: dict[str, str] = {}
     newer = [name for name in applied_schemas(prim) if name.startswith(f"{MATERIAL_API}_")]
     if newer:
         raise SchemaVersionError(
@@ -238,13 +247,13 @@ def _metadata(prim: Usd.Prim, source: Path) -> dict[str, str]:
     playing = sequence_prim(prim)
     if playing is not None:
         stored = playing.GetCustomDataByKey("beam")
-        notes.update({str(key): str(value) for key, value in (stored if isinstance(stored, Mapping) else {}).items()})
+        said.update({str(key): str(value) for key, value in (stored if isinstance(stored, Mapping) else {}).items()})
         for key, name in _SEQUENCE_TOKENS.items():
             word = authored(playing, name)
             if word:
-                notes[key] = str(word)
+                said[key] = str(word)
     if not has_material_api(prim):
-        return notes
+        return said
     version = str(authored(prim, "beam:schemaVersion") or "")
     major, _, minor = version.partition(".")
     if major != SCHEMA_VERSION.partition(".")[0] or not minor.isdecimal():
@@ -252,22 +261,20 @@ def _metadata(prim: Usd.Prim, source: Path) -> dict[str, str]:
             f"{source} must have schema version {SCHEMA_VERSION}, got {version or 'none'!r} at {prim.GetPath()}. "
             "Upgrade beam-warp, or export the asset again."
         )
-    notes["schema_version"] = version
+    said["schema_version"] = version
     if int(minor) > int(SCHEMA_VERSION.partition(".")[2]):
-        notes["schema_note"] = f"version {version} is newer than {SCHEMA_VERSION}: what it added is not read"
-        warnings.warn(f"{source}: schema {notes['schema_note']}.", UserWarning, stacklevel=3)
+        notes.append(f"schema version {version} is newer than {SCHEMA_VERSION}: what it added is not read")
+        warnings.warn(f"{source}: {notes[-1]}. Upgrade beam-warp to read all of it.", UserWarning, stacklevel=3)
     for key, name in _TOKENS.items():
         word = authored(prim, name)
         if word is not None:
-            notes[key] = notes.get(key, str(word)) if key == "roughness_source" else str(word)
+            said[key] = str(word)
     if array_attribute(prim, CHANNELS["metallic"]) is not None:
-        notes["metallic_note"] = "the asset has a metallic channel, which is not read"
-    return notes
+        notes.append("the asset has a metallic channel, which is not read")
+    return said
 
 
-def _timing(
-    stage: Usd.Stage, prim: Usd.Prim, source: Path, metadata: dict[str, str]
-) -> tuple[list[float], float, Topology]:
+def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) -> tuple[list[float], float, Topology]:
     """Return the time of each frame, the playback rate, and whether rows keep their identity."""
     times = sample_times(prim)
     rate = stage.GetTimeCodesPerSecond()
@@ -285,15 +292,15 @@ def _timing(
         steps = np.diff(times)
         rate /= float(np.median(steps))
         if not np.allclose(steps, steps[0], rtol=1e-6):
-            metadata["timing_note"] = "time samples are unevenly spaced; the rate is that of the median step"
+            notes.append("time samples are unevenly spaced; the rate is that of the median step")
     times = times or [stage.GetStartTimeCode()]
     return times, rate, "constant" if topology == "constant" or len(times) == 1 else "perFrame"
 
 
-def _meters_per_unit(stage: Usd.Stage, source: Path, metadata: dict[str, str]) -> float:
+def _meters_per_unit(stage: Usd.Stage, source: Path, notes: list[str]) -> float:
     meters = UsdGeom.GetStageMetersPerUnit(stage)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        metadata["units_note"] = f"assumed {meters:g} m per unit, which is USD's default; the asset states none"
+        notes.append(f"one unit is taken as {meters:g} m, USD's default; the asset states none")
     if not 0.0 < meters < np.inf:
         raise AssetFormatError(f"{source} must have a positive metersPerUnit, got {meters:g}. Set it.")
     return meters

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -24,6 +24,7 @@ from beam_warp.schema.stage_queries import (
     authored,
     clip_sets,
     has_material_api,
+    has_whole_clips,
     sample_times,
     sequence_prim,
     splat_prims,
@@ -39,31 +40,35 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule: ``check`` takes a stage, a prim or a frame, as ``subject`` says, and yields what is wrong."""
+    """A rule: ``check`` yields what is wrong with a stage, a prim or a frame."""
 
     id: str
     severity: Severity
-    subject: Literal["stage", "prim", "frame"]
-    text: str
     check: Callable[[Any], Iterator[Fault]]
 
+    @property
+    def text(self) -> str:
+        """What must hold, in one sentence."""
+        return (self.check.__doc__ or "").strip()
 
-RULES: list[Rule] = []
-"""Every rule that has been defined, in the order of definition."""
+
+Check = Callable[[Any], Iterator[Fault]]
 
 
-def rule(
-    rule_id: str, severity: Severity, subject: Literal["stage", "prim", "frame"]
-) -> Callable[[Callable[[Any], Iterator[Fault]]], Callable[[Any], Iterator[Fault]]]:
-    """Enter a function in the table of rules."""
+def entering(table: list[Rule], rule_id: str, severity: Severity) -> Callable[[Check], Check]:
+    """Return a decorator that enters a function in a table of rules."""
 
-    def enter(check: Callable[[Any], Iterator[Fault]]) -> Callable[[Any], Iterator[Fault]]:
-        assert all(known.id != rule_id for known in RULES), rule_id
-        RULES.append(Rule(rule_id, severity, subject, (check.__doc__ or "").strip(), check))
+    def enter(check: Check) -> Check:
+        table.append(Rule(rule_id, severity, check))
         return check
 
     return enter
 
+
+STAGE_RULES: list[Rule] = []
+FIRST_RULES: list[Rule] = []
+"""Rules about a prim without which no other can be asked: a missing clip layer makes OpenUSD raise everywhere."""
+PRIM_RULES: list[Rule] = []
 
 REQUIRED = ("positions", "orientations", "scales", "opacities", "radiance")
 RELIGHTABLE = ("base_color", "roughness", "ambient_occlusion", "normals")
@@ -73,16 +78,20 @@ TOKENS = {
     "beam:normalSource": ("authored", "shortestAxis", "none"),
     "beam:radianceMeaning": ("captured", "shaded", "baseColorOnly"),
 }
+OPTIONAL_TOKENS = {
+    "beam:roughnessSource": ("texture", "estimated", "constant", "unknown"),
+    "beam:sequence:topology": ("constant", "perSegment", "perFrame"),
+}
 
 
-@rule("BEAM-STAGE-001", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-001", "error")
 def _default_prim(stage: Usd.Stage) -> Iterator[Fault]:
     """The stage names a default prim that exists, so that it can be referenced."""
     if not stage.GetDefaultPrim():
         yield Fault(f"defaultPrim must name a prim, got {stage.GetRootLayer().defaultPrim or 'none'!r}. Set it.")
 
 
-@rule("BEAM-STAGE-002", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-002", "error")
 def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
     """metersPerUnit is authored and positive; USD would assume centimetres."""
     meters = UsdGeom.GetStageMetersPerUnit(stage)
@@ -92,7 +101,7 @@ def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
         yield Fault(f"metersPerUnit must be positive, got {meters:g}. Set it, for example to 1.")
 
 
-@rule("BEAM-STAGE-003", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-003", "error")
 def _up_axis(stage: Usd.Stage) -> Iterator[Fault]:
     """upAxis is authored and Y or Z."""
     up = stage.GetRootLayer().pseudoRoot.GetInfo("upAxis") if stage.HasAuthoredMetadata("upAxis") else None
@@ -100,17 +109,17 @@ def _up_axis(stage: Usd.Stage) -> Iterator[Fault]:
         yield Fault(f"upAxis must be Y or Z, got {up!r}. Author it.")
 
 
-@rule("BEAM-STAGE-004", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-004", "error")
 def _holds_splats(stage: Usd.Stage) -> Iterator[Fault]:
     """The stage holds at least one ParticleField3DGaussianSplat."""
     if not splat_prims(stage):
         yield Fault("the stage must hold a ParticleField3DGaussianSplat, got none. Convert the splats first.")
 
 
-@rule("BEAM-STAGE-005", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-005", "error")
 def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
     """A stage on which something varies states its time range and timeCodesPerSecond."""
-    if not any(len(sample_times(prim)) > 1 for prim in splat_prims(stage)):
+    if not any(has_whole_clips(prim) and len(sample_times(prim)) > 1 for prim in splat_prims(stage)):
         return
     if not stage.HasAuthoredTimeCodeRange() or not stage.GetStartTimeCode() <= stage.GetEndTimeCode():
         yield Fault("startTimeCode and endTimeCode must be authored in order, got none or reversed ones. Author them.")
@@ -118,14 +127,14 @@ def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
         yield Fault("timeCodesPerSecond must be authored and positive, got none. Author the frame rate.")
 
 
-@rule("BEAM-STAGE-006", "error", "stage")
+@entering(STAGE_RULES, "BEAM-STAGE-006", "error")
 def _composes(stage: Usd.Stage) -> Iterator[Fault]:
     """Every layer that the stage references is there and composes."""
     for problem in stage.GetCompositionErrors():
         yield Fault(f"the stage must compose, got: {' '.join(str(problem).split())} Restore the missing layer.")
 
 
-@rule("BEAM-GEO-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-GEO-001", "error")
 def _required_arrays(prim: Usd.Prim) -> Iterator[Fault]:
     """Positions, orientations, scales, opacities and spherical harmonics are authored."""
     for name in REQUIRED:
@@ -134,7 +143,7 @@ def _required_arrays(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault(f"{channel.usd_name} must be authored, got none. Write the array.", channel.usd_name)
 
 
-@rule("BEAM-GEO-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-GEO-002", "error")
 def _one_precision(prim: Usd.Prim) -> Iterator[Fault]:
     """Of an array's float and half variants one is authored, so that no host can pick a stale one."""
     for channel in CHANNELS.values():
@@ -142,7 +151,7 @@ def _one_precision(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault("one precision must be authored, got float and half. Clear one of them.", channel.usd_name)
 
 
-@rule("BEAM-GEO-003", "error", "prim")
+@entering(PRIM_RULES, "BEAM-GEO-003", "error")
 def _similarity(prim: Usd.Prim) -> Iterator[Fault]:
     """The transform to the world is rotation, uniform scale and translation."""
     for time in sample_times(prim) or [Usd.TimeCode.Default()]:
@@ -154,14 +163,14 @@ def _similarity(prim: Usd.Prim) -> Iterator[Fault]:
             return
 
 
-@rule("BEAM-GEO-004", "error", "prim")
+@entering(PRIM_RULES, "BEAM-GEO-004", "error")
 def _extent_authored(prim: Usd.Prim) -> Iterator[Fault]:
     """extent is authored: USD computes none for Gaussian splats."""
     if not authored_at_all(prim, "extent"):
         yield Fault("extent must be authored, got none. Write the bounds of each frame.", "extent")
 
 
-@rule("BEAM-SH-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-SH-001", "error")
 def _sh_degree(prim: Usd.Prim) -> Iterator[Fault]:
     """The spherical-harmonics degree is authored (USD would assume 3) and 0 to 4."""
     degree = authored(prim, SH_DEGREE)
@@ -169,14 +178,14 @@ def _sh_degree(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"the degree must be authored, 0 to {MAX_SH_DEGREE}, got {degree!r}. Author it.", SH_DEGREE)
 
 
-@rule("BEAM-API-001", "warning", "prim")
+@entering(PRIM_RULES, "BEAM-API-001", "warning")
 def _is_relightable(prim: Usd.Prim) -> Iterator[Fault]:
     """The prim has BeamRelightableGaussianAPI; without it, it is an ordinary splat that cannot be relit."""
     if not has_material_api(prim) and not _beam_attributes(prim):
         yield Fault(f"{MATERIAL_API} should be applied, got ordinary splats. Decompose them to relight them.")
 
 
-@rule("BEAM-API-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-API-002", "error")
 def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
     """A prim that authors beam: attributes has BeamRelightableGaussianAPI applied."""
     names = _beam_attributes(prim)
@@ -184,7 +193,7 @@ def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"{MATERIAL_API} must be applied, got beam: attributes without it. Apply it.", names[0])
 
 
-@rule("BEAM-MAT-001", "warning", "prim")
+@entering(PRIM_RULES, "BEAM-MAT-001", "warning")
 def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
     """Base colour, roughness, ambient occlusion and normals are all authored: relighting reads them."""
     missing = [CHANNELS[name].usd_name for name in RELIGHTABLE if array_attribute(prim, CHANNELS[name]) is None]
@@ -192,7 +201,7 @@ def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"relighting needs {', '.join(missing)}, got none. Decompose the asset.", missing[0])
 
 
-@rule("BEAM-MAT-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-MAT-002", "error")
 def _normal_source(prim: Usd.Prim) -> Iterator[Fault]:
     """normalSource is none exactly if there are no normals."""
     source = authored(prim, "beam:normalSource")
@@ -202,7 +211,7 @@ def _normal_source(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"normalSource must fit the normals, got {source} with {got}. Mend it.", "beam:normalSource")
 
 
-@rule("BEAM-COLOR-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-COLOR-001", "error")
 def _base_color_space(prim: Usd.Prim) -> Iterator[Fault]:
     """The base colour's colour space is authored as lin_rec709_scene, not left to a fallback."""
     attribute = array_attribute(prim, CHANNELS["base_color"])
@@ -213,7 +222,7 @@ def _base_color_space(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault(f"colorSpace must be {LINEAR_REC709}, got {got}. Author it.", attribute.GetName())
 
 
-@rule("BEAM-COLOR-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-COLOR-002", "error")
 def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
     """The colour space of the radiance is authored and one that we know."""
     space = authored(prim, "beam:radianceColorSpace")
@@ -222,7 +231,7 @@ def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"the colour space must be {wanted}, got {space!r}. Author it.", "beam:radianceColorSpace")
 
 
-@rule("BEAM-TOKEN-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-TOKEN-001", "error")
 def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
     """brdf, aoMeaning, normalSource and radianceMeaning are authored: fallbacks are invisible without the plug-in."""
     for name in TOKENS:
@@ -230,16 +239,18 @@ def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault(f"{name} must be authored, got none. Author it.", name)
 
 
-@rule("BEAM-TOKEN-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-TOKEN-002", "error")
 def _tokens_known(prim: Usd.Prim) -> Iterator[Fault]:
     """Tokens hold one of their allowed values."""
-    for name, allowed in TOKENS.items():
-        value = authored(prim, name)
+    playing = sequence_prim(prim)
+    for name, allowed in {**TOKENS, **OPTIONAL_TOKENS}.items():
+        holder = playing if name.startswith("beam:sequence:") else prim
+        value = authored(holder, name) if holder is not None else None
         if value is not None and value not in allowed:
             yield Fault(f"{name} must be one of {', '.join(allowed)}, got {value!r}. Choose one.", name)
 
 
-@rule("BEAM-VERSION-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-VERSION-001", "error")
 def _version_authored(prim: Usd.Prim) -> Iterator[Fault]:
     """schemaVersion is authored as major.minor."""
     version = authored(prim, "beam:schemaVersion")
@@ -247,7 +258,7 @@ def _version_authored(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"the version must be major.minor, got {version!r}. Author it.", "beam:schemaVersion")
 
 
-@rule("BEAM-VERSION-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-VERSION-002", "error")
 def _version_major(prim: Usd.Prim) -> Iterator[Fault]:
     """The schema's major version is one that this validator knows."""
     version = _parsed(authored(prim, "beam:schemaVersion"))
@@ -255,7 +266,7 @@ def _version_major(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"the major version must be {_KNOWN[0]}, got {version[0]}. Upgrade.", "beam:schemaVersion")
 
 
-@rule("BEAM-VERSION-003", "warning", "prim")
+@entering(PRIM_RULES, "BEAM-VERSION-003", "warning")
 def _version_minor(prim: Usd.Prim) -> Iterator[Fault]:
     """The schema's minor version is not newer than this validator."""
     version = _parsed(authored(prim, "beam:schemaVersion"))
@@ -263,7 +274,7 @@ def _version_minor(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"what is newer than {SCHEMA_VERSION} was not checked, got 1.{version[1]}. Upgrade.")
 
 
-@rule("BEAM-SEQ-001", "error", "prim")
+@entering(PRIM_RULES, "BEAM-SEQ-001", "error")
 def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
     """An ancestor of a relightable prim says how it plays: BeamSequenceAPI with frameCount, rate and topology."""
     if not has_material_api(prim):
@@ -277,7 +288,7 @@ def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault(f"beam:sequence:{name} must be authored on {playing.GetPath()}, got none. Author it.")
 
 
-@rule("BEAM-SEQ-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-SEQ-002", "error")
 def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
     """frameCount is the number of time codes of the stage's range, framesPerSecond its timeCodesPerSecond."""
     playing, stage = sequence_prim(prim), prim.GetStage()
@@ -293,7 +304,7 @@ def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"framesPerSecond must equal timeCodesPerSecond, {got:g}, got {rate:g}. Mend either.")
 
 
-@rule("BEAM-SEQ-003", "error", "prim")
+@entering(PRIM_RULES, "BEAM-SEQ-003", "error")
 def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
     """Arrays that vary share one set of time samples, so that each frame is whole."""
     samples = _own_samples(prim)
@@ -304,7 +315,7 @@ def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault(f"samples must be those of all arrays, got none at time {gap:g}. Write every frame.", name)
 
 
-@rule("BEAM-SEQ-004", "error", "prim")
+@entering(PRIM_RULES, "BEAM-SEQ-004", "error")
 def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
     """Time samples are every whole time code from startTimeCode to endTimeCode."""
     stage = prim.GetStage()
@@ -317,7 +328,7 @@ def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"samples must be every whole time code of the range, got a difference at {strange:g}. Mend them.")
 
 
-@rule("BEAM-CLIP-001", "error", "prim")
+@entering(FIRST_RULES, "BEAM-CLIP-001", "error")
 def _clips_resolve(prim: Usd.Prim) -> Iterator[Fault]:
     """Every layer that value clips name opens, and every clip that becomes active exists."""
     for clips in clip_sets(prim):
@@ -327,24 +338,22 @@ def _clips_resolve(prim: Usd.Prim) -> Iterator[Fault]:
             yield Fault("active clips must be among the clip layers, got another index. Mend clips:active.")
 
 
-@rule("BEAM-CLIP-002", "error", "prim")
+@entering(PRIM_RULES, "BEAM-CLIP-002", "error")
 def _clip_manifest(prim: Usd.Prim) -> Iterator[Fault]:
     """The manifest declares exactly the attributes that the clip layers sample."""
     for clips in clip_sets(prim):
-        if clips.missing_layers():
-            continue
         declared, sampled = clips.declared(), set().union(*(clips.sampled(index) for index in range(len(clips.paths))))
         for name in sorted(declared ^ sampled):
             got = "no samples of what it declares" if name in declared else "samples of what it does not declare"
             yield Fault(f"the manifest must declare what clips sample, got {got}. Write it anew.", name)
 
 
-@rule("BEAM-CLIP-003", "error", "prim")
+@entering(PRIM_RULES, "BEAM-CLIP-003", "error")
 def _clips_cover(prim: Usd.Prim) -> Iterator[Fault]:
     """At every time code of the range the active clip has a sample of every declared attribute."""
     stage = prim.GetStage()
     for clips in clip_sets(prim):
-        if clips.missing_layers() or not clips.active or not stage.HasAuthoredTimeCodeRange():
+        if not clips.active or not stage.HasAuthoredTimeCodeRange():
             continue
         for name in sorted(clips.declared() & clips.sampled(0)):
             for time in np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1.0):

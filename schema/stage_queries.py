@@ -89,6 +89,11 @@ def radiance_color_space(prim: Usd.Prim) -> tuple[str | None, str]:
     return _COLOR_SPACES.get(str(word)), str(word or "")
 
 
+def has_whole_clips(prim: Usd.Prim) -> bool:
+    """Say whether all clip layers of a prim open; where one does not, every question about samples raises."""
+    return not any(clips.missing_layers() for clips in clip_sets(prim))
+
+
 @dataclass(frozen=True)
 class ClipSet:
     """One set of explicit value clips of a prim.
@@ -121,7 +126,9 @@ class ClipSet:
         """Return the attributes that one clip layer has samples of."""
         layer = _open_layer(self.paths[index])
         prim = layer.GetPrimAtPath(self.prim_path) if layer else None
-        names = set(prim.attributes.keys()) if prim else set()
+        if layer is None or not prim:
+            return set()
+        names = prim.attributes.keys()
         return {name for name in names if layer.GetNumTimeSamplesForPath(f"{self.prim_path}.{name}")}
 
     def has_sample(self, name: str, time: float) -> bool:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.images import linear_to_srgb, srgb_to_linear
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.spherical_harmonics import SH_C0
 
@@ -108,7 +109,7 @@ def display_color(cloud: GaussianCloud) -> NDArray[np.float32]:
     else:
         color = np.clip(0.5 + SH_C0 * stored_arrays(cloud)["radiance"][:, 0].astype(np.float64), 0.0, 1.0)
         if cloud.radiance_color_space in (None, DISPLAY_SRGB):
-            color = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+            color = srgb_to_linear(color)
     return np.average(color, axis=0, weights=cloud.opacities).astype(np.float32)
 
 
@@ -119,24 +120,23 @@ def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
     color = cloud.base_color.astype(np.float64)
     if cloud.ambient_occlusion is not None:
         color = color * cloud.ambient_occlusion[:, None]
-    encoded = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1.0 / 2.4) - 0.055)
-    return ((encoded - 0.5) / SH_C0).astype(np.float32)[:, None, :]
+    return ((linear_to_srgb(color) - 0.5) / SH_C0).astype(np.float32)[:, None, :]
 
 
 def _require_same_kind(sequence: GaussianSequence, frame: int, cloud: GaussianCloud, first: GaussianCloud) -> None:
     """Refuse a frame that one prim cannot hold together with frame 0."""
-    for label, got, wanted in _kinds(cloud, first):
-        if got != wanted:
-            raise InvalidOptionError(
-                f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
-                "Convert the frames to one form."
-            )
     names, wanted_names = set(cloud.arrays()), set(first.arrays())
     if names != wanted_names:
         raise InvalidArrayError(
             f"frames must hold the same arrays, got a difference in {', '.join(sorted(names ^ wanted_names))} "
             f"at frame {frame}. Fill or drop these arrays everywhere."
         )
+    for label, got, wanted in _kinds(cloud, first):
+        if got != wanted:
+            raise InvalidOptionError(
+                f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
+                "Convert the frames to one form."
+            )
     if len(cloud) != len(first) and (sequence.topology == "constant" or "positions" in sequence.constant):
         raise InvalidOptionError(
             f"topology must be perFrame where counts change, got {len(cloud)} Gaussians after {len(first)} at frame "

@@ -14,12 +14,13 @@ import numpy as np
 from pxr import Tf, Usd, UsdValidation
 
 from beam_warp.errors import AssetFormatError
-from beam_warp.schema import frame_rules, register
+from beam_warp.schema import register
 from beam_warp.schema.files import require_asset_file, run_child
+from beam_warp.schema.frame_rules import FRAME_RULES, Frame
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
 from beam_warp.schema.probe import said_by_usd
 from beam_warp.schema.report import Finding, Report, Severity
-from beam_warp.schema.rules import RULES, Rule
+from beam_warp.schema.rules import FIRST_RULES, PRIM_RULES, STAGE_RULES, Rule
 from beam_warp.schema.stage_queries import array_attribute, authored, sample_times, sequence_prim, splat_prims
 
 SECONDS = 120.0
@@ -30,6 +31,10 @@ BYTES_PER_SECOND = 20e6
 
 HOST_VALIDATOR = "beam_warp.schema.host_validator:AssetRules"
 """Our rules as OpenUSD knows them; not run again beside our rules."""
+
+
+ALL_RULES = tuple(sorted([*STAGE_RULES, *FIRST_RULES, *PRIM_RULES, *FRAME_RULES], key=lambda rule: rule.id))
+"""Every rule of ours, by id."""
 
 
 def validate(path: str | Path) -> Report:
@@ -62,16 +67,20 @@ def validate_stage(stage: Usd.Stage) -> Report:
 
 def check_rules(stage: Usd.Stage) -> Report:
     """Check a stage against our own rules only, holding two frames at a time."""
-    findings = [finding for rule in _of("stage") for finding in _ask(rule, stage, "/")]
+    findings = [finding for rule in STAGE_RULES for finding in _ask(rule, stage, "/")]
     frames = gaussians = 0
     for prim in splat_prims(stage):
         path = str(prim.GetPath())
-        findings += [finding for rule in _of("prim") for finding in _ask(rule, prim, path)]
+        broken = [finding for rule in FIRST_RULES for finding in _ask(rule, prim, path)]
+        if broken:
+            findings += broken
+            continue
+        findings += [finding for rule in PRIM_RULES for finding in _ask(rule, prim, path)]
         seen: dict[tuple[str, str], Finding] = {}
         for index, (time, frame) in enumerate(_frames(prim)):
             frames = max(frames, index + 1)
             gaussians += frame.count if index == 0 else 0
-            for rule in _of("frame"):
+            for rule in FRAME_RULES:
                 for found in _ask(rule, frame, path):
                     first = seen.get((found.rule, found.attribute))
                     seen[found.rule, found.attribute] = Finding(
@@ -87,16 +96,12 @@ def check_rules(stage: Usd.Stage) -> Report:
     return Report(stage.GetRootLayer().identifier, tuple(findings), frames, gaussians)
 
 
-def _of(subject: str) -> list[Rule]:
-    return [rule for rule in RULES if rule.subject == subject]
-
-
 def _ask(rule: Rule, subject: object, path: str) -> Iterator[Finding]:
     for fault in rule.check(subject):
         yield Finding(rule.id, rule.severity, fault.message, path, fault.attribute)
 
 
-def _frames(prim: Usd.Prim) -> Iterator[tuple[float, frame_rules.Frame]]:
+def _frames(prim: Usd.Prim) -> Iterator[tuple[float, Frame]]:
     """Read a prim frame by frame; arrays that do not vary are read and checked once."""
     attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items()}
     attributes = {name: attribute for name, attribute in attributes.items() if attribute is not None}
@@ -114,10 +119,13 @@ def _frames(prim: Usd.Prim) -> Iterator[tuple[float, frame_rules.Frame]]:
             value = _value(attributes[name], time)
             if value is not None:
                 arrays[name] = from_vt(CHANNELS[name], value)
+        if "positions" not in arrays:  # a missing clip or array, which a rule about prims reports
+            previous = None
+            continue
         extent = _value(prim.GetAttribute("extent"), time)
         yield (
             time,
-            frame_rules.Frame(
+            Frame(
                 arrays={name: arrays[name] for name in CHANNELS if name in arrays},
                 changed=changed,
                 attributes={name: attribute.GetName() for name, attribute in attributes.items()},
@@ -127,7 +135,7 @@ def _frames(prim: Usd.Prim) -> Iterator[tuple[float, frame_rules.Frame]]:
                 previous=previous,
             ),
         )
-        previous = arrays if "positions" in arrays else None
+        previous = arrays
 
 
 def _value(attribute: Usd.Attribute, time: float) -> object | None:

@@ -48,12 +48,14 @@ def write_asset(
 
     Reads every frame twice (first to learn what varies and which precision is safe) and holds one segment at a time.
     Arrays that are the same in every frame are written once. Arrays are written in half precision where that is safe
-    (see `beam_warp.schema.layout`); positions always in float.
+    (see `beam_warp.schema.layout`); positions always in float. Layers of an earlier asset of the same name are
+    replaced where names meet; its further segments stay, unused.
 
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
             ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units`` set
-            the attributes of these names; all keys are kept in ``customData`` of ``/Asset``.
+            the attributes of these names; all keys but
+            ``notes`` are kept in ``customData`` of ``/Asset``.
         path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
             ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
         full_float: Write every array in float.

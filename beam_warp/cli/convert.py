@@ -126,9 +126,12 @@ def convert(command: ConvertCommand) -> int:
     elif not command.quiet:
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
-        last = f" … {paths[-1].name}" if len(paths) > 1 else ""
+        if is_ply:
+            files = f"{paths[0]}" + (f" … {paths[-1].name}" if len(paths) > 1 else "")
+        else:
+            files = f"{command.output}" + (f" and {len(paths) - 1} layers beside it" if len(paths) > 1 else "")
         frames = f"{len(sequence)} frames, " if len(sequence) > 1 else ""
-        print(f"wrote {paths[0]}{last}: {frames}{len(first):,} Gaussians, {seconds:.2f} s")
+        print(f"wrote {files}: {frames}{len(first):,} Gaussians, {seconds:.2f} s")
     return 0
 
 

@@ -56,14 +56,12 @@ def _validate(asset: str, as_json: bool, quiet: bool) -> int:
 
 
 def _list_rules(as_json: bool) -> int:
-    from beam_warp.schema import frame_rules as _frame_rules  # noqa: F401  enters its rules in the table
-    from beam_warp.schema.rules import RULES
+    from beam_warp.schema.validator import ALL_RULES
 
-    rules = sorted(RULES, key=lambda rule: rule.id)
     if as_json:
-        print_json([{"id": rule.id, "severity": rule.severity, "text": rule.text} for rule in rules])
+        print_json([{"id": rule.id, "severity": rule.severity, "text": rule.text} for rule in ALL_RULES])
     else:
-        for rule in rules:
+        for rule in ALL_RULES:
             print(f"{rule.id:17} {rule.severity:8} {rule.text}")
     return 0
 

@@ -1,0 +1,43 @@
+"""``beam``: one command with a word for each thing the package does."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, subcommand
+
+from beam_warp._version import __version__
+from beam_warp.cli.console import run_command
+from beam_warp.cli.demo import Demo, demo
+from beam_warp.cli.render import Render, render
+from beam_warp.cli.run import Run, run
+
+_HELP = """Relightable 4D Gaussian assets: decompose, relight, demonstrate.
+
+Example: beam run person.ply --environment studio.hdr --out person
+
+See also beam-convert (formats, axes, units) and beam-validate (is an asset valid?).
+"""
+
+Command = (
+    Annotated[Run, subcommand("run", prefix_name=False)]
+    | Annotated[Render, subcommand("render", prefix_name=False)]
+    | Annotated[Demo, subcommand("demo", prefix_name=False)]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``beam``; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"beam {__version__}")
+        return 0
+    command = tyro.cli(Command, prog="beam", description=_HELP, args=words, config=(FlagCreatePairsOff,))  # type: ignore[arg-type]
+    if isinstance(command, Run):
+        return run_command(lambda: run(command))
+    if isinstance(command, Render):
+        return run_command(lambda: render(command))
+    return run_command(lambda: demo(command))

@@ -1,0 +1,130 @@
+"""One picture of an asset: what was captured, what was found, and two relightings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from PIL import ImageDraw, ImageFont
+
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
+from beam_warp.cameras import Camera
+from beam_warp.deferred import EnvironmentLighting, shade
+from beam_warp.environments import EnvironmentMap
+from beam_warp.images import display_image
+from beam_warp.rasterizing import GBuffer, rasterize
+
+BACKGROUND = 0.13
+"""Display grey behind the subject: dark subjects stay visible, and white ones too."""
+
+MARGIN = 8
+TITLE_HEIGHT = 30
+WHITE_IRRADIANCE = 0.85 * np.pi
+"""Relightings are exposed so that a white surface facing the light's strongest side comes to 0.85."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relighting:
+    """A light to show the asset under."""
+
+    title: str
+    environment: EnvironmentMap
+
+
+def relit(buffer: GBuffer, environment: EnvironmentMap, device: str | None) -> NDArray[np.float32]:
+    """Return a G-buffer's radiance under an environment, ``(H, W, 3)`` scene-linear, premultiplied."""
+    return shade(
+        base_color=buffer.channels["base_color"],
+        roughness=buffer.channels["roughness"],
+        ambient_occlusion=buffer.channels["ambient_occlusion"],
+        normals=buffer.channels["normals"],
+        alpha=buffer.alpha,
+        view_directions=buffer.camera.directions(),
+        lighting=EnvironmentLighting.from_environment(environment, device=device),
+    )
+
+
+def display_exposure(environment: EnvironmentMap) -> float:
+    """Return the stops that bring a white surface, at its best-lit orientation, to just below display white."""
+    brightest = float(environment.irradiance_map(16, 32).max())
+    return float(np.log2(WHITE_IRRADIANCE / max(brightest, 1e-12)))
+
+
+def contact_sheet(
+    cloud: GaussianCloud,
+    camera: Camera,
+    relightings: Sequence[Relighting],
+    *,
+    device: str | None = None,
+) -> NDArray[np.uint8]:
+    """Draw the captured colour, ambient occlusion, base colour, roughness, normals, and the relightings.
+
+    Args:
+        cloud: Relightable, with captured radiance, axes "rfu".
+        camera: Sees each panel.
+        relightings: One panel each.
+        device: Warp device.
+
+    Returns:
+        8-bit sRGB, ``(H, W, 3)``.
+    """
+    names = ("base_color", "roughness", "ambient_occlusion", "normals")
+    buffer = rasterize(cloud, camera, channels=("radiance", *names), device=device)
+    alpha = buffer.alpha[..., None]
+    captured = buffer.channels["radiance"]
+    if cloud.radiance_color_space != DISPLAY_SRGB:
+        captured = display_image(captured) / 255.0
+    panels = [
+        ("captured", _over(np.clip(captured, 0.0, 1.0), alpha)),
+        ("ambient occlusion (white is open)", _over(_gray(buffer.channels["ambient_occlusion"]), alpha)),
+        ("base colour", _over(display_image(buffer.channels["base_color"]) / 255.0, alpha)),
+        ("roughness (white is 1)", _over(_gray(buffer.channels["roughness"]), alpha)),
+        ("normals (x, y, z as r, g, b)", _over(0.5 * buffer.channels["normals"] + 0.5, alpha)),
+    ]
+    for light in relightings:
+        radiance = relit(buffer, light.environment, device)
+        straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
+        shown = display_image(straight, display_exposure(light.environment)) / 255.0
+        panels.append((light.title, _over(shown, alpha)))
+    return _grid(panels)
+
+
+def _gray(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
+
+
+def _over(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.rint(255.0 * (display * alpha + BACKGROUND * (1.0 - alpha))).astype(np.uint8)
+
+
+def _grid(panels: Sequence[tuple[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+    """Lay panels out with their titles, close to 16:9 and with few empty places."""
+    height, width = panels[0][1].shape[:2]
+    cell = (height + TITLE_HEIGHT + MARGIN, width + MARGIN)
+
+    def cost(columns: int) -> float:
+        rows = -(-len(panels) // columns)
+        aspect = columns * cell[1] / (rows * cell[0])
+        return abs(float(np.log(aspect * 9.0 / 16.0))) + 0.3 * (rows * columns - len(panels))
+
+    columns = min(range(1, len(panels) + 1), key=cost)
+    rows = -(-len(panels) // columns)
+    sheet = PillowImage.new(
+        "RGB", (columns * cell[1] + MARGIN, rows * cell[0] + MARGIN), (round(255 * BACKGROUND * 0.7),) * 3
+    )
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=16)
+    for number, (title, pixels) in enumerate(panels):
+        left = MARGIN + number % columns * cell[1]
+        top = MARGIN + number // columns * cell[0]
+        size = 16
+        while draw.textlength(title, font=font) > width and size > 8:
+            size -= 1
+            font = ImageFont.load_default(size=size)
+        draw.text((left + 2, top + 5), title, fill=(225, 225, 225), font=font)
+        font = ImageFont.load_default(size=16)
+        sheet.paste(PillowImage.fromarray(pixels), (left, top + TITLE_HEIGHT))
+    return np.asarray(sheet)

@@ -1,0 +1,522 @@
+"""The main job: Gaussians with captured radiance in, a relightable asset out, frame by frame and resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, astuple, dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp import converters
+from beam_warp._version import __version__
+from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence, Observability
+from beam_warp.axes import change_axes
+from beam_warp.cameras import Camera, bulk
+from beam_warp.checks import require_number
+from beam_warp.contact_sheet import Relighting, contact_sheet
+from beam_warp.devices import resolve_device
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidArrayError, OutputError
+from beam_warp.frame_store import frame_key, read_frame, write_frame
+from beam_warp.images import write_png
+from beam_warp.kernels.launching import thread_count
+from beam_warp.materials import (
+    BaseColor,
+    ColorEvidence,
+    MaterialOptions,
+    PreparedLight,
+    estimate_exposure,
+    measure_materials,
+    solve_base_color,
+)
+from beam_warp.roughness import constant_roughness, textured_roughness
+from beam_warp.scene import Scene
+from beam_warp.surfaces import SurfaceNormals, estimate_normals
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, total)."""
+
+CLIPPED_WARNING = 0.05
+"""Part of the Gaussians with base colour cut at 1 above which the stated light is called too dim."""
+
+ASSET_NAME = "asset.usda"
+EVIDENCE = "evidence_"
+
+
+def no_progress(stage: str, done: int, total: int) -> None:
+    """Report to nobody."""
+
+
+@dataclass(frozen=True)
+class RoughnessTexture:
+    """A roughness texture and the mesh whose texture coordinates it follows, in the axes and units of the input."""
+
+    texture: Path
+    mesh: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What the main job is asked for.
+
+    Attributes:
+        materials: Rays, offset, bounce, seed.
+        roughness: Perceptual roughness of everything, or a texture.
+        exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
+            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear.
+        persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
+            frames at once; sequences that carry ids state it themselves.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+    """
+
+    materials: MaterialOptions = field(default_factory=MaterialOptions)
+    roughness: float | RoughnessTexture = 0.5
+    exposure: float | Literal["auto"] = "auto"
+    persistent: bool = False
+    device: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverviewOptions:
+    """What the contact sheet shows.
+
+    Attributes:
+        second_light: Shown beside the light of the capture; that light turned by 180 degrees if None.
+        azimuth: Camera angle; 0 looks along +y [degree].
+        elevation: Camera angle above the horizon [degree].
+        height: Height of a panel [pixel].
+    """
+
+    second_light: Relighting | None = None
+    azimuth: float = 0.0
+    elevation: float = 5.0
+    height: int = 640
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Where things are, and what was done.
+
+    Attributes:
+        asset: Root layer of the asset.
+        overview: The contact sheet.
+        sequence: The relightable sequence, read lazily from the store, axes "rfu".
+        environment: The light as used: the given one times the exposure.
+        report: What was measured, JSON-able; also written to ``report.json``.
+    """
+
+    asset: Path
+    overview: Path
+    sequence: GaussianSequence
+    environment: EnvironmentMap
+    report: dict[str, Any]
+
+
+def run(
+    sequence: GaussianSequence,
+    environment: EnvironmentMap,
+    out: Path,
+    options: RunOptions | None = None,
+    *,
+    overview: OverviewOptions | None = None,
+    progress: Progress = no_progress,
+) -> RunResult:
+    """Decompose a sequence; write ``out/asset.usda``, its layers, ``out/report.json`` and ``out/overview.png``.
+
+    Every finished frame is kept in ``out/frames``; a second call with the same input and options takes up where the
+    first was stopped, and one with other input or options starts over.
+
+    Args:
+        sequence: Frames with captured radiance, in any axes.
+        environment: The light of the capture, in the world "rfu".
+        out: Folder; made if its parent exists.
+        options: See `RunOptions`.
+        overview: See `OverviewOptions`.
+        progress: Called with (stage, done, total).
+
+    Raises:
+        InvalidArrayError: A frame has no captured radiance.
+        OutputError: The folder cannot be made or written.
+        BeamError: An input or option breaks its contract.
+
+    Source: BEAM §3.2, by the direct path (see `beam_warp.materials`).
+    """
+    started = time.perf_counter()
+    job = _Job(sequence, environment, _make_folders(out), options or RunOptions())
+    total = len(sequence)
+    for frame in range(total):
+        job.measure(frame)
+        progress("decompose", frame + 1, total)
+    with job.timer("solve"):
+        relightable = job.solve()
+    with job.timer("write asset"):
+        asset = out / ASSET_NAME
+        converters.write(relightable, asset)
+    picture = out / "overview.png"
+    with job.timer("overview"):
+        progress("overview", 0, 1)
+        _draw_overview(job, relightable, picture, overview or OverviewOptions())
+        progress("overview", 1, 1)
+    report = job.report()
+    report["seconds"]["total"] = time.perf_counter() - started
+    write_report(out, report)
+    return RunResult(asset, picture, relightable, job.lit, report)
+
+
+def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: OverviewOptions) -> None:
+    """Draw the middle frame; panels are as wide as the subject needs."""
+    cloud = sequence[len(sequence) // 2]
+    extent = np.ptp(bulk(cloud.positions, cloud.opacities), axis=0)
+    aspect = float(np.clip(np.hypot(extent[0], extent[1]) / max(extent[2], 1e-9), 0.5, 1.8))
+    camera = Camera.frame_cloud(
+        cloud.positions,
+        cloud.opacities,
+        azimuth=options.azimuth,
+        elevation=options.elevation,
+        width=round(options.height * aspect),
+        height=options.height,
+    )
+    lights = [
+        Relighting("relit by the light of the capture", job.lit),
+        options.second_light or Relighting("relit by that light turned by 180°", job.lit.rotated(180.0)),
+    ]
+    write_png(path, contact_sheet(cloud, camera, lights, device=str(job.device)))
+
+
+def write_report(out: Path, report: Mapping[str, Any]) -> None:
+    """Write ``out/report.json`` whole or not at all."""
+    path = out / "report.json"
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error
+
+
+class _Timer:
+    """Seconds by stage; waits for the device, so that work is charged to the stage that asked for it."""
+
+    def __init__(self, device: Any) -> None:
+        self.seconds: dict[str, float] = {}
+        self._device = device
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        wp.synchronize_device(self._device)
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+class _Frame:
+    """One frame on its way through: each step is done when it is first asked for, and once."""
+
+    def __init__(self, number: int, original: GaussianCloud, job: _Job) -> None:
+        self.number = number
+        self._original = original
+        self._job = job
+        self.cloud = change_axes(original, WORLD_AXES)
+        if self.cloud.radiance is None:
+            raise InvalidArrayError(
+                f"radiance must be given to decompose materials, got none at frame {number}. "
+                "Import Gaussians with captured colour."
+            )
+
+    @cached_property
+    def scene(self) -> Scene:
+        with self._job.timer("upload and build"):
+            return Scene.from_gaussians(self.cloud, str(self._job.device))
+
+    @cached_property
+    def surface(self) -> SurfaceNormals:
+        scene = self.scene
+        with self._job.timer("normals"):
+            return estimate_normals(self.cloud, scene, seed=self._job.options.materials.seed)
+
+    @cached_property
+    def roughness(self) -> NDArray[np.float32]:
+        source = self._job.options.roughness
+        if isinstance(source, RoughnessTexture):
+            return textured_roughness(self._original, source.texture, source.mesh)
+        return constant_roughness(self.cloud, source)
+
+
+class _Job:
+    """One call of `run`: what it was given, where its store is, and what it has found out so far."""
+
+    def __init__(
+        self, sequence: GaussianSequence, environment: EnvironmentMap, folder: Path, options: RunOptions
+    ) -> None:
+        self.sequence = sequence
+        self.folder = folder
+        self.options = options
+        self.device = resolve_device(options.device)
+        self.timer = _Timer(self.device)
+        self.persistent = options.persistent or sequence.topology == "constant"
+        self.resumed = 0
+        self.first = _Frame(0, sequence[0], self)
+        self.exposure = self._find_exposure(environment)
+        self.lit = environment.scaled(2.0**self.exposure)
+        self.light = PreparedLight.from_environment(self.lit, self.device)
+        self.key = _digest(self._described(), self.lit.radiance)
+        self._statistics: dict[str, Any] = {}
+
+    def _described(self) -> str:
+        """Everything but the input and the light that a stored measurement depends on."""
+        source = self.options.roughness
+        files = [source.texture, source.mesh] if isinstance(source, RoughnessTexture) else []
+        return json.dumps(
+            {
+                "version": __version__,
+                "device": "cuda" if self.device.is_cuda else "cpu",
+                "options": options_as_dict(self.options),
+                "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
+            },
+            sort_keys=True,
+        )
+
+    def _find_exposure(self, environment: EnvironmentMap) -> float:
+        """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
+        if self.options.exposure != "auto":
+            return require_number("exposure", self.options.exposure, -32.0, 32.0)
+        if self.first.cloud.radiance_color_space != DISPLAY_SRGB:
+            return 0.0
+        path = self.folder / "exposure.h5"
+        key = _digest(self._described(), environment.radiance, *self.first.cloud.arrays().values())
+        if frame_key(path) != key:
+            first = self.first
+            scene, surface, roughness = first.scene, first.surface, first.roughness
+            with self.timer("exposure"):
+                factor = estimate_exposure(
+                    first.cloud, scene, surface, roughness, environment, options=self.options.materials
+                )
+            write_frame(path, key, {"stops": np.array([np.log2(factor)])})
+        return float(read_frame(path)["stops"][0])
+
+    def path(self, frame: int) -> Path:
+        return self.folder / f"frame_{frame:06d}.h5"
+
+    def measure(self, number: int) -> None:
+        """Measure a frame into the store, unless it is there already."""
+        frame = self.first if number == 0 else _Frame(number, self.sequence[number], self)
+        key = _digest(f"{self.key} {number} {frame.cloud.radiance_color_space}", *frame.cloud.arrays().values())
+        if frame_key(self.path(number)) == key:
+            self.resumed += 1
+            return
+        scene, surface = frame.scene, frame.surface
+        with self.timer("materials"):
+            measured = measure_materials(
+                frame.cloud,
+                scene,
+                surface,
+                frame.roughness,
+                self.light,
+                options=self.options.materials,
+                frame=number,
+            )
+        arrays = {
+            **frame.cloud.arrays(),
+            "ambient_occlusion": measured.ambient_occlusion,
+            "ambient_occlusion_error": measured.ambient_occlusion_error,
+            "normals": surface.normals,
+            "normal_confidence": surface.confidence,
+            "roughness": frame.roughness,
+            **{EVIDENCE + name: getattr(measured.evidence, name) for name in ColorEvidence.ARRAYS},
+            "from_shape": surface.from_shape,
+            "report": np.array(astuple(scene.report)),
+        }
+        with self.timer("store"):
+            write_frame(self.path(number), key, arrays)
+
+    def stored_cloud(self, frame: int) -> GaussianCloud:
+        """Return what is known of a frame before base colour is solved."""
+        stored = read_frame(self.path(frame))
+        return GaussianCloud(
+            **{name: array for name, array in stored.items() if name in ATTRIBUTES},
+            axes=WORLD_AXES,
+            radiance_color_space=self.first.cloud.radiance_color_space,
+        )
+
+    def evidence(self, frame: int) -> ColorEvidence:
+        names = tuple(EVIDENCE + name for name in ColorEvidence.ARRAYS)
+        stored = read_frame(self.path(frame), names)
+        return ColorEvidence(**{name.removeprefix(EVIDENCE): array for name, array in stored.items()})
+
+    def solve(self) -> GaussianSequence:
+        """Solve base colour, over all frames at once or each by itself, and return the relightable sequence."""
+        total = len(self.sequence)
+        tally = _Tally()
+        if self.persistent:
+            joint = self.evidence(0)
+            for frame in range(1, total):
+                joint = joint + self.evidence(frame)
+            groups = {0: joint}
+        else:
+            groups = dict.fromkeys(range(total))
+        for frame, evidence in groups.items():
+            cloud = self.stored_cloud(frame)
+            solved = solve_base_color(cloud, evidence or self.evidence(frame), self.light.mean_irradiance)
+            write_frame(
+                self.folder / f"solution_{frame:06d}.h5",
+                self.key,
+                {
+                    "base_color": solved.base_color,
+                    "base_color_error": solved.standard_error,
+                    "observability": solved.observability,
+                },
+            )
+            tally.add(solved, cloud, read_frame(self.path(frame), ("from_shape", "report")))
+        self._statistics = tally.summary()
+
+        def read(frame: int) -> GaussianCloud:
+            solution = read_frame(self.folder / f"solution_{0 if self.persistent else frame:06d}.h5")
+            return self.stored_cloud(frame).with_arrays(**solution)
+
+        solution_names = {"base_color", "base_color_error", "observability"}
+        constant_roughness_names = {"roughness"} if self.persistent else set()
+        return GaussianSequence(
+            frame_count=total,
+            read_frame=read,
+            frames_per_second=self.sequence.frames_per_second,
+            constant=frozenset(self.sequence.constant & set(ATTRIBUTES)) - {"normals"}
+            | (solution_names if self.persistent else set())
+            | constant_roughness_names,
+            topology="constant" if self.persistent else "perFrame",
+            metadata={
+                **self.sequence.metadata,
+                "generator": f"beam-warp {__version__}",
+                "normal_source": "shortestAxis" if self._statistics["normals_from_shape"] > 0.5 else "authored",
+                "roughness_source": "texture" if isinstance(self.options.roughness, RoughnessTexture) else "constant",
+                "radiance_meaning": "captured",
+                "source_axes": self.first._original.axes,
+                "exposure_stops": f"{self.exposure:.4f}",
+            },
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return what was done, found and spent; JSON-able."""
+        measured = len(self.sequence) - self.resumed
+        samples = self.options.materials.sample_count
+        seconds = self.timer.seconds.get("materials", 0.0)
+        rays = measured * len(self.first.cloud) * samples * 2
+        notes = self.sequence.metadata.get("notes", "").splitlines()
+        warnings = []
+        if self._statistics["clipped_part"] > CLIPPED_WARNING:
+            warnings.append(
+                f"{self._statistics['clipped_part']:.0%} of what is opaque has base colour cut at 1: the environment "
+                "is too dim, or comes from other sides than the light of the capture; see --exposure and --rotate"
+            )
+        if self._statistics["flags"]["UNCERTAIN_NORMAL"] > 0.5 * self._statistics["gaussians"]:
+            warnings.append("most normals are uncertain: the Gaussians do not form a surface; relighting is a guess")
+        return {
+            "input": {"frames": len(self.sequence), "gaussians": len(self.first.cloud), "notes": notes},
+            "device": {
+                "name": self.device.name,
+                "kind": "cuda" if self.device.is_cuda else "cpu",
+                "threads": None if self.device.is_cuda else thread_count(),
+            },
+            "versions": {
+                "beam-warp": __version__,
+                "warp": wp.__version__,
+                "numpy": np.__version__,
+                "usd-core": version("usd-core"),
+                "python": platform.python_version(),
+            },
+            "options": options_as_dict(self.options),
+            "exposure_stops": self.exposure,
+            "resumed_frames": self.resumed,
+            "persistent": self.persistent,
+            "materials": self._statistics,
+            "seconds": dict(self.timer.seconds),
+            "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
+            "warnings": warnings,
+        }
+
+
+class _Tally:
+    """Counts over frames, so that a report needs no frame twice."""
+
+    def __init__(self) -> None:
+        self._rows = 0
+        self._sums = dict.fromkeys(
+            ("clipped", "from_shape", "openness", "confidence", "error", "dropped", "raised"), 0.0
+        )
+        self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
+
+    def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:
+        count = len(cloud)
+        measured = (solved.observability & np.uint8(Observability.FILLED)) == 0
+        assert cloud.ambient_occlusion is not None
+        assert cloud.normal_confidence is not None
+        self._rows += count
+        for name, value in (
+            ("clipped", solved.clipped_part * count),
+            ("from_shape", stored["from_shape"].sum()),
+            ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
+            ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
+            ("error", solved.standard_error[measured].mean(axis=1).sum(dtype=np.float64)),
+            ("measured", measured.sum()),
+            ("dropped", stored["report"][1]),
+            ("raised", stored["report"][2]),
+        ):
+            self._sums[name] = self._sums.get(name, 0.0) + float(value)
+        for flag in Observability:
+            if flag and flag.name:
+                self._flags[flag.name] += int(((solved.observability & np.uint8(flag)) != 0).sum())
+
+    def summary(self) -> dict[str, Any]:
+        rows = max(self._rows, 1)
+        return {
+            "gaussians": self._rows,
+            "clipped_part": self._sums["clipped"] / rows,
+            "normals_from_shape": self._sums["from_shape"] / rows,
+            "mean_ambient_occlusion": self._sums["openness"] / rows,
+            "mean_normal_confidence": self._sums["confidence"] / rows,
+            "mean_base_color_error_where_measured": self._sums["error"] / max(self._sums["measured"], 1.0),
+            "dropped_transparent": int(self._sums["dropped"]),
+            "raised_scales": int(self._sums["raised"]),
+            "flags": self._flags,
+        }
+
+
+def options_as_dict(options: RunOptions) -> dict[str, Any]:
+    """Return the options as JSON-able values; the device is not one, because it is reported by its name."""
+    described = asdict(options)
+    described.pop("device")
+    if isinstance(options.roughness, RoughnessTexture):
+        described["roughness"] = {key: str(value) for key, value in described["roughness"].items()}
+    return described
+
+
+def _digest(text: str, *arrays: NDArray[Any]) -> str:
+    digest = hashlib.blake2b(text.encode(), digest_size=16)
+    for array in arrays:
+        digest.update(str((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _make_folders(out: Path) -> Path:
+    folder = out / "frames"
+    try:
+        out.mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"out must be a folder that can be made, got {out} ({error.strerror}). Choose another place."
+        ) from error
+    return folder

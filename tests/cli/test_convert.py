@@ -1,0 +1,175 @@
+"""beam-convert as a user meets it: what it prints, what it writes, how it fails."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from beam_warp import __version__, converters
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
+from beam_warp.cli.convert import main
+from beam_warp.converters import WriteOptions
+
+
+@pytest.fixture
+def person(tmp_path):
+    """A sequence of three relightable frames in its own folder, and its first frame as one file."""
+    rng = np.random.default_rng(11)
+    orientations = rng.normal(size=(9, 4))
+    clouds = [
+        GaussianCloud(
+            positions=rng.normal(size=(9, 3)),
+            orientations=orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
+            scales=np.full((9, 3), 0.01),
+            opacities=np.full(9, 0.5),
+            radiance=rng.normal(size=(9, 4, 3)),
+            radiance_color_space=DISPLAY_SRGB,
+            base_color=rng.uniform(size=(9, 3)),
+        )
+        for _ in range(3)
+    ]
+    (tmp_path / "take").mkdir()
+    (tmp_path / "out").mkdir()
+    converters.write(GaussianSequence.from_clouds(clouds), tmp_path / "take" / "f.ply", WriteOptions(profile="beam"))
+    shutil.copy(tmp_path / "take" / "f000000.ply", tmp_path / "person.ply")
+    return tmp_path
+
+
+def run(*arguments, capsys):
+    code = main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_a_file(person, capsys):
+    code, out, err = run(person / "person.ply", person / "out" / "a.ply", "--target", "unity", capsys=capsys)
+    assert code == 0
+    assert out.startswith(f"wrote {person / 'out' / 'a.ply'}: 9 Gaussians, ")
+    assert err == "note: materials are not in a standard PLY: --profile beam keeps them\n"
+    assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
+
+
+def test_a_sequence(person, capsys):
+    code, out, err = run(person / "take", person / "out" / "g.ply", "--profile", "beam", "--quiet", capsys=capsys)
+    assert (code, out, err) == (0, "", "")
+    assert len(converters.read(person / "out")) == 3
+
+
+def test_json(person, capsys):
+    code, out, _ = run(person / "take", person / "out" / "g.ply", "--json", capsys=capsys)
+    result = json.loads(out)
+    assert code == 0
+    assert result["frame_count"] == 3
+    assert result["gaussian_count"] == 9
+    assert result["source_axes"] == "rfu"
+    assert len(result["outputs"]) == 3
+    assert result["notes"] == ["materials are not in a standard PLY: --profile beam keeps them"]
+
+
+def test_every_option_reaches_the_reader_and_the_writer(person, capsys):
+    options = (
+        "--source-axes",
+        "rub",
+        "--meters-per-unit",
+        "0.5",
+        "--sh-degree",
+        "3",
+        "--material-activation",
+        "linear",
+    )
+    options += ("--activation", "log", "--drop-invalid", "--profile", "beam", "--target", "usd")
+    code, _, _ = run(person / "person.ply", person / "out" / "a.ply", *options, capsys=capsys)
+    before, after = (converters.read(path)[0] for path in (person / "person.ply", person / "out" / "a.ply"))
+    assert code == 0
+    assert (after.axes, after.sh_degree) == ("rub", 3)
+    assert np.array_equal(after.positions, 0.5 * before.positions)
+    assert np.array_equal(after.base_color, before.base_color)
+
+
+def test_the_input_is_never_written_over(person, capsys):
+    before = (person / "person.ply").read_bytes()
+    spelled = person / "out" / ".." / "person.ply"
+    code, _, err = run(person / "person.ply", spelled, capsys=capsys)
+    assert code == 2
+    assert err.startswith("error: output must be another file than the input, got ")
+    assert (person / "person.ply").read_bytes() == before
+    code, _, err = run(person / "take", person / "take" / "f.ply", capsys=capsys)
+    assert code == 2
+    assert "f000000.ply for both. Choose another name." in err
+
+
+@pytest.mark.parametrize(
+    ("source", "output", "message"),
+    [
+        ("gone.ply", "out/a.ply", "error: input must be an existing file or folder, got "),
+        ("person.ply", "nowhere/a.ply", "error: output folder must exist, got "),
+        ("person.ply", "out/a.obj", "error: file name must end in one of .ply, .usd, "),
+        ("person.ply", "out/a.compressed.ply", "error: output must be a plain .ply, got a.compressed.ply"),
+        ("person.ply", "out", "error: file name must end in one of .ply, .usd, "),
+        ("out", "out/a.ply", "error: folder out must hold numbered files"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(person, capsys, source, output, message):
+    started = time.perf_counter()
+    code, out, err = run(person / source, person / output, capsys=capsys)
+    assert time.perf_counter() - started < 2.0
+    assert (code, out) == (2, "")
+    assert err.startswith(message)
+    assert err.count("\n") == 1
+    assert not list((person / "out").iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_closed_folder(person, capsys):
+    (person / "out").chmod(0o500)
+    code, _, err = run(person / "person.ply", person / "out" / "a.ply", capsys=capsys)
+    assert code == 2
+    assert err.startswith("error: output folder must be writable, got ")
+
+
+@pytest.mark.parametrize("option", [("--sh-degree", "4"), ("--source-axes", "xyz"), ("--meters-per-unit", "-1")])
+def test_options_out_of_range(person, capsys, option):
+    code, _, err = run(person / "person.ply", person / "out" / "a.ply", *option, capsys=capsys)
+    assert code == 2
+    assert err.startswith(f"error: {option[0][2:].replace('-', '_')} must be ")
+
+
+def test_inspect(person, capsys):
+    code, out, _ = run("inspect", person / "person.ply", capsys=capsys)
+    assert code == 0
+    assert "producer    beam-warp (beam_schema 1.0)\n" in out
+    assert "materials   base_color\n" in out
+    code, out, _ = run("inspect", person / "take", "--json", capsys=capsys)
+    assert json.loads(out)["frame_count"] == 3
+
+
+def test_version_and_help(capsys):
+    assert run("--version", capsys=capsys) == (0, f"beam-convert {__version__}\n", "")
+    for arguments in (["--help"], ["inspect", "--help"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(arguments)
+        assert stopped.value.code == 0
+        assert "Example: beam-convert " in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        main(["one.ply"])
+    assert stopped.value.code == 2
+
+
+def test_ply_to_ply_costs_neither_warp_nor_usd(person):
+    script = (
+        "import sys\n"
+        "from beam_warp.cli.convert import main\n"
+        "code = main(sys.argv[1:])\n"
+        "heavy = {'warp', 'pxr', 'OpenEXR', 'scipy', 'trimesh', 'h5py'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else code)\n"
+    )
+    for arguments in (["person.ply", "out/a.ply", "--target", "unreal"], ["inspect", "person.ply"]):
+        finished = subprocess.run(
+            [sys.executable, "-c", script, *arguments], cwd=person, capture_output=True, text=True, timeout=30
+        )
+        assert finished.returncode == 0, finished.stderr

@@ -1,0 +1,102 @@
+"""beam-validate: exit codes, what it prints, and that a caller's mistake is one line."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from pxr import Sdf
+
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.cli.validate import main
+from beam_warp.schema.writer import write_asset
+
+
+@pytest.fixture
+def asset(tmp_path):
+    cloud = GaussianCloud(
+        positions=[[0.0, 0.0, 0.0]],
+        orientations=[[0.0, 0.0, 0.0, 1.0]],
+        scales=[[0.1, 0.1, 0.1]],
+        opacities=[0.5],
+        base_color=[[0.5, 0.5, 0.5]],
+        roughness=[0.5],
+        ambient_occlusion=[1.0],
+        normals=[[0.0, 0.0, 1.0]],
+    )
+    write_asset(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usdc")
+    return tmp_path / "a.usdc"
+
+
+def damage(asset):
+    layer = Sdf.Layer.FindOrOpen(str(asset))
+    layer.GetAttributeAtPath("/Asset/Splats.beam:brdf").default = "lambert"
+    layer.Save()
+
+
+def test_valid(asset, capsys):
+    assert main([str(asset)]) == 0
+    assert capsys.readouterr().out == f"{asset}: valid (1 frame, 1 Gaussian; 0 errors, 0 warnings)\n"
+
+
+def test_not_valid(asset, capsys):
+    damage(asset)
+    assert main([str(asset)]) == 1
+    finding, verdict = capsys.readouterr().out.splitlines()
+    assert finding == (
+        "error   BEAM-TOKEN-002  /Asset/Splats.beam:brdf: beam:brdf must be one of ggx-metallic-roughness, "
+        "got 'lambert'. Choose one."
+    )
+    assert verdict == f"{asset}: not valid (1 frame, 1 Gaussian; 1 error, 0 warnings)"
+
+
+def test_json(asset, capsys):
+    damage(asset)
+    assert main([str(asset), "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["valid"] is False
+    assert [finding["rule"] for finding in report["findings"]] == ["BEAM-TOKEN-002"]
+
+
+def test_quiet(asset, capsys):
+    damage(asset)
+    assert main([str(asset), "--quiet"]) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_unreadable(tmp_path, asset, capsys):
+    asset.write_bytes(asset.read_bytes()[:-10])
+    assert main([str(asset)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {asset} must hold ")
+    assert error.count("\n") == 1
+    assert main([str(tmp_path / "none.usda")]) == 2
+    assert "must be a readable file, got No such file or directory" in capsys.readouterr().err
+
+
+def test_rules_are_listed(capsys):
+    assert main(["--rules"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 40
+    assert lines == sorted(lines)
+    assert main(["--rules", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)) == len(lines)
+
+
+def test_help_and_version(capsys):
+    for flag, text in (("--help", "beam-validate dancer.usda"), ("--version", "beam-validate 0.")):
+        with pytest.raises(SystemExit) as stopped:
+            main([flag])
+        assert stopped.value.code == 0
+        assert text in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        main([])
+    assert stopped.value.code == 2
+    assert "asset must be given, got none" in capsys.readouterr().err
+
+
+def test_as_a_program(asset):
+    done = subprocess.run(
+        [sys.executable, "-m", "beam_warp.cli.validate", str(asset)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,86 @@
+"""Clouds and PLY bytes that the converter tests share."""
+
+import numpy as np
+import pytest
+
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
+
+
+@pytest.fixture(scope="session")
+def make_cloud():
+    """A function that makes a random cloud; unit vectors are unit to float32 rounding."""
+
+    def make(count=50, degree=3, *, materials=False, seed=1, **changes):
+        rng = np.random.default_rng(seed)
+
+        def units(width):
+            vectors = rng.normal(size=(count, width)).astype(np.float32)
+            return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+        fields = {
+            "positions": rng.normal(size=(count, 3)),
+            "orientations": units(4),
+            "scales": np.exp(rng.uniform(-8.0, 0.0, (count, 3))),
+            "opacities": rng.uniform(0.01, 0.99, count),
+            "radiance": rng.normal(size=(count, (degree + 1) ** 2, 3)),
+            "radiance_color_space": DISPLAY_SRGB,
+            "axes": "rfu",
+        }
+        if materials:
+            fields |= {
+                "base_color": rng.uniform(size=(count, 3)),
+                "roughness": rng.uniform(size=count),
+                "ambient_occlusion": rng.uniform(size=count),
+                "normals": units(3),
+            }
+        return GaussianCloud(**fields | changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def ply_bytes():
+    """A function that makes a PLY of float columns: ``ply_bytes({"x": [...], …}, comments=…, newline=…)``."""
+
+    def make(columns, *, comments=(), newline="\n", count=None, order="<", types=None):
+        types = types or {}
+        codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
+        names = list(columns)
+        rows = len(next(iter(columns.values())))
+        kind = "binary_little_endian" if order == "<" else "binary_big_endian"
+        lines = [
+            "ply",
+            f"format {kind} 1.0",
+            *(f"comment {comment}" for comment in comments),
+            f"element vertex {rows if count is None else count}",
+            *(f"property {types.get(name, 'float')} {name}" for name in names),
+            "end_header",
+            "",
+        ]
+        table = np.empty(rows, [(name, order + codes[types.get(name, "float")]) for name in names])
+        for name in names:
+            table[name] = columns[name]
+        return newline.join(lines).encode() + table.tobytes()
+
+    return make
+
+
+@pytest.fixture
+def columns():
+    """Columns of three sound Gaussians in the training layout, without spherical harmonics above the mean."""
+    return {
+        "x": [0.0, 1.0, 2.0],
+        "y": [0.0, -1.0, 0.5],
+        "z": [3.0, 2.0, 1.0],
+        "f_dc_0": [0.1, 0.2, 0.3],
+        "f_dc_1": [0.0, 0.0, 0.0],
+        "f_dc_2": [-0.1, 0.5, 1.0],
+        "opacity": [-2.0, 0.0, 3.0],
+        "scale_0": [-4.0, -5.0, -6.0],
+        "scale_1": [-4.5, -5.5, -6.5],
+        "scale_2": [-7.0, -7.0, -7.0],
+        "rot_0": [1.0, 0.0, 2.0],
+        "rot_1": [0.0, 1.0, 0.0],
+        "rot_2": [0.0, 0.0, 0.0],
+        "rot_3": [0.0, 0.0, 0.0],
+    }

@@ -1,0 +1,382 @@
+"""Sound PLY files: what other tools write is read as they mean it, and what we write comes back."""
+
+import numpy as np
+import plyfile
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from beam_warp import converters
+from beam_warp.assets import LINEAR_REC709, GaussianSequence
+from beam_warp.axes import axes_matrix
+from beam_warp.converters import WriteOptions
+from beam_warp.converters.activations import LOGIT_LIMIT
+from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, SchemaVersionError
+from beam_warp.spherical_harmonics import sh_color
+
+EPSILON = np.finfo(np.float32).eps
+
+STANDARD_62 = [
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{i}" for i in range(45)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+
+
+def notes_of(sequence):
+    return sequence.metadata.get("notes", "").splitlines()
+
+
+def write(cloud, path, **options):
+    return converters.write(GaussianSequence.from_clouds([cloud]), path, WriteOptions(**options))
+
+
+def through_plyfile(path):
+    """The independent reading: one column at a time, activations from their definitions, in float64."""
+    vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    stack = lambda *names: np.stack([vertex[name].astype(np.float64) for name in names], 1)  # noqa: E731
+    quaternions = stack("rot_1", "rot_2", "rot_3", "rot_0")
+    rest = [name for name in vertex.dtype.names if name.startswith("f_rest_")]
+    per_channel = len(rest) // 3
+    radiance = [stack("f_dc_0", "f_dc_1", "f_dc_2")]
+    for k in range(per_channel):
+        radiance.append(stack(f"f_rest_{k}", f"f_rest_{per_channel + k}", f"f_rest_{2 * per_channel + k}"))
+    return {
+        "positions": stack("x", "y", "z"),
+        "orientations": quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        "scales": np.exp(stack("scale_0", "scale_1", "scale_2")),
+        "opacities": 1.0 / (1.0 + np.exp(-vertex["opacity"].astype(np.float64))),
+        "radiance": np.stack(radiance, 1),
+    }
+
+
+def test_a_file_of_another_tool_is_read_as_plyfile_reads_it(data_dir):
+    path = data_dir / "fixtures" / "jsplat" / "unitCube-ascii.ply"
+    sequence = converters.read(path)
+    cloud = sequence[0]
+    assert len(sequence) == 1
+    assert len(cloud) == 20
+    assert cloud.axes == "rdf"
+    for name, expected in through_plyfile(path).items():
+        assert np.allclose(getattr(cloud, name), expected, rtol=2 * EPSILON, atol=0.0), name
+    assert notes_of(sequence) == [
+        "axes are not stated: taken as rdf (3DGS training); pass --source-axes if they are others"
+    ]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_standard_files_are_read_alike_by_plyfile(make_cloud, tmp_path, degree):
+    cloud = make_cloud(degree=degree)
+    write(cloud, tmp_path / "a.ply")
+    back = converters.read(tmp_path / "a.ply")[0]
+    for name, expected in through_plyfile(tmp_path / "a.ply").items():
+        assert np.allclose(getattr(back, name), expected, rtol=2 * EPSILON, atol=EPSILON), name
+    for name in ("positions", "orientations", "radiance"):  # stored as they are: bit for bit
+        assert np.array_equal(getattr(back, name), getattr(cloud, name)), name
+    assert (back.axes, back.radiance_color_space) == (cloud.axes, cloud.radiance_color_space)
+
+
+def test_the_file_obeys_the_rules_of_importers(make_cloud, tmp_path):
+    cloud = make_cloud(materials=True)
+    write(cloud, tmp_path / "standard.ply")
+    write(cloud, tmp_path / "beam.ply", profile="beam")
+    extras = ["base_color_0", "base_color_1", "base_color_2", "roughness", "ambient_occlusion"]
+    for name, properties in (("standard", STANDARD_62), ("beam", STANDARD_62 + extras)):
+        content = (tmp_path / f"{name}.ply").read_bytes()
+        header, _, body = content.partition(b"end_header\n")
+        lines = header.decode("ascii").split("\n")[:-1]
+        assert b"\r" not in header
+        assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+        rest = [line for line in lines[2:] if not line.startswith("comment ")]
+        assert rest == ["element vertex 50", *(f"property float {p}" for p in properties)]
+        assert len(body) == 50 * 4 * len(properties)
+        assert np.isfinite(np.frombuffer(body, "<f4")).all()
+        assert "comment beam_axes rfu" in lines
+        assert "comment beam_schema 1.0" in lines
+        assert "comment beam_frame 0 30" in lines
+        assert ("comment beam_material linear" in lines) == (name == "beam")
+        assert ("comment beam_base_color_space lin_rec709_scene" in lines) == (name == "beam")
+
+
+def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
+    cloud = make_cloud(materials=True, radiance_color_space=LINEAR_REC709)
+    write(cloud, tmp_path / "a.ply", profile="beam")
+    sequence = converters.read(tmp_path / "a.ply")
+    back = sequence[0]
+    assert not notes_of(sequence)
+    exact = ("positions", "orientations", "radiance", "normals", "base_color", "roughness", "ambient_occlusion")
+    for name in exact:
+        assert np.array_equal(getattr(back, name), getattr(cloud, name)), name
+    assert back.is_relightable
+    assert back.radiance_color_space == LINEAR_REC709
+    assert sequence.metadata["producer"] == "beam-warp (beam_schema 1.0)"
+
+
+finite = st.floats(-(2.0**100), 2.0**100, width=32)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    positions=arrays(np.float32, (4, 3), elements=finite),
+    radiance=arrays(np.float32, (4, 4, 3), elements=finite),
+    scales=arrays(np.float32, (4, 3), elements=st.floats(2.0**-40, 2.0**20, width=32)),
+    opacities=arrays(np.float32, (4,), elements=st.floats(0.0, 1.0, width=32)),
+    base_color=arrays(np.float32, (4, 3), elements=st.floats(0.0, 1.0, width=32)),
+)
+def test_round_trip(tmp_path_factory, make_cloud, positions, radiance, scales, opacities, base_color):
+    path = tmp_path_factory.mktemp("trip") / "a.ply"
+    cloud = make_cloud(
+        4, positions=positions, radiance=radiance, scales=scales, opacities=opacities, base_color=base_color
+    )
+    write(cloud, path, profile="beam")
+    back = converters.read(path, activation="log")[0]
+    for name in ("positions", "radiance", "orientations", "base_color"):
+        assert np.array_equal(getattr(back, name), getattr(cloud, name)), name
+    # ln s is rounded to float32: |d ln s| <= |ln s| eps / 2, and s itself once more.
+    log = np.abs(np.log(scales.astype(np.float64)))
+    assert (np.abs(back.scales - scales.astype(np.float64)) <= scales * (log + 1.0) * EPSILON).all()
+    # d sigmoid(x) = o (1 - o) dx with |dx| <= |x| eps / 2, |x| <= 20; sigmoid(±20) is within 2.1e-9 of 0 and 1.
+    o = opacities.astype(np.float64)
+    bound = o * (1.0 - o) * LOGIT_LIMIT * EPSILON + o * EPSILON + 2.1e-9
+    assert (np.abs(back.opacities - o) <= bound).all()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_byte_orders_and_line_ends(columns, ply_bytes, tmp_path, order, newline):
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, order=order, newline=newline, comments=["made by hand"]))
+    cloud = converters.read(tmp_path / "a.ply")[0]
+    assert np.array_equal(cloud.positions, [[0, 0, 3], [1, -1, 2], [2, 0.5, 1]])
+    assert np.array_equal(cloud.orientations, [[0, 0, 0, 1], [1, 0, 0, 0], [0, 0, 0, 1]])  # w last, normalised
+    assert np.allclose(cloud.opacities, [0.119202922, 0.5, 0.952574127], rtol=EPSILON)
+    assert np.allclose(cloud.scales[:, 2], 0.000911882, rtol=1e-6)
+
+
+def test_any_property_order_and_unknown_properties(columns, ply_bytes, tmp_path):
+    shuffled = dict(reversed(columns.items())) | {"confidence": [1, 2, 3], "label": [1, 2, 3], "weight": [1, 2, 3]}
+    types = {"label": "uchar", "weight": "double", "x": "double"}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    (tmp_path / "b.ply").write_bytes(ply_bytes(shuffled, types=types))
+    (tmp_path / "c.ply").write_bytes(ply_bytes(dict(reversed(columns.items()))))
+    plain, mixed, reordered = (converters.read(tmp_path / f"{name}.ply") for name in "abc")
+    for name, array in plain[0].arrays().items():
+        assert np.array_equal(getattr(mixed[0], name), array), name
+        assert np.array_equal(getattr(reordered[0], name), array), name
+    assert "properties left out: confidence, label, weight" in notes_of(mixed)
+
+
+def test_elements_before_and_lists_after_are_stepped_over(columns, ply_bytes, tmp_path):
+    content = ply_bytes(columns)
+    header, _, body = content.partition(b"end_header\n")
+    first = b"element camera 2\nproperty float f\nproperty uchar c\nelement vertex"
+    last = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    header = header.replace(b"element vertex", first)
+    (tmp_path / "a.ply").write_bytes(header + last + bytes(10) + body + b"\x03" + bytes(12))
+    assert np.array_equal(converters.read(tmp_path / "a.ply")[0].positions[:, 0], [0, 1, 2])
+
+
+def test_ascii_after_other_elements(columns, tmp_path):
+    names = list(columns)
+    rows = "\n".join(" ".join(str(columns[name][row]) for name in names) for row in range(3))
+    text = "ply\nformat ascii 1.0\nelement camera 1\nproperty float f\nelement vertex 3\n"
+    text += "".join(f"property float {name}\n" for name in names) + f"end_header\n0.5\n{rows}"
+    (tmp_path / "a.ply").write_text(text)
+    assert np.array_equal(converters.read(tmp_path / "a.ply")[0].positions[:, 0], [0, 1, 2])
+
+
+def test_flat_gaussians_and_missing_colour(columns, ply_bytes, tmp_path):
+    for name in ("scale_2", "f_dc_0", "f_dc_1", "f_dc_2"):
+        del columns[name]
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    sequence = converters.read(tmp_path / "a.ply")
+    assert np.array_equal(sequence[0].scales[:, 2], [0, 0, 0])
+    assert sequence[0].radiance is None
+    assert notes_of(sequence)[:2] == [
+        "no scale_2: read as 2D Gaussians of thickness 0",
+        "no f_dc_0 … f_dc_2: read without colour",
+    ]
+    # Written again, a flat Gaussian has the least scale that a log can say, and a colourless one stays colourless.
+    converters.write(sequence, tmp_path / "b.ply")
+    back = converters.read(tmp_path / "b.ply")[0]
+    assert back.radiance is None
+    assert back.scales[:, 2].max() == np.float32(np.exp(-30.0))
+
+
+def test_no_gaussians(columns, ply_bytes, tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply_bytes({name: [] for name in columns}))
+    sequence = converters.read(tmp_path / "a.ply")
+    assert len(sequence[0]) == 0
+    assert notes_of(sequence)[-1] == "holds no Gaussians"
+    converters.write(sequence, tmp_path / "b.ply")
+    assert len(converters.read(tmp_path / "b.ply")[0]) == 0
+    assert converters.inspect(tmp_path / "b.ply").bounds is None
+
+
+def test_axes_and_units_of_the_file_and_of_the_caller(make_cloud, tmp_path):
+    cloud = make_cloud(axes="rub")
+    write(cloud, tmp_path / "unreal.ply", target="unreal")
+    back = converters.read(tmp_path / "unreal.ply")[0]  # the header says fru and 0.01 m
+    assert back.axes == "fru"
+    expected = cloud.positions @ axes_matrix("rub", "fru").T
+    assert np.allclose(back.positions, expected, rtol=3 * EPSILON, atol=0)
+    raw = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)[0]
+    assert raw.axes == "rdf"
+    assert np.allclose(raw.positions, 100.0 * expected, rtol=3 * EPSILON, atol=0)
+    assert np.allclose(raw.scales, 100.0 * cloud.scales, rtol=12 * EPSILON, atol=0)
+
+
+def test_bands_are_padded_and_cut(make_cloud, tmp_path):
+    cloud = make_cloud(degree=2)
+    write(cloud, tmp_path / "three.ply", sh_degree=3)
+    write(cloud, tmp_path / "none.ply", sh_degree=0)
+    three, none = (converters.read(tmp_path / f"{name}.ply")[0].radiance for name in ("three", "none"))
+    assert three.shape == (50, 16, 3)
+    assert np.array_equal(three[:, :9], cloud.radiance)
+    assert not three[:, 9:].any()
+    assert np.array_equal(none, cloud.radiance[:, :1])
+
+
+def test_without_radiance_a_standard_file_shows_the_base_colour(make_cloud, tmp_path):
+    cloud = make_cloud(materials=True, radiance=None, radiance_color_space=None)
+    write(cloud, tmp_path / "a.ply")
+    sequence = converters.read(tmp_path / "a.ply")
+    shown = sh_color(sequence[0].radiance, [0.0, 0.0, 1.0])
+    light = (cloud.base_color * cloud.ambient_occlusion[:, None]).astype(np.float64)
+    # IEC 61966-2-1; the standard's own two branches meet only to 1e-7, and colour is rounded twice.
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert np.abs(shown - encoded).max() <= 4 * EPSILON + 1e-7
+    assert "colour is base colour times ambient occlusion, not captured radiance" in notes_of(sequence)
+    assert sequence.metadata["radiance_meaning"] == "baseColorOnly"
+    # The beam profile knows that this colour repeats the material.
+    write(cloud, tmp_path / "b.ply", profile="beam")
+    assert converters.read(tmp_path / "b.ply")[0].radiance is None
+
+
+def test_linear_radiance_is_encoded_in_a_standard_file(make_cloud, tmp_path):
+    rng = np.random.default_rng(2)
+    radiance = np.concatenate([rng.uniform(-1.0, 3.0, (50, 1, 3)), 1e-3 * rng.normal(size=(50, 3, 3))], 1)
+    cloud = make_cloud(radiance=radiance, radiance_color_space=LINEAR_REC709)
+    write(cloud, tmp_path / "a.ply")
+    back = converters.read(tmp_path / "a.ply")[0]
+    direction = np.array([0.6, 0.0, 0.8])
+    light = sh_color(cloud.radiance, direction)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+    # First order: the error is at most half the second derivative (< 0.4 / light^1.6 above 0.2) times (3e-3)^2.
+    bright = light > 0.2
+    assert bright.any()
+    assert np.abs(sh_color(back.radiance, direction) - encoded)[bright].max() <= 0.5 * 0.4 / 0.2**1.6 * 3e-3**2
+
+
+def test_linear_files_are_read_when_told(columns, ply_bytes, tmp_path):
+    columns |= {"opacity": [0.25, 0.5, 1.0]}
+    columns |= {f"scale_{i}": [0.01, 0.02, 0.03] for i in range(3)}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    cloud = converters.read(tmp_path / "a.ply", activation="linear")[0]
+    assert np.array_equal(cloud.opacities, np.float32([0.25, 0.5, 1.0]))
+    assert np.array_equal(cloud.scales[:, 0], np.float32([0.01, 0.02, 0.03]))
+    assert np.allclose(converters.read(tmp_path / "a.ply", activation="log")[0].scales[0], np.exp(0.01))
+
+
+@pytest.mark.parametrize(
+    ("activation", "producer", "names", "base", "rough"),
+    [
+        ("r3dg", "Relightable3DGaussian", ("base_color", "incidents_dc"), 0.03 + 0.77 * 0.5, 0.09 + 0.9 * 0.5),
+        ("gsir", "GS-IR", ("albedo", "normal"), 0.5, 0.5),
+        ("irgs", "IRGS", ("base_color", "metallic"), 0.03 + 0.77 * 0.5, 0.5),
+    ],
+)
+def test_materials_of_other_producers(columns, ply_bytes, tmp_path, activation, producer, names, base, rough):
+    zeros, ones = [0.0] * 3, [1.0] * 3
+    columns |= {f"{names[0]}_{i}": zeros for i in range(3)} | {"roughness": zeros}
+    columns |= {f"{names[1]}_{i}": ones for i in range(3)} | ({"metallic": zeros} if activation == "irgs" else {})
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    sequence = converters.read(tmp_path / "a.ply")
+    assert sequence[0].base_color is None
+    assert sequence.metadata["producer"] == f"{producer}, by its property names"
+    assert any(
+        note.startswith(f"materials of {producer} left out")
+        and note.endswith(f"pass --material-activation {activation} to read them")
+        for note in notes_of(sequence)
+    )
+    cloud = converters.read(tmp_path / "a.ply", material_activation=activation)[0]
+    assert np.allclose(cloud.base_color, base, rtol=EPSILON)
+    assert np.allclose(cloud.roughness, rough, rtol=EPSILON)
+    assert (cloud.normals is not None) == (activation == "gsir")
+
+
+def test_mesh2splat_is_named(columns, ply_bytes, tmp_path):
+    columns |= {"metallicFactor": [0.0] * 3, "roughnessFactor": [0.5] * 3}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    assert converters.inspect(tmp_path / "a.ply").producer == "mesh2splat, by its property names"
+
+
+def test_materials_that_are_not_there(columns, ply_bytes, tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    with pytest.raises(
+        AssetFormatError, match=r"a\.ply: materials of gsir must have albedo_0, .* no material channels"
+    ):
+        converters.read(tmp_path / "a.ply", material_activation="gsir")
+
+
+def test_normals_zero_in_part_are_left_out(columns, ply_bytes, tmp_path):
+    columns |= {"nx": [0.0, 2.0, 0.0], "ny": [0.0, 0.0, 1.0], "nz": [0.0, 0.0, 0.0]}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    sequence = converters.read(tmp_path / "a.ply")
+    assert sequence[0].normals is None
+    assert "normals left out: 1 of 3 are zero or not finite" in notes_of(sequence)
+
+
+def test_invalid_rows_are_dropped_on_request(columns, ply_bytes, tmp_path):
+    columns["x"][0] = np.nan
+    columns["rot_0"][2] = 0.0
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    sequence = converters.read(tmp_path / "a.ply", drop_invalid=True)
+    assert np.array_equal(sequence[0].positions, [[1, -1, 2]])
+    assert "2 of 3 Gaussians dropped: not finite, or zero quaternions" in notes_of(sequence)
+
+
+def test_a_beam_profile_needs_materials(make_cloud, tmp_path):
+    with pytest.raises(InvalidOptionError, match="profile beam must have a material channel to write"):
+        write(make_cloud(), tmp_path / "a.ply", profile="beam")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_later_schema_is_refused(columns, ply_bytes, tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["beam_schema 2.0"]))
+    with pytest.raises(SchemaVersionError, match=r"beam_schema must be 1\.x, got 2\.0\. Update beam-warp"):
+        converters.read(tmp_path / "a.ply")
+
+
+def test_files_too_large_for_importers_are_refused(make_cloud, tmp_path, monkeypatch):
+    monkeypatch.setattr("beam_warp.converters.ply_writer.MAX_FILE_BYTES", 5000)
+    with pytest.raises(OutputError, match=r"a PLY file must be under 2 GB for importers to read it, got 0\.00 GB"):
+        write(make_cloud(), tmp_path / "a.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_nothing(make_cloud, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("beam_warp.converters.ply_writer._row_source", lambda *_: full)
+    with pytest.raises(OutputError, match=r"output must be writable, got No space left on device at .*Free space"):
+        write(make_cloud(), tmp_path / "a.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def test_sixteen_thousand_row_blocks_join_without_a_seam(make_cloud, tmp_path):
+    # The writer converts 16,384 rows at a time: one less, the same, one more.
+    for count in (16383, 16384, 16385):
+        cloud = make_cloud(count, degree=0)
+        write(cloud, tmp_path / "a.ply")
+        assert np.array_equal(converters.read(tmp_path / "a.ply")[0].positions, cloud.positions)
+
+
+def test_options_are_checked():
+    with pytest.raises(InvalidOptionError, match="sh_degree must be an integer in"):
+        WriteOptions(sh_degree=4)
+    with pytest.raises(InvalidOptionError, match="target must be one of usd, unity, unreal, got 'maya'"):
+        WriteOptions(target="maya")
+    with pytest.raises(InvalidOptionError, match="meters_per_unit must be a number in"):
+        converters.read("a.ply", meters_per_unit=0.0)

@@ -1,0 +1,197 @@
+"""Folders of numbered files, USD as a row of the table, and what an inspection says."""
+
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from beam_warp import converters
+from beam_warp.assets import GaussianSequence
+from beam_warp.converters import WriteOptions
+from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
+
+
+@pytest.fixture
+def walk(make_cloud):
+    clouds = [make_cloud(10 + frame, degree=0, seed=frame) for frame in range(12)]
+    return GaussianSequence.from_clouds(clouds, frames_per_second=24.0)
+
+
+def test_frames_are_numbered_and_come_back_in_order(walk, tmp_path):
+    paths = converters.write(walk, tmp_path / "walk.ply")
+    assert [path.name for path in paths] == [f"walk{frame:06d}.ply" for frame in range(12)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [path.name for path in paths]
+    back = converters.read(tmp_path)
+    assert len(back) == 12
+    assert back.frames_per_second == 24.0
+    assert back.topology == "perFrame"
+    for frame, cloud in enumerate(walk):
+        assert np.array_equal(back[frame].positions, cloud.positions)
+
+
+def test_frames_are_read_when_asked_for(walk, tmp_path):
+    converters.write(walk, tmp_path / "walk.ply")
+    sequence = converters.read(tmp_path)
+    (tmp_path / "walk000005.ply").unlink()
+    assert len(sequence[4]) == 14
+    with pytest.raises(MissingFileError, match=r"input must be an existing file, got .*walk000005"):
+        sequence[5]
+
+
+def test_a_cut_frame_is_found_before_any_work(walk, tmp_path):
+    converters.write(walk, tmp_path / "walk.ply")
+    last = tmp_path / "walk000011.ply"
+    last.write_bytes(last.read_bytes()[:-1])
+    with pytest.raises(AssetFormatError, match=r"walk000011\.ply: element vertex must have the 21 rows"):
+        converters.read(tmp_path)
+
+
+def test_natural_order_any_start_and_the_packed_suffix(columns, ply_bytes, tmp_path):
+    for number in (8, 9, 10, 11):
+        columns["x"] = [float(number)] * 3
+        suffix = ".compressed.ply" if number == 9 else ".PLY" if number == 10 else ".ply"
+        (tmp_path / f"take2_{number}{suffix}").write_bytes(ply_bytes(columns))
+    (tmp_path / "notes.txt").write_text("not a frame")
+    assert [cloud.positions[0, 0] for cloud in converters.read(tmp_path)] == [8, 9, 10, 11]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], r"must hold numbered files \(walk000000\.ply, walk000001\.ply, …\), got none"),
+        (["scene.ply"], "must hold numbered files"),
+        (["a0.ply", "a1.ply", "b0.ply"], r"must hold one sequence, got 2 prefixes \('a', 'b'\)"),
+        (["a0.ply", "a2.ply"], r"must hold every frame, got none between a0\.ply and a2\.ply. Add the missing frames"),
+        (["a1.ply", "a01.ply"], r"must hold each frame once, got a01\.ply and a1\.ply. Remove one"),
+    ],
+)
+def test_folders_that_are_no_sequence(columns, ply_bytes, tmp_path, names, message):
+    for name in names:
+        (tmp_path / name).write_bytes(ply_bytes(columns))
+    with pytest.raises(AssetFormatError, match=message):
+        converters.read(tmp_path)
+
+
+def test_a_frame_that_fails_leaves_no_frames(walk, tmp_path):
+    def broken(frame):
+        if frame == 7:
+            raise InvalidArrayError("positions must be finite, got NaN at row 0. Repair it.")
+        return walk[frame]
+
+    sequence = GaussianSequence(frame_count=12, read_frame=broken)
+    with pytest.raises(InvalidArrayError, match="positions must be finite"):
+        converters.write(sequence, tmp_path / "walk.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_of_an_older_longer_take_are_in_the_way(walk, tmp_path, make_cloud):
+    converters.write(walk, tmp_path / "walk.ply")
+    shorter = GaussianSequence.from_clouds([make_cloud(3, seed=frame) for frame in range(5)])
+    with pytest.raises(OutputError, match=r"no frames after the last of 5, got walk000005\.ply \(7 in all\). Delete"):
+        converters.write(shorter, tmp_path / "walk.ply")
+    converters.write(walk, tmp_path / "walk.ply")  # the same length replaces it
+
+
+def test_output_folders(walk, tmp_path):
+    with pytest.raises(OutputError, match=r"output folder must exist, got .*nowhere for a\.ply. Create it first"):
+        converters.write(walk, tmp_path / "nowhere" / "a.ply")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(OutputError, match="output must be a file, got the folder"):
+        converters.write(walk, tmp_path / "folder.ply")
+    with pytest.raises(InvalidOptionError, match=r"output must be a plain \.ply, got a\.compressed\.ply"):
+        converters.write(walk, tmp_path / "a.compressed.ply")
+
+
+@pytest.fixture
+def schema_room(monkeypatch):
+    """Stand-ins for the schema room's reader and writer, to see what the table hands them."""
+    seen = {}
+
+    def write_asset(sequence, path, *, full_float=False):
+        seen.update(
+            metadata=sequence.metadata,
+            frames=[sequence[frame] for frame in range(len(sequence))],
+            full_float=full_float,
+        )
+        return [path]
+
+    def read_asset(path):
+        seen["path"] = path
+        return GaussianSequence.from_clouds(seen["frames"])
+
+    reader, writer = types.ModuleType("beam_warp.schema.reader"), types.ModuleType("beam_warp.schema.writer")
+    reader.read_asset, writer.write_asset = read_asset, write_asset
+    monkeypatch.setitem(sys.modules, reader.__name__, reader)
+    monkeypatch.setitem(sys.modules, writer.__name__, writer)
+    monkeypatch.delitem(sys.modules, "beam_warp.converters.usd", raising=False)
+    yield seen
+    sys.modules.pop("beam_warp.converters.usd", None)
+
+
+def test_usd_gets_y_up_metres_and_the_asked_bands(schema_room, make_cloud, tmp_path):
+    cloud = make_cloud(axes="rdf", degree=1)
+    sequence = GaussianSequence.from_clouds([cloud], metadata={"producer": "somebody", "notes": "of another file"})
+    paths = converters.write(sequence, tmp_path / "a.usda", WriteOptions(sh_degree=2, full_float=True))
+    assert paths == [tmp_path / "a.usda"]
+    assert schema_room["full_float"]
+    (written,) = schema_room["frames"]
+    assert written.axes == "rub"
+    assert np.array_equal(written.positions, cloud.positions * [1, -1, -1])
+    assert written.sh_degree == 2
+    assert schema_room["metadata"] == {"producer": "somebody"}
+
+
+def test_usd_states_its_own_axes(schema_room, make_cloud, tmp_path):
+    (tmp_path / "a.usdc").write_bytes(b"")
+    with pytest.raises(InvalidOptionError, match=r"source_axes must be left out for USD, which states it, got a\.usdc"):
+        converters.read(tmp_path / "a.usdc", source_axes="rdf")
+    with pytest.raises(
+        InvalidOptionError, match=r"target must be usd for a USD output, got unity\. Write PLY for unity"
+    ):
+        converters.write(
+            GaussianSequence.from_clouds([make_cloud()]), tmp_path / "b.usda", WriteOptions(target="unity")
+        )
+
+
+def test_inspection_of_a_person(data_dir):
+    found = converters.inspect(data_dir / "splats" / "biker.compressed.ply")
+    assert (found.gaussian_count, found.frame_count, found.sh_degree) == (152746, 1, 0)
+    assert found.format == "PLY, binary, packed in chunks of 256"
+    assert found.producer == "SuperSplat 2.7.1, by its comment"
+    assert found.axes == "rdf"
+    assert found.axes_evidence[-2:] == (
+        "it spans -3.11 … -0.04: y points down if it stands at 0",
+        "which agrees with rdf",
+    )
+    text = found.as_text()
+    assert "Gaussians   152,746" in text
+    assert "size [m]    1.036 × 3.180 × 1.146" in text
+    assert json.loads(json.dumps(found.as_json(), allow_nan=False))["opacities"]["greatest"] == 1.0
+
+
+def test_inspection_of_our_own_sequence(make_cloud, tmp_path):
+    clouds = [make_cloud(materials=True, seed=frame) for frame in range(2)]
+    converters.write(GaussianSequence.from_clouds(clouds), tmp_path / "a.ply", WriteOptions(profile="beam"))
+    found = converters.inspect(tmp_path)
+    assert found.axes_evidence == ("stated by the file",)
+    assert found.materials == ("base_color", "roughness", "ambient_occlusion", "normals")
+    assert found.color_state == "captured radiance, srgb_rec709_display"
+    assert found.format == "PLY, one file per frame, binary, one property per value"
+    assert "frames      2 at 30 per second" in found.as_text()
+    assert found.notes == ()
+
+
+def test_inspection_names_what_is_odd(columns, ply_bytes, tmp_path):
+    count = 500
+    rng = np.random.default_rng(5)
+    many = {name: np.resize(values, count) for name, values in columns.items()}
+    many |= {axis: rng.uniform(-1, 1, count) for axis in "xyz"} | {"opacity": np.full(count, -9.0)}
+    many["x"][3] = 1e4
+    (tmp_path / "a.ply").write_bytes(ply_bytes(many, comments=["Generated by Somebody 1.0"]))
+    found = converters.inspect(tmp_path / "a.ply")
+    assert found.producer == "Somebody 1.0, by its comment"
+    assert "500 Gaussians (100.0%) are less than 1/255 opaque" in found.notes
+    assert "1 Gaussians lie more than 5 × the size of the middle 98 % away from it" in found.notes
+    assert found.axes_evidence[1].startswith("the shape has no tall axis")

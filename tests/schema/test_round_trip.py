@@ -1,0 +1,130 @@
+"""What is written is read back: exactly in float, within the rounding of half otherwise."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pxr import Usd
+
+from beam_warp.assets import GaussianSequence
+from beam_warp.schema.layout import HALF_ABSOLUTE, HALF_EPSILON
+from beam_warp.schema.reader import read_asset
+from beam_warp.schema.writer import write_asset
+
+
+def assert_same(got, wanted, full_float):
+    assert got.arrays().keys() == wanted.arrays().keys()
+    assert (got.axes, got.radiance_color_space) == (wanted.axes, wanted.radiance_color_space)
+    for name, array in wanted.arrays().items():
+        found = got.arrays()[name]
+        if name == "orientations":  # q and -q are one rotation; the writer keeps signs continuous over time
+            found = np.where(np.sum(found * array, axis=1, keepdims=True) < 0.0, -found, found)
+        if full_float or name in ("positions", "ids", "observability"):
+            assert np.array_equal(found, array), name
+        else:
+            bound = np.maximum(HALF_EPSILON * np.abs(array), HALF_ABSOLUTE)
+            assert (np.abs(found.astype(np.float64) - array) <= bound).all(), name
+
+
+@pytest.mark.parametrize("full_float", [True, False])
+@pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usdz"])
+@pytest.mark.parametrize("frames", [1, 3, 65])  # one, one layer, clips with a short last segment
+def test_every_channel_survives(tmp_path, sequence, name, frames, full_float):
+    source = sequence(frames, metadata={"producer": "test", "source_axes": "rdf"})
+    write_asset(source, tmp_path / name, full_float=full_float, segment_length=30)
+    found = read_asset(tmp_path / name, trusted=True)
+    assert len(found) == frames
+    assert found.frames_per_second == 24.0
+    assert found.topology == "constant"
+    assert found.constant == source.constant
+    assert found.metadata.items() >= source.metadata.items()
+    for frame in (*range(min(frames, 3)), frames // 2, frames - 1):
+        assert_same(found[frame], source[frame], full_float)
+
+
+def test_z_up_is_the_internal_world(tmp_path, cloud, sequence):
+    write_asset(sequence(1, axes="rfu"), tmp_path / "a.usdc", full_float=True)
+    assert_same(read_asset(tmp_path / "a.usdc")[0], cloud(axes="rfu"), True)
+
+
+def test_splats_without_material_survive(tmp_path, cloud, sequence):
+    write_asset(sequence(1, relightable=False, degree=3), tmp_path / "a.usdc", full_float=True)
+    found = read_asset(tmp_path / "a.usdc", trusted=True)[0]
+    assert not found.is_relightable
+    assert_same(found, cloud(relightable=False, degree=3), True)
+
+
+def test_stand_in_radiance_is_not_read_as_captured(tmp_path, sequence):
+    write_asset(sequence(2, degree=None), tmp_path / "a.usdc")
+    found = read_asset(tmp_path / "a.usdc", trusted=True)
+    assert found[0].radiance is None
+    assert found.metadata["radiance_meaning"] == "baseColorOnly"
+    assert "radiance" not in found.constant
+
+
+def test_frames_blend_across_a_segment_boundary_as_in_one_layer(tmp_path, sequence):
+    source = sequence(65)
+    values = []
+    for name in ("clips.usda", "single.usdc"):
+        write_asset(source, tmp_path / name)
+        stage = Usd.Stage.Open(str(tmp_path / name))
+        prim = stage.GetPrimAtPath("/Asset/Splats")
+        values.append([np.array(prim.GetAttribute("positions").Get(time)) for time in (29.25, 29.5, 30.0, 63.5)])
+    assert np.array_equal(values[0], values[1])
+    mean = 0.5 * (source[29].positions + source[30].positions)
+    assert np.abs(values[0][1] - mean).max() <= 1e-6  # one float32 lerp of values below 4
+
+
+def test_writing_what_was_read_changes_nothing(tmp_path, sequence):
+    write_asset(sequence(3), tmp_path / "a.usdc")
+    once = read_asset(tmp_path / "a.usdc", trusted=True)
+    write_asset(once, tmp_path / "b.usdc")
+    twice = read_asset(tmp_path / "b.usdc", trusted=True)
+    for frame in range(3):
+        assert_same(twice[frame], once[frame], True)
+
+
+def test_an_asset_can_be_rewritten_from_itself(tmp_path, sequence):
+    write_asset(sequence(65), tmp_path / "a.usda", full_float=True)
+    found = read_asset(tmp_path / "a.usda", trusted=True)
+    write_asset(found, tmp_path / "a.usda", full_float=True, segment_length=10)
+    again = read_asset(tmp_path / "a.usda", trusted=True)
+    assert_same(again[64], sequence(65)[64], True)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames"), [("a.usda", 2), ("a.usdc", 2), ("a.usdz", 2), ("a.usda", 65), ("a.usdz", 65)]
+)
+def test_reading_sees_a_replaced_file(tmp_path, sequence, name, frames):
+    write_asset(sequence(frames), tmp_path / name)
+    held = read_asset(tmp_path / name, trusted=True)
+    assert len(held[1]) == 6  # OpenUSD shares the open layers with the next reader
+    write_asset(sequence(frames, count=9), tmp_path / name)
+    assert len(read_asset(tmp_path / name, trusted=True)[1]) == 9
+
+
+def test_frames_can_be_read_from_any_thread(tmp_path, sequence):
+    source = sequence(65, count=200)
+    write_asset(source, tmp_path / "a.usda", full_float=True)
+    found = read_asset(tmp_path / "a.usda", trusted=True)
+    order = [(7 * frame) % 65 for frame in range(65)]
+    with ThreadPoolExecutor(4) as threads:
+        for frame, got in zip(order, threads.map(found.read_frame, order), strict=True):
+            assert np.array_equal(got.positions, source[frame].positions)
+            assert np.array_equal(got.base_color, source[frame].base_color)
+
+
+def test_still_frames_keep_their_number(tmp_path, cloud):
+    write_asset(GaussianSequence.from_clouds([cloud()] * 5), tmp_path / "a.usda")
+    found = read_asset(tmp_path / "a.usda", trusted=True)
+    assert len(found) == 5
+    assert len(found.constant) == len(cloud().arrays())
+
+
+def test_counts_may_change(tmp_path, cloud):
+    source = GaussianSequence.from_clouds([cloud(0, 4), cloud(1, 7), cloud(2, 0)])
+    write_asset(source, tmp_path / "a.usdc", full_float=True)
+    found = read_asset(tmp_path / "a.usdc", trusted=True)
+    assert found.topology == "perFrame"
+    assert [len(found[frame]) for frame in range(3)] == [4, 7, 0]
+    assert_same(found[1], source[1], True)
