@@ -58,7 +58,7 @@ class Camera:
             object.__setattr__(self, name, require_count(name, getattr(self, name), 1, MAX_SIDE))
         if self.width * self.height > MAX_PIXELS:
             raise InvalidOptionError(
-                f"width x height must be at most {MAX_PIXELS}, got {self.width} x {self.height}. Choose a smaller image."
+                f"width x height must be at most {MAX_PIXELS}, got {self.width} x {self.height}. Choose a smaller one."
             )
         for name in ("focal_x", "focal_y"):
             object.__setattr__(self, name, require_number(name, getattr(self, name), 1e-3, 1e9))

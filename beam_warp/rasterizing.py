@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.assets import ATTRIBUTES, WORLD_AXES, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.checks import require_array, require_choice, require_finite, require_same_length
-from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
+from beam_warp.devices import resolve_device
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.bin_tiles import (
     Band,
     count_pairs_kernel,
@@ -106,7 +107,7 @@ def rasterize(
         cloud: Gaussians in the internal world (axes ``rfu``).
         camera: The camera.
         channels: What to draw, of `CHANNELS`.
-        device: Warp device; the current one without.
+        device: Warp device; the first GPU without, or the CPU where there is none.
         antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
             views from further away than the training views.
 
@@ -171,11 +172,7 @@ def rasterize_values(
             f"cloud must be in the axes {WORLD_AXES!r}, got {cloud.axes!r}. Convert it with "
             f"beam_warp.axes.change_axes(cloud, {WORLD_AXES!r})."
         )
-    try:
-        target = wp.get_device(device)
-    except Exception as error:  # Warp raises a plain RuntimeError or ValueError, by version
-        known = ", ".join(str(d) for d in wp.get_devices())
-        raise DeviceError(f"device must be one of {known}, got {device!r}. Choose one that is there.") from error
+    target = resolve_device(device)
     with wp.ScopedDevice(target):
         return _draw(cloud, camera, rows, antialiased, target)
 

@@ -109,12 +109,10 @@ def render(args: Render) -> int:
     else:
         views = _numbered_views(args, sequence)
 
-    import warp as wp
-
     from beam_warp.deferred import EnvironmentLighting
+    from beam_warp.devices import resolve_device
 
-    wp.config.log_level = wp.LOG_WARNING  # Warp greets on stdout, which belongs to the result
-    lighting = EnvironmentLighting.from_environment(environment, device=args.device)
+    lighting = EnvironmentLighting.from_environment(environment, device=str(resolve_device(args.device)))
     gaussian_count = 0
     with progress(args.quiet or args.json) as report:
         for done, (view, cloud) in enumerate(_with_clouds(args, views, sequence), start=1):
