@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +15,7 @@ from numpy.typing import NDArray
 from beam_warp.checks import require_array, require_finite, require_unit
 from beam_warp.errors import DeviceError, InvalidArrayError
 
-wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # a library prints no banner, nor that there is no GPU
+wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # a library prints no banner
 
 
 def resolve_device(device: str | None = None) -> Any:
@@ -20,7 +24,7 @@ def resolve_device(device: str | None = None) -> Any:
     Raises:
         DeviceError: There is no such device.
     """
-    wp.init()
+    _init_warp()
     if device is None:
         return wp.get_device("cuda:0" if wp.is_cuda_available() else "cpu")
     try:
@@ -28,6 +32,30 @@ def resolve_device(device: str | None = None) -> Any:
     except Exception as error:
         known = ", ".join(str(d) for d in wp.get_devices())
         raise DeviceError(f"device must be one of {known}, got {device!r}. Choose one of them.") from error
+
+
+@cache
+def _init_warp() -> None:
+    """Initialise Warp without its line on stderr that a machine has no GPU: half of our users have none, and know it.
+
+    The line comes from native code that no setting reaches, hence the detour by the file descriptor.
+    """
+    try:
+        kept = os.dup(2)
+    except OSError:  # no stderr at all
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        held.seek(0)
+        said = [line for line in held.read().decode(errors="replace").splitlines() if "CUDA driver" not in line]
+    if said:
+        print("\n".join(said), file=sys.stderr)
 
 
 def upload_vectors(name: str, value: Any, device: Any, *, unit_length: bool = False) -> wp.array:
