@@ -1,0 +1,56 @@
+"""The intermediate store: one HDF5 file per frame, written whole or not at all.
+
+Workers never share a file, and a killed one costs a frame. A file carries the key of what it was computed from; a
+reader asks for that key, so stale files are never taken for fresh ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.errors import OutputError
+
+KEY = "beam_key"
+
+
+def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a frame's arrays under a key.
+
+    Raises:
+        OutputError: The file cannot be written; nothing is left behind.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with h5py.File(temporary, "w", track_order=True) as file:
+            file.attrs[KEY] = key
+            for name, array in arrays.items():
+                file.create_dataset(name, data=np.ascontiguousarray(array))
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} must be writable, got {error}. Free space or choose another folder.") from error
+
+
+def frame_key(path: Path) -> str | None:
+    """Return the key of a stored frame; None if there is no whole file."""
+    try:
+        with h5py.File(path, "r") as file:
+            return str(file.attrs[KEY])
+    except (OSError, KeyError):
+        return None
+
+
+def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
+    """Read a frame's arrays, all or some."""
+    with h5py.File(path, "r") as file:
+        wanted = tuple(file) if names is None else names
+        return {name: np.asarray(file[name]) for name in wanted}

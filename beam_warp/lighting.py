@@ -1,0 +1,132 @@
+"""How open to light surface points are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import warp as wp
+
+from beam_warp.checks import require_count, require_number, require_same_length
+from beam_warp.devices import download_like, upload_vectors
+from beam_warp.errors import InvalidOptionError
+from beam_warp.kernels.ambient_occlusion import (
+    launch_local_surface,
+    launch_reduce_visibility,
+    launch_trace_occlusion,
+)
+from beam_warp.scene import Scene
+
+LIFT_IN_THICKNESSES = 4.0
+"""How far ``offset="auto"`` lifts ray origins off the local surface, in standard deviations of its thickness."""
+
+RAYS_AT_ONCE = 1 << 22
+"""Rays whose results are held at a time: 16 MiB."""
+
+
+@dataclass(frozen=True)
+class AmbientOcclusion:
+    """How open the hemisphere above each point is.
+
+    Attributes:
+        visibility: Cosine-weighted visibility in [0, 1], 1 is open, ``(N,)`` float32.
+        standard_error: Standard error of ``visibility``, ``(N,)`` float32; errs on the large side.
+    """
+
+    visibility: Any
+    standard_error: Any
+
+
+def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float | Literal["auto"]) -> wp.array:
+    """Return how far along its normal each ray origin is moved [m], ``(N,)`` float32 on the scene's device.
+
+    ``"auto"``: to the mean of the Gaussians' opacity along the normal's line, where the surface is seen, and from
+    there `LIFT_IN_THICKNESSES` standard deviations outwards. A number is taken as it is.
+    """
+    if offset != "auto":
+        value = require_number("offset", offset)
+        return wp.full(len(points), value, dtype=float, device=scene.device)
+    if scene.bvh is None:
+        return wp.zeros(len(points), dtype=float, device=scene.device)
+    surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
+    launch_local_surface(scene.bvh.id, scene.gaussians, scene.device_origin, points, normals, surface, scene.device)
+    height, thickness = surface.numpy().T
+    return wp.array(height + LIFT_IN_THICKNESSES * thickness, dtype=float, device=scene.device)
+
+
+def stratum_bits(sample_count: int) -> wp.vec2i:
+    """Return the grid of strata, as bits of columns and rows, that ``sample_count`` points fill; (-1, -1) for none."""
+    bits = sample_count.bit_length() - 1
+    if sample_count != 1 << bits or bits == 0:
+        return wp.vec2i(-1, -1)
+    return wp.vec2i(bits // 2, bits - bits // 2)
+
+
+def ambient_occlusion(
+    scene: Scene,
+    points: Any,
+    normals: Any,
+    *,
+    sample_count: int = 64,
+    offset: float | Literal["auto"] = "auto",
+    seed: int = 0,
+    frame: int = 0,
+) -> AmbientOcclusion:
+    """Estimate how open the hemisphere above each surface point is.
+
+    A(x) = 1/pi * integral over the hemisphere of V(x, w) (n.w) dw. Directions are cosine-weighted by an
+    Owen-scrambled Sobol' set of its own for each point, so the estimate is the mean of V.
+
+    Args:
+        scene: Occluders; the work runs on its device.
+        points: Surface points [m], ``(N, 3)`` float32, NumPy or a warp array of vec3 on the scene's device.
+        normals: Unit outward normals, like ``points``.
+        sample_count: Rays per point; a power of two gives the full benefit of the sample set and a tighter error.
+        offset: Distance [m] from point to ray origin along the normal, or ``"auto"``: onto the local surface and
+            off it by `LIFT_IN_THICKNESSES` times its thickness. The paper's absolute value is 0.02.
+        seed: Same seed, same device, same bits.
+        frame: Number of the frame; frames have independent noise, the same frame always the same.
+
+    Returns:
+        Visibility and its standard error; NumPy, or warp arrays if one came in.
+
+    Raises:
+        InvalidArrayError: A shape, type, non-finite or non-unit value breaks the contract above.
+        InvalidOptionError: An option is out of range.
+
+    Source: BEAM Eq. 6; sample set Burley 2020.
+    """
+    count = require_count("sample_count", sample_count, 1, 1 << 20)
+    require_count("seed", seed, 0, 2**32 - 1)
+    require_count("frame", frame, 0, 2**32 - 1)
+    if isinstance(offset, str) and offset != "auto":
+        raise InvalidOptionError(f'offset must be a number or "auto", got {offset!r}. Give metres or "auto".')
+    at = upload_vectors("points", points, scene.device)
+    up = upload_vectors("normals", normals, scene.device, unit_length=True)
+    require_same_length("normals", up, "points", len(at))
+    mean = wp.ones(len(at), dtype=float, device=scene.device)
+    error = wp.zeros(len(at), dtype=float, device=scene.device)
+    if scene.bvh is not None and len(at):
+        offsets = ray_offsets(scene, at, up, offset)
+        bits = stratum_bits(count)
+        step = max(1, RAYS_AT_ONCE // count)
+        samples = wp.empty(min(step, len(at)) * count, dtype=float, device=scene.device)
+        for start in range(0, len(at), step):
+            part = slice(start, min(start + step, len(at)))
+            launch_trace_occlusion(
+                scene.bvh.id,
+                scene.gaussians,
+                scene.device_origin,
+                at[part],
+                up[part],
+                offsets[part],
+                seed,
+                frame,
+                start,
+                count,
+                bits,
+                samples,
+                scene.device,
+            )
+            launch_reduce_visibility(samples, count, bits[0] >= 0, mean[part], error[part], scene.device)
+    return AmbientOcclusion(download_like(mean, points, normals), download_like(error, points, normals))

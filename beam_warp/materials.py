@@ -1,0 +1,440 @@
+"""From captured radiance and known light to base colour and ambient occlusion: measure each frame, then solve.
+
+The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays;
+base colour is the weighted least-squares fit of the captured radiance over views, and over frames where Gaussians
+persist. Nothing is divided by a small number: what was hardly lit or never seen is flagged and filled from neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, Observability
+from beam_warp.brdf import specular_albedo_table
+from beam_warp.checks import require_count, require_number
+from beam_warp.devices import upload
+from beam_warp.environment_sampling import environment_blocks
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidArrayError
+from beam_warp.images import srgb_to_linear
+from beam_warp.kernels.product_sampling import launch_accumulate_block_weights
+from beam_warp.kernels.residues import (
+    ColorFit,
+    LightRays,
+    SurfacePoints,
+    launch_fit_color,
+    launch_trace_bounce,
+    launch_trace_light,
+)
+from beam_warp.lighting import ambient_occlusion, ray_offsets, stratum_bits
+from beam_warp.scene import Scene
+from beam_warp.spherical_harmonics import SH_C0, sh_color
+from beam_warp.surfaces import SurfaceNormals
+
+POINTS_AT_ONCE = 1 << 14
+"""Gaussians whose rays are held at a time: 64 rays of 28 bytes and 512 block weights each, 60 MiB."""
+
+VIEW_COUNT = 8
+SMALLEST_VIEW_COSINE = 0.2
+"""Views below this n.v count for nothing: there the shading normal and the lobe's edge dominate the residue."""
+
+UNLIT_PART = 0.01
+"""A Gaussian is unlit below this part of the environment's mean unshadowed irradiance."""
+
+BURIED_VISIBILITY = 0.02
+"""Below this visibility no view shows the Gaussian: its captured colour was never constrained."""
+
+SATURATION = 0.995
+"""Captured display colour above which the sensor's or the training's ceiling may have cut it."""
+
+UNCERTAIN_NORMAL = 0.1
+
+FILL_NEIGHBORS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOptions:
+    """How materials are measured.
+
+    Attributes:
+        sample_count: Rays per Gaussian and frame for visibility, and as many for light; a power of two is best.
+        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.ambient_occlusion`.
+        bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
+        seed: Same seed, same device, same bits.
+    """
+
+    sample_count: int = 64
+    offset: float | Literal["auto"] = "auto"
+    bounce: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        require_count("sample_count", self.sample_count, 2, 4096)
+        require_count("seed", self.seed, 0, 2**32 - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLight:
+    """An environment on a device, ready to be sampled; make it once, use it for every frame."""
+
+    blocks: Any
+    irradiance_map: wp.array
+    mean_irradiance: float
+
+    @classmethod
+    def from_environment(cls, environment: EnvironmentMap, device: Any) -> PreparedLight:
+        """Accumulate what sampling and the ratio estimator need."""
+        irradiance = environment.irradiance_map()
+        return cls(
+            environment_blocks(environment, device),
+            upload(irradiance.astype(np.float32), wp.vec3, device),
+            float(np.pi * environment.mean_radiance().mean()),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ColorEvidence:
+    """What frames say about base colour; evidence on the same Gaussians adds up.
+
+    Attributes:
+        numerator: Sum of w L_D (L_o - L_S), ``(N, 3)``.
+        denominator: Sum of w L_D^2, ``(N, 3)``.
+        observed: Sum of w (L_o - L_S)^2, ``(N, 3)``.
+        irradiance: Sum over frames of the environment's shadowed irradiance, ``(N, 3)``.
+        openness: Sum over frames of the hemispherical visibility, ``(N,)``.
+        noise: Sum over frames of the squared relative standard error of the irradiance, ``(N,)``.
+        frames: Number of frames.
+    """
+
+    numerator: NDArray[Any]
+    denominator: NDArray[Any]
+    observed: NDArray[Any]
+    irradiance: NDArray[Any]
+    openness: NDArray[Any]
+    noise: NDArray[Any]
+    frames: int = 1
+
+    ARRAYS: ClassVar[tuple[str, ...]] = (
+        "numerator",
+        "denominator",
+        "observed",
+        "irradiance",
+        "openness",
+        "noise",
+    )
+
+    def __add__(self, other: ColorEvidence) -> ColorEvidence:
+        """Join evidence, in float64."""
+        sums = {
+            name: np.add(getattr(self, name), getattr(other, name), dtype=np.float64) for name in ColorEvidence.ARRAYS
+        }
+        return ColorEvidence(**sums, frames=self.frames + other.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialMeasurement:
+    """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour."""
+
+    ambient_occlusion: NDArray[np.float32]
+    ambient_occlusion_error: NDArray[np.float32]
+    evidence: ColorEvidence
+
+
+def linear_radiance(cloud: GaussianCloud, directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return captured radiance in scene-linear Rec.709.
+
+    Args:
+        cloud: With radiance.
+        directions: Unit vectors from the camera to each Gaussian, ``(N, 3)``.
+
+    Returns:
+        ``(N, 3)`` float32. Display sRGB is decoded per Gaussian: exact for opaque Gaussians, an approximation where
+        training blended several in gamma space.
+    """
+    assert cloud.radiance is not None
+    color = sh_color(cloud.radiance, directions)
+    if cloud.radiance_color_space == DISPLAY_SRGB:
+        color = srgb_to_linear(np.minimum(color, 1.0))
+    return color.astype(np.float32)
+
+
+def hemisphere_views(normals: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ``VIEW_COUNT`` directions evenly over each Gaussian's visible side, and the cosines they make.
+
+    Args:
+        normals: ``(N, 3)``.
+
+    Returns:
+        Unit directions towards the viewer ``(N, VIEW_COUNT, 3)`` and their cosines ``(VIEW_COUNT,)``.
+    """
+    index = np.arange(VIEW_COUNT) + 0.5
+    z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    radius = np.sqrt(1.0 - z * z)
+    n = normals.astype(np.float64)
+    sign = np.where(n[:, 2] >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + n[:, 2])
+    b = n[:, 0] * n[:, 1] * a
+    tangent = np.stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], axis=-1)
+    bitangent = np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], axis=-1)
+    local = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
+    return np.einsum("vk,nki->nvi", local, np.stack([tangent, bitangent, n], axis=1)), z
+
+
+def measure_materials(
+    cloud: GaussianCloud,
+    scene: Scene,
+    surface: SurfaceNormals,
+    roughness: NDArray[np.float32],
+    light: PreparedLight,
+    *,
+    options: MaterialOptions,
+    frame: int = 0,
+    rows: NDArray[np.integer[Any]] | None = None,
+) -> MaterialMeasurement:
+    """Trace one frame and accumulate its evidence on base colour.
+
+    Args:
+        cloud: Gaussians with captured radiance, axes "rfu".
+        scene: The same Gaussians, uploaded.
+        surface: Their normals.
+        roughness: Their perceptual roughness, ``(N,)``.
+        light: The light of the capture.
+        options: Rays, offset, bounce, seed.
+        frame: Number of the frame. Light rays differ from frame to frame, so that fits over frames average their
+            noise; occlusion rays do not, so that ambient occlusion does not flicker.
+        rows: Gaussians to measure; all of them if None.
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+
+    Source: BEAM Eqs. 3 to 6; the ratio estimator, Heitz et al. 2018.
+    """
+    if cloud.radiance is None:
+        raise InvalidArrayError(
+            "radiance must be given to decompose materials, got None. Import Gaussians with captured colour."
+        )
+    device = scene.device
+    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
+    count = len(chosen)
+    occlusion = ambient_occlusion(
+        scene,
+        cloud.positions[chosen],
+        surface.normals[chosen],
+        sample_count=options.sample_count,
+        offset=options.offset,
+        seed=options.seed,
+    )
+    results = {
+        name: np.zeros((count, *shape), np.float32)
+        for name, shape in (
+            ("irradiance", (3,)),
+            ("numerator", (3,)),
+            ("denominator", (3,)),
+            ("observed", (3,)),
+            ("noise", ()),
+        )
+    }
+    table = upload(specular_albedo_table(), float, device)
+    # Hits are taken as diffuse: the band of degree 0 is their mean colour over views.
+    mean_color = 0.5 + SH_C0 * cloud.radiance[:, 0]
+    if cloud.radiance_color_space == DISPLAY_SRGB:
+        mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
+    hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32)[scene.rows], wp.vec3, device)
+    samples = options.sample_count
+    for start in range(0, count if scene.bvh is not None else 0, POINTS_AT_ONCE):
+        here = slice(start, min(start + POINTS_AT_ONCE, count))
+        at = chosen[here]
+        size = len(at)
+        views, cosines = hemisphere_views(surface.normals[at])
+        part = cloud.select(at)
+        captured = np.stack([linear_radiance(part, -views[:, v]) for v in range(VIEW_COUNT)], axis=1)
+
+        points = SurfacePoints()
+        points.positions = upload(cloud.positions[at], wp.vec3, device)
+        points.normals = upload(surface.normals[at], wp.vec3, device)
+        points.offsets = ray_offsets(scene, points.positions, points.normals, options.offset)
+        points.roughness = upload(roughness[at].astype(np.float32), float, device)
+        cumulative = wp.empty((size, 512), dtype=float, device=device)
+        launch_accumulate_block_weights(light.blocks, points.normals, cumulative, device)
+        rays = LightRays()
+        rays.directions = wp.empty(size * samples, dtype=wp.vec3, device=device)
+        rays.radiance_over_pdf = wp.empty(size * samples, dtype=wp.vec3, device=device)
+        rays.visibility = wp.empty(size * samples, dtype=float, device=device)
+        launch_trace_light(
+            scene, points, light.blocks, cumulative, (options.seed, frame), start, samples, stratum_bits(samples), rays
+        )
+        bounce = wp.zeros(size, dtype=wp.vec3, device=device)
+        if options.bounce:
+            launch_trace_bounce(scene, points, hit_radiance, (options.seed, frame), start, samples, bounce)
+        irradiance = wp.empty(size, dtype=wp.vec3, device=device)
+        fit = ColorFit()
+        for name in ("numerator", "denominator", "observed"):
+            setattr(fit, name, wp.empty(size, dtype=wp.vec3, device=device))
+        fit.relative_error = wp.empty(size, dtype=float, device=device)
+        launch_fit_color(
+            points,
+            rays,
+            samples,
+            light.irradiance_map,
+            bounce,
+            table,
+            upload(views.astype(np.float32), wp.vec3, device),
+            upload(np.broadcast_to(cosines.astype(np.float32), (size, VIEW_COUNT)), float, device),
+            upload(captured, wp.vec3, device),
+            irradiance,
+            fit,
+            device,
+        )
+        results["irradiance"][here] = irradiance.numpy()
+        for name in ("numerator", "denominator", "observed"):
+            results[name][here] = getattr(fit, name).numpy()
+        results["noise"][here] = fit.relative_error.numpy() ** 2
+    evidence = ColorEvidence(openness=occlusion.visibility, **results)
+    return MaterialMeasurement(occlusion.visibility, occlusion.standard_error, evidence)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseColor:
+    """Solved base colour.
+
+    Attributes:
+        base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
+        standard_error: ``(N, 3)`` float32.
+        observability: `Observability` flags, ``(N,)`` uint8.
+        clipped_part: Part of the observed Gaussians with a channel cut at 1: a sign of light stated too dim.
+    """
+
+    base_color: NDArray[np.float32]
+    standard_error: NDArray[np.float32]
+    observability: NDArray[np.uint8]
+    clipped_part: float
+
+
+def solve_base_color(
+    cloud: GaussianCloud,
+    surface_confidence: NDArray[np.float32],
+    evidence: ColorEvidence,
+    mean_irradiance: float,
+) -> BaseColor:
+    """Solve the least-squares problem that the frames add up to.
+
+    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
+    badly one rho explains all views and frames, and the noise of the irradiance, averaged over frames.
+
+    Args:
+        cloud: The Gaussians, of any one of the frames.
+        surface_confidence: Confidence of their normals, ``(N,)``.
+        evidence: Of one frame, or the sum over frames of the same Gaussians.
+        mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
+
+    Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
+    """
+    assert cloud.radiance is not None
+    numerator, denominator, observed = (
+        np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
+    )
+    irradiance = evidence.irradiance.mean(axis=1) / evidence.frames
+    openness = evidence.openness / evidence.frames
+
+    flags = np.zeros(len(cloud), np.uint8)
+    flags[~(irradiance > UNLIT_PART * mean_irradiance) | ~(denominator > 0.0).all(axis=1)] |= Observability.UNLIT
+    flags[~(openness > BURIED_VISIBILITY)] |= Observability.UNSEEN
+    flags[(0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)] |= Observability.SATURATED
+    flags[~(surface_confidence > UNCERTAIN_NORMAL)] |= Observability.UNCERTAIN_NORMAL
+    missing = (flags & (Observability.UNLIT | Observability.UNSEEN)) != 0
+
+    safe = np.where(denominator > 0.0, denominator, 1.0)
+    raw = np.where(denominator > 0.0, numerator / safe, 0.0)
+    base_color = np.clip(raw, 0.0, 1.0)
+    residual = np.maximum(observed - 2.0 * base_color * numerator + base_color**2 * denominator, 0.0)
+    degrees = max(VIEW_COUNT * evidence.frames - 1, 1)
+    noise = np.sqrt(evidence.noise) / evidence.frames
+    error = np.sqrt(residual / safe / degrees + (base_color * noise[:, None]) ** 2)
+    clipped = float((raw[~missing] > 1.0).any(axis=1).mean()) if (~missing).any() else 0.0
+    base_color, error = _fill_from_neighbors(cloud.positions, base_color, error, missing)
+    flags[missing] |= Observability.FILLED
+    return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
+
+
+def _fill_from_neighbors(
+    positions: NDArray[np.float32],
+    values: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    missing: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give what was not observed the mean of its nearest observed neighbours; its error is their spread."""
+    known = np.flatnonzero(~missing)
+    if not missing.any() or len(known) == 0:
+        return values, errors
+    k = min(FILL_NEIGHBORS, len(known))
+    distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    weight = 1.0 / np.maximum(distance, 1e-9)
+    weight /= weight.sum(axis=1, keepdims=True)
+    near = values[known[index]]
+    mean = np.einsum("nk,nkc->nc", weight, near)
+    filled, spread = values.copy(), errors.copy()
+    filled[missing] = mean
+    spread[missing] = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2)) + errors[known].mean(axis=0)
+    return filled, spread
+
+
+REFERENCE_WHITE = 0.8
+"""Base colour that the brightest surfaces get when the exposure of the capture is unknown: white cloth, fresh paper."""
+
+REFERENCE_PART = 0.98
+"""What counts as the brightest surfaces: this quantile of the largest channel."""
+
+
+def estimate_exposure(
+    cloud: GaussianCloud,
+    scene: Scene,
+    surface: SurfaceNormals,
+    roughness: NDArray[np.float32],
+    environment: EnvironmentMap,
+    *,
+    options: MaterialOptions,
+    subset: int = 4096,
+) -> float:
+    """Find the factor on an environment that makes display-referred captured colour physically plausible.
+
+    Display-referred colour has no absolute scale, so base colour has none either. The factor is chosen such that the
+    brightest surfaces, by quantile, have a base colour of `REFERENCE_WHITE`; the specular part makes the relation
+    nonlinear, so two steps are taken.
+
+    Args:
+        cloud: Gaussians with captured radiance.
+        scene: The same, uploaded.
+        surface: Their normals.
+        roughness: Their roughness.
+        environment: The light of the capture up to a factor.
+        options: Rays, offset, bounce, seed.
+        subset: Gaussians to look at, spread evenly over the cloud.
+
+    Returns:
+        A positive factor; 1 where nothing was observed.
+    """
+    rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(subset, len(cloud))).astype(np.int64))
+    factor = 1.0
+    for _ in range(2):
+        light = PreparedLight.from_environment(environment.scaled(factor), scene.device)
+        measured = measure_materials(cloud, scene, surface, roughness, light, options=options, rows=rows)
+        evidence = measured.evidence
+        good = (evidence.denominator > 0.0).all(axis=1) & (evidence.openness > BURIED_VISIBILITY)
+        good &= evidence.irradiance.mean(axis=1) > UNLIT_PART * light.mean_irradiance
+        if not good.any():
+            return 1.0
+        albedo = (evidence.numerator[good] / evidence.denominator[good]).max(axis=1)
+        brightest = float(np.quantile(albedo, REFERENCE_PART))
+        if not (brightest > 0.0):
+            return 1.0
+        factor *= require_number("exposure", brightest / REFERENCE_WHITE, 1e-6, 1e6)
+    return factor

@@ -1,0 +1,68 @@
+"""From a cloud's arrays to what tracing reads: packed rows and exact, opacity-adaptive ellipsoid bounds."""
+
+import warp as wp
+
+from beam_warp.kernels.constants import ALPHA_MIN
+from beam_warp.kernels.gaussian import Gaussians
+from beam_warp.kernels.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def pack_gaussians_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    origin: wp.vec3,
+    smallest_scale: float,
+    largest_ratio: float,
+    out_gaussians: Gaussians,
+    out_lower: wp.array[wp.vec3],
+    out_upper: wp.array[wp.vec3],
+):
+    i = first + wp.tid()
+    center = positions[i] - origin
+    scale = scales[i]
+    largest = wp.max(scale)
+    floor = wp.max(smallest_scale, largest * largest_ratio)
+    scale = wp.vec3(wp.max(scale[0], floor), wp.max(scale[1], floor), wp.max(scale[2], floor))
+    rotation = wp.quat_to_matrix(wp.normalize(orientations[i]))
+    opacity = opacities[i]
+    radius_squared = 2.0 * wp.log(opacity / ALPHA_MIN)
+
+    out_gaussians.center_opacity[i] = wp.vec4(center[0], center[1], center[2], opacity)
+    out_gaussians.whitening_0[i] = wp.vec4(
+        rotation[0, 0] / scale[0], rotation[1, 0] / scale[0], rotation[2, 0] / scale[0], radius_squared
+    )
+    out_gaussians.whitening_1[i] = wp.vec4(
+        rotation[0, 1] / scale[1], rotation[1, 1] / scale[1], rotation[2, 1] / scale[1], 0.0
+    )
+    out_gaussians.whitening_2[i] = wp.vec4(
+        rotation[0, 2] / scale[2], rotation[1, 2] / scale[2], rotation[2, 2] / scale[2], 0.0
+    )
+
+    # The half-extent of {x : |M x| <= r} along axis k is r |row k of R S|: tight, unlike the box of the rotated box.
+    radius = wp.sqrt(radius_squared)
+    half = wp.vec3()
+    for k in range(3):
+        row = wp.vec3(rotation[k, 0] * scale[0], rotation[k, 1] * scale[1], rotation[k, 2] * scale[2])
+        # Rounding must not lose the ellipsoid: a relative 1e-5 of the extent plus two ulp of the coordinate.
+        half[k] = radius * wp.length(row) * 1.00001 + 2.4e-7 * wp.abs(center[k])
+    out_lower[i] = center - half
+    out_upper[i] = center + half
+
+
+def launch_pack_gaussians(
+    positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio, gaussians, lower, upper, device
+):
+    """Pack every Gaussian and its bounds; ``positions`` are world space, the outputs relative to ``origin``."""
+    launch(
+        pack_gaussians_kernel,
+        len(positions),
+        inputs=[positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio],
+        outputs=[gaussians, lower, upper],
+        device=device,
+    )

@@ -1,0 +1,18 @@
+"""Cut-offs that tracer and rasteriser share, each with its derivation or source."""
+
+import warp as wp
+
+ALPHA_MAX = wp.constant(0.99)
+"""Cap of one Gaussian's alpha (Kerbl et al. 2023): 1 - alpha stays >= 0.01, so dividing it out stays stable."""
+
+ALPHA_MIN = wp.constant(1.0 / 255.0)
+"""Smallest alpha that counts (Kerbl et al. 2023): below one step of an 8-bit image."""
+
+TRANSMITTANCE_STOP = wp.constant(1.0e-4)
+"""Traversal stops below this transmittance (BEAM §3.2): the largest error that stopping causes."""
+
+DIRECTION_FLOOR = wp.constant(1.0e-12)
+"""Smallest |component| of a direction in a box test: 0 * inf is NaN and loses the hit when the origin is on a slab."""
+
+LARGEST_FLOAT = wp.constant(3.0e38)
+"""Stands for infinity in comparisons that may run under fast-math."""
