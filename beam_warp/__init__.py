@@ -15,23 +15,51 @@ if TYPE_CHECKING:
     from beam_warp.assets import GaussianCloud as GaussianCloud
     from beam_warp.assets import GaussianSequence as GaussianSequence
     from beam_warp.assets import Observability as Observability
+    from beam_warp.axes import change_axes as change_axes
+    from beam_warp.cameras import Camera as Camera
+    from beam_warp.captures import Capture as Capture
+    from beam_warp.converters import read as read
+    from beam_warp.converters import write as write
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
+    from beam_warp.materials import MaterialOptions as MaterialOptions
+    from beam_warp.pipeline import RunOptions as RunOptions
+    from beam_warp.pipeline import RunResult as RunResult
+    from beam_warp.pipeline import run as run
+    from beam_warp.rasterizing import GBuffer as GBuffer
+    from beam_warp.rasterizing import rasterize as rasterize
     from beam_warp.scene import Scene as Scene
+    from beam_warp.schema.validator import validate as validate
+    from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
+    from beam_warp.surfaces import estimate_normals as estimate_normals
     from beam_warp.tracing import visibility as visibility
 
 _HOMES = {
     "AmbientOcclusion": "lighting",
+    "BeamError": "errors",
+    "Camera": "cameras",
+    "Capture": "captures",
     "EnvironmentMap": "environments",
+    "GBuffer": "rasterizing",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
+    "MaterialOptions": "materials",
     "Observability": "assets",
-    "BeamError": "errors",
+    "RunOptions": "pipeline",
+    "RunResult": "pipeline",
     "Scene": "scene",
+    "SurfaceNormals": "surfaces",
     "ambient_occlusion": "lighting",
+    "change_axes": "axes",
+    "estimate_normals": "surfaces",
+    "rasterize": "rasterizing",
+    "read": "converters",
+    "run": "pipeline",
+    "validate": "schema.validator",
     "visibility": "tracing",
+    "write": "converters",
 }
 """Public name → the module that defines it."""
 

@@ -174,7 +174,7 @@ class MaterialMeasurement:
 
 
 def view_set() -> NDArray[np.float32]:
-    """Return ``VIEW_COUNT`` unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
+    """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
     index = np.arange(VIEW_COUNT) + 0.5
     z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
     phi = np.pi * (1.0 + np.sqrt(5.0)) * index

@@ -104,13 +104,15 @@ def run(args: Run) -> int:
         ]:
             print(line, file=sys.stderr)
         materials = result.report["materials"]
+        frames = f"{len(sequence)} frame{'s' if len(sequence) > 1 else ''}"
+        seconds = time.perf_counter() - started
         print(
-            f"wrote {result.asset}: {len(sequence)} frame{'s' if len(sequence) > 1 else ''}, "
-            f"{result.report['input']['gaussians']:,} Gaussians, {time.perf_counter() - started:.1f} s on "
+            f"wrote {result.asset}: {frames}, {result.report['input']['gaussians']:,} Gaussians, {seconds:.1f} s on "
             f"{result.report['device']['name']}\n"
-            f"exposure {result.report['exposure_stops']:+.2f} stops, mean ambient occlusion "
-            f"{materials['mean_ambient_occlusion']:.3f}, mean standard error of base colour "
-            f"{materials['mean_base_color_error_where_measured']:.3f}, {materials['flags']['FILLED']:,} filled from neighbours\n"
+            f"exposure of the light {result.report['exposure_stops']:+.2f} stops, "
+            f"mean ambient occlusion {materials['mean_ambient_occlusion']:.3f}\n"
+            f"mean standard error of base colour {materials['mean_base_color_error_where_measured']:.3f}, "
+            f"{materials['flags']['FILLED']:,} Gaussians filled from neighbours\n"
             f"overview: {result.overview}"
         )
     return 0

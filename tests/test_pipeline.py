@@ -1,0 +1,162 @@
+"""The main job on a small figure: everything is written, a stopped job continues to the same bytes, errors leave nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from shapes import cloud_of, sphere_points, tiles
+
+from beam_warp import GaussianSequence, MaterialOptions, RunOptions, read, run, validate
+from beam_warp.assets import DISPLAY_SRGB
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidArrayError, OutputError
+from beam_warp.frame_store import frame_key, read_frame, write_frame
+from beam_warp.images import read_image
+from beam_warp.pipeline import OverviewOptions, RoughnessTexture
+
+FAST = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
+SMALL = OverviewOptions(height=48)
+
+
+def frame(shift=0.0, ids=True, count=400):
+    points, spacing = sphere_points(count)
+    parts = tiles(points + np.array([shift, 0.0, 0.0]), points, spacing)
+    return cloud_of(
+        parts,
+        radiance=np.full((count, 1, 3), 0.3),
+        radiance_color_space=DISPLAY_SRGB,
+        ids=np.arange(count) if ids else None,
+    )
+
+
+@pytest.fixture
+def light():
+    return EnvironmentMap.constant((1.0, 0.9, 0.8), height=32)
+
+
+def folder_bytes(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "report.json"}
+
+
+def test_everything_is_written_valid_and_readable(tmp_path, light):
+    result = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", FAST, overview=SMALL)
+    assert validate(result.asset).is_valid
+    cloud = read(result.asset)[0]
+    assert cloud.is_relightable
+    assert cloud.axes == "rub"
+    assert cloud.base_color_error is not None
+    assert cloud.observability is not None
+    assert np.allclose(cloud.roughness, 0.5)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["materials"]["gaussians"] == 400
+    assert report["device"]["kind"] == "cpu"
+    assert read_image(result.overview).width > 48
+
+
+def test_stopped_job_continues_to_identical_bytes(tmp_path, light, monkeypatch):
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1), frame(0.2)])
+    run(sequence, light, tmp_path / "whole", FAST, overview=SMALL)
+
+    def stop(stage, done, total):
+        if (stage, done) == ("decompose", 2):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL, progress=stop)
+    assert not (tmp_path / "stopped" / "asset.usda").exists()
+    result = run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL)
+    assert result.report["resumed_frames"] == 2
+    whole, continued = folder_bytes(tmp_path / "whole"), folder_bytes(tmp_path / "stopped")
+    assert whole.keys() == continued.keys()
+    differing = [str(path) for path in whole if whole[path] != continued[path]]
+    assert not differing
+
+
+def test_other_input_or_options_start_over(tmp_path, light):
+    sequence = GaussianSequence.from_clouds([frame()])
+    run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    again = run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    assert again.report["resumed_frames"] == 1
+    for changed in (
+        {"sequence": GaussianSequence.from_clouds([frame(0.5)])},
+        {"environment": light.scaled(2.0)},
+        {"options": RunOptions(materials=MaterialOptions(sample_count=16), device="cpu")},
+    ):
+        arguments = {"sequence": sequence, "environment": light, "options": FAST} | changed
+        fresh = run(
+            arguments["sequence"], arguments["environment"], tmp_path / "out", arguments["options"], overview=SMALL
+        )
+        assert fresh.report["resumed_frames"] == 0
+
+
+def test_persistent_frames_share_one_base_colour(tmp_path, light):
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
+    joint = run(sequence, light, tmp_path / "joint", FAST, overview=SMALL).sequence
+    assert joint.topology == "constant"
+    assert "base_color" in joint.constant
+    assert np.array_equal(joint[0].base_color, joint[1].base_color)
+    assert not np.array_equal(joint[0].positions, joint[1].positions)
+    apart = GaussianSequence.from_clouds([frame(0.0, ids=False), frame(0.1, ids=False)])
+    separate = run(apart, light, tmp_path / "apart", FAST, overview=SMALL).sequence
+    assert separate.topology == "perFrame"
+    assert "base_color" not in separate.constant
+
+
+def test_radiance_is_needed(tmp_path, light):
+    bare = frame().with_arrays(radiance=None, radiance_color_space=None)
+    with pytest.raises(InvalidArrayError, match="radiance must be given to decompose materials, got none at frame 0"):
+        run(GaussianSequence.from_clouds([bare]), light, tmp_path / "out", FAST)
+    assert not (tmp_path / "out" / "asset.usda").exists()
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, light):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="out must be a folder that can be made"):
+        run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "file", FAST)
+
+
+def test_roughness_from_a_texture(tmp_path, light):
+    """A square of two triangles whose texture is rough on the left, smooth on the right."""
+    import trimesh
+    from PIL import Image
+
+    values = np.full((8, 8), 51, np.uint8)
+    values[:, :4] = 204
+    Image.fromarray(values).save(tmp_path / "rough.png")
+    square = trimesh.Trimesh(
+        vertices=[[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        faces=[[0, 1, 2], [0, 2, 3]],
+        visual=trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]]),
+        process=False,
+    )
+    square.export(tmp_path / "square.obj")
+    options = RunOptions(
+        materials=MaterialOptions(sample_count=8),
+        roughness=RoughnessTexture(tmp_path / "rough.png", tmp_path / "square.obj"),
+        device="cpu",
+    )
+    cloud = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", options, overview=SMALL).sequence[0]
+    clear = np.abs(cloud.positions[:, 0]) > 0.2
+    expected = np.where(cloud.positions[:, 0] < 0.0, 0.8, 0.2)
+    assert np.allclose(cloud.roughness[clear], expected[clear], atol=1e-6)
+
+
+class TestStore:
+    def test_round_trip(self, tmp_path, rng):
+        arrays = {"a": rng.normal(size=(5, 3)).astype(np.float32), "b": np.arange(4), "empty": np.zeros((0, 3))}
+        write_frame(tmp_path / "f.h5", "key", arrays)
+        back = read_frame(tmp_path / "f.h5")
+        assert list(back) == list(arrays)
+        assert all(np.array_equal(back[name], arrays[name]) for name in arrays)
+        assert frame_key(tmp_path / "f.h5") == "key"
+
+    def test_missing_and_cut_files_have_no_key(self, tmp_path):
+        assert frame_key(tmp_path / "none.h5") is None
+        write_frame(tmp_path / "f.h5", "key", {"a": np.zeros(1000)})
+        (tmp_path / "f.h5").write_bytes((tmp_path / "f.h5").read_bytes()[:300])
+        assert frame_key(tmp_path / "f.h5") is None
+
+    def test_nothing_is_left_of_a_failed_write(self, tmp_path):
+        with pytest.raises(OutputError, match="must be writable"):
+            write_frame(tmp_path / "missing" / "f.h5", "key", {"a": np.zeros(3)})
+        assert not list(tmp_path.iterdir())
