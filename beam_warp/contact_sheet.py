@@ -34,8 +34,8 @@ class Relighting:
     environment: EnvironmentMap
 
 
-def relit(buffer: GBuffer, environment: EnvironmentMap, device: str | None) -> NDArray[np.float32]:
-    """Return a G-buffer's radiance under an environment, ``(H, W, 3)`` scene-linear, premultiplied."""
+def relit(buffer: GBuffer, lighting: EnvironmentLighting) -> NDArray[np.float32]:
+    """Return a G-buffer's radiance under a light, ``(H, W, 3)`` scene-linear, premultiplied."""
     return shade(
         base_color=buffer.channels["base_color"],
         roughness=buffer.channels["roughness"],
@@ -43,13 +43,13 @@ def relit(buffer: GBuffer, environment: EnvironmentMap, device: str | None) -> N
         normals=buffer.channels["normals"],
         alpha=buffer.alpha,
         view_directions=buffer.camera.directions(),
-        lighting=EnvironmentLighting.from_environment(environment, device=device),
+        lighting=lighting,
     )
 
 
-def display_exposure(environment: EnvironmentMap) -> float:
+def display_exposure(lighting: EnvironmentLighting) -> float:
     """Return the stops that bring a white surface, at its best-lit orientation, to just below display white."""
-    brightest = float(environment.irradiance_map(16, 32).max())
+    brightest = float(lighting.light.irradiance.numpy().max())
     return float(np.log2(WHITE_IRRADIANCE / max(brightest, 1e-12)))
 
 
@@ -85,9 +85,10 @@ def contact_sheet(
         ("normals (x, y, z as r, g, b)", _over(0.5 * buffer.channels["normals"] + 0.5, alpha)),
     ]
     for light in relightings:
-        radiance = relit(buffer, light.environment, device)
+        lighting = EnvironmentLighting.from_environment(light.environment, device=device)
+        radiance = relit(buffer, lighting)
         straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
-        shown = display_image(straight, display_exposure(light.environment)) / 255.0
+        shown = display_image(straight, display_exposure(lighting)) / 255.0
         panels.append((light.title, _over(shown, alpha)))
     return _grid(panels)
 

@@ -168,6 +168,7 @@ class EnvironmentMap:
         columns = stride * width
         source = self.resized(columns // 2, columns)
         spectrum = np.fft.rfft(source.radiance.astype(np.float64), axis=1)  # (rows, frequencies, channel)
+        spectrum = np.ascontiguousarray(spectrum.transpose(1, 0, 2))  # frequency first: one small product each
         theta = _row_edges(source.height)
         # ∫∫ (cos φ sin θ, cos θ) sin θ dθ dφ over a texel whose middle is at φ = 0, for each row
         sideways = np.diff(theta / 2.0 - np.sin(2.0 * theta) / 4.0) * (2.0 * np.sin(np.pi / columns))
@@ -177,7 +178,7 @@ class EnvironmentMap:
         result = np.empty((height, width, 3), np.float32)
         for row, polar in enumerate((np.arange(height) + 0.5) * (np.pi / height)):
             kernel = np.maximum(np.sin(polar) * sideways[:, None] * cosine + np.cos(polar) * upward[:, None], 0.0)
-            product = np.einsum("rf,rfx->fx", np.fft.rfft(kernel, axis=1).conj(), spectrum)
+            product = np.matmul(np.fft.rfft(kernel, axis=1).conj().T[:, None, :], spectrum)[:, 0]
             result[row] = np.fft.irfft(product, columns, axis=0)[::stride]
         return np.maximum(result, 0.0)  # a dark hemisphere is zero up to the rounding of the FFT
 
