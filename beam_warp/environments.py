@@ -136,7 +136,7 @@ class EnvironmentMap:
         whole = int(np.floor(columns))
         part = np.float32(columns - whole)
         near, far = np.roll(self.radiance, -whole, axis=1), np.roll(self.radiance, -whole - 1, axis=1)
-        return EnvironmentMap(near * (1 - part) + far * part)
+        return EnvironmentMap((near * (1 - part) + far * part).astype(np.float32))
 
     def resized(self, height: int, width: int) -> EnvironmentMap:
         """Return the map on another 2:1 grid: each new texel is the mean over its solid angle, so energy is kept."""
@@ -146,7 +146,7 @@ class EnvironmentMap:
         columns = _overlap_means(np.linspace(0.0, 1.0, self.width + 1), np.linspace(0.0, 1.0, width + 1))
         by_rows = rows @ self.radiance.reshape(self.height, -1).astype(np.float64)
         by_columns = columns @ by_rows.reshape(height, self.width, 3).transpose(1, 0, 2).reshape(self.width, -1)
-        return EnvironmentMap(by_columns.reshape(width, height, 3).transpose(1, 0, 2))
+        return EnvironmentMap(by_columns.reshape(width, height, 3).transpose(1, 0, 2).astype(np.float32))
 
     def irradiance_map(self, height: int = 64, width: int = 128) -> NDArray[np.float32]:
         """Return the irradiance E(n) = ∫ L(ω) max(0, n·ω) dω of every normal n of a lat-long grid.

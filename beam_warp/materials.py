@@ -7,6 +7,7 @@ persist. Nothing is divided by a small number: what was hardly lit or never seen
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -156,12 +157,17 @@ class ColorEvidence:
         "noise",
     )
 
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], frames: int = 1) -> ColorEvidence:
+        """Collect arrays by name."""
+        return cls(**{name: arrays[name] for name in cls.ARRAYS}, frames=frames)  # type: ignore[arg-type]
+
     def __add__(self, other: ColorEvidence) -> ColorEvidence:
         """Join evidence, in float64."""
         sums = {
             name: np.add(getattr(self, name), getattr(other, name), dtype=np.float64) for name in ColorEvidence.ARRAYS
         }
-        return ColorEvidence(**sums, frames=self.frames + other.frames)
+        return ColorEvidence.from_arrays(sums, self.frames + other.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +303,7 @@ def measure_materials(
         for name in ("numerator", "denominator", "observed"):
             results[name][here] = getattr(fit, name).numpy()
         results["noise"][here] = fit.relative_error.numpy() ** 2
-    evidence = ColorEvidence(openness=occlusion.visibility, **results)
+    evidence = ColorEvidence.from_arrays({"openness": occlusion.visibility, **results})
     return MaterialMeasurement(occlusion.visibility, occlusion.standard_error, evidence)
 
 

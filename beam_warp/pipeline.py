@@ -356,7 +356,7 @@ class _Job:
     def evidence(self, frame: int) -> ColorEvidence:
         names = tuple(EVIDENCE + name for name in ColorEvidence.ARRAYS)
         stored = read_frame(self.path(frame), names)
-        return ColorEvidence(**{name.removeprefix(EVIDENCE): array for name, array in stored.items()})
+        return ColorEvidence.from_arrays({name.removeprefix(EVIDENCE): array for name, array in stored.items()})
 
     def solve(self) -> GaussianSequence:
         """Solve base colour, over all frames at once or each by itself, and return the relightable sequence."""
@@ -454,9 +454,7 @@ class _Tally:
 
     def __init__(self) -> None:
         self._rows = 0
-        self._sums = dict.fromkeys(
-            ("clipped", "from_shape", "openness", "confidence", "error", "dropped", "raised"), 0.0
-        )
+        self._sums: dict[str, float] = {}
         self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
     def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:

@@ -95,7 +95,8 @@ def textured_roughness(cloud: GaussianCloud, texture: Path, mesh: Path) -> NDArr
         raise AssetFormatError(
             f"roughness mesh must have texture coordinates, got none in {mesh}. Unwrap it before baking."
         )
-    positions, indices = texel_positions(loaded, *values.shape)
+    assert isinstance(loaded, trimesh.Trimesh)  # what force='mesh' promises
+    positions, indices = texel_positions(loaded, values.shape[0], values.shape[1])
     if len(positions) == 0:
         raise AssetFormatError(f"roughness mesh must cover texels of its texture, got none in {mesh}. Check its UVs.")
     nearest = cKDTree(positions).query(cloud.positions, workers=-1)[1]

@@ -103,7 +103,7 @@ def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[n
     ordered = np.take_along_axis(cloud.scales, order, axis=1)
     axis = np.take_along_axis(rotation_matrices(cloud.orientations), order[:, None, :1], axis=2)[..., 0]
     flatness = 1.0 - ordered[:, 0] / np.maximum(ordered[:, 1], 1e-30)
-    return axis.astype(np.float32), flatness
+    return axis.astype(np.float32), flatness.astype(np.float32)
 
 
 def _open_side(

@@ -283,12 +283,12 @@ def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentL
     alpha = buffer.alpha
     if args.background != "transparent":
         behind = srgb_to_linear(np.asarray(args.background, np.float32))
-        radiance = radiance + (1.0 - alpha[..., None]) * behind
+        radiance = (radiance + (1.0 - alpha[..., None]) * behind).astype(np.float32)
         alpha = np.ones_like(alpha)
     if view.path.suffix.lower() == ".png":
         write_png(view.path, _display(radiance, alpha))
         return
-    layers = buffer.layers() if args.aov else {}
+    layers: dict[str, NDArray[np.float32]] = dict(buffer.layers()) if args.aov else {}
     layers.update({"R": radiance[..., 0], "G": radiance[..., 1], "B": radiance[..., 2], "A": alpha})
     write_exr(view.path, layers)
 
