@@ -25,9 +25,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_finite, require_range, require_unit
+from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap, texel_directions
-from beam_warp.errors import DeviceError
-from beam_warp.ggx import DIELECTRIC_F0, specular_albedo_table
+from beam_warp.ggx import specular_albedo_table
 from beam_warp.kernels.prefilter import FluxTree, launch_prefilter_environment
 from beam_warp.kernels.shading import EnvironmentLight, ShadedSurfaces, launch_shade_environment
 
@@ -67,18 +67,12 @@ class EnvironmentLighting:
 
         Args:
             environment: The light.
-            device: ``"cpu"``, ``"cuda:0"``, ...; the default device where none is given.
+            device: ``"cpu"``, ``"cuda:0"``, …; None takes the first CUDA device, or the CPU where there is none.
 
         Raises:
             DeviceError: There is no such device.
         """
-        try:
-            target = wp.get_device(device)
-        except (ValueError, RuntimeError) as error:
-            raise DeviceError(
-                f"device must be one of {', '.join(str(d) for d in wp.get_devices())}, got {device!r}. "
-                "Choose one of them."
-            ) from error
+        target = resolve_device(device)
         heights = [environment.height, *(_level_rows(roughness) for roughness in LEVEL_ROUGHNESS[1:])]
         offsets = np.concatenate([[0], np.cumsum([2 * height * height for height in heights])])
         texels = wp.empty(int(offsets[-1]), dtype=wp.vec3, device=target)
@@ -103,7 +97,6 @@ class EnvironmentLighting:
         light.first_roughness = FIRST_ROUGHNESS
         light.log_ratio = float(np.log(LEVEL_ROUGHNESS[2] / LEVEL_ROUGHNESS[1]))
         light.albedo_terms = wp.array(specular_albedo_table(), dtype=wp.vec2, device=target)
-        light.dielectric_f0 = DIELECTRIC_F0
         return cls(environment, str(target), light)
 
     def blurred_level(self, level: int) -> NDArray[np.float32]:

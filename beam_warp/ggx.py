@@ -1,11 +1,11 @@
 """The specular lobe in float64: GGX with height-correlated Smith masking, its directional albedo as a table.
 
-Perceptual roughness r maps to alpha = r². With F = F0 + (1 - F0)(1 - v·h)^5 the directional albedo (the share of uniform
-light that is reflected specularly) splits into E(n·v, r) = F0 A + B. The table is integrated, not fitted: the usual
-analytic fits are off by up to a factor of four at grazing angles on rough surfaces.
+Perceptual roughness r maps to alpha = r². With F = F0 + (1 - F0)(1 - v·h)^5 the directional albedo (the share of
+uniform light that is reflected specularly) splits into E(n·v, r) = F0 A + B. The table is integrated, not fitted: the
+usual analytic fits are off by up to a factor of four at grazing angles on rough surfaces.
 
-Sources: Walter et al. 2007 (GGX); Heitz 2014 (height-correlated Smith); Dupuy and Benyoub 2023 (spherical-cap sampling of
-visible normals); Karis 2013 (the split into A and B).
+Sources: Walter et al. 2007 (GGX); Heitz 2014 (height-correlated Smith); Dupuy and Benyoub 2023 (spherical-cap
+sampling of visible normals); Karis 2013 (the split into A and B).
 """
 
 from __future__ import annotations
@@ -21,8 +21,11 @@ DIELECTRIC_F0 = 0.04
 TABLE_SIZE = 64
 """Nodes along each axis of `specular_albedo_table`."""
 
-SAMPLES_AROUND, SAMPLES_ACROSS = 16, 64
+SAMPLES_AROUND, SAMPLES_ACROSS = 32, 64
 """Midpoint grid over the visible normals: half a turn (the lobe is symmetric) and the cap's height."""
+
+TAIL_POWER = 3
+"""Nodes crowd towards the cap's rim as (1 - u)^3: there are the lobe's long tail and the jump at the horizon."""
 
 
 def smith_lambda(cosine: ArrayLike, alpha: ArrayLike) -> NDArray[np.float64]:
@@ -58,7 +61,10 @@ def specular_albedo_terms(n_dot_v: ArrayLike, roughness: ArrayLike) -> tuple[NDA
     alpha = np.square(np.asarray(roughness, np.float64))[..., None, None]
     sine = np.sqrt(1.0 - cosine * cosine)
     azimuth = (np.arange(SAMPLES_AROUND) + 0.5) * (np.pi / SAMPLES_AROUND)
-    share = ((np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS)[:, None]
+    remaining = 1.0 - ((np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS)[:, None]
+    share = 1.0 - remaining**TAIL_POWER
+    weight = TAIL_POWER * remaining ** (TAIL_POWER - 1)
+    weight = weight / weight.mean()
     # The view direction, stretched to where the lobe is a hemisphere; a cap about it is uniform in height.
     length = np.hypot(alpha * sine, cosine)
     x, z = alpha * sine / length, cosine / length
@@ -70,7 +76,7 @@ def specular_albedo_terms(n_dot_v: ArrayLike, roughness: ArrayLike) -> tuple[NDA
     n_dot_l = 2.0 * v_dot_h * h[2] - cosine
     above = n_dot_l > 0.0
     view = 1.0 + smith_lambda(cosine, alpha)
-    masking = np.where(above, view / (view + smith_lambda(np.where(above, n_dot_l, 1.0), alpha)), 0.0)
+    masking = weight * np.where(above, view / (view + smith_lambda(np.where(above, n_dot_l, 1.0), alpha)), 0.0)
     rising = schlick_weight(v_dot_h)
     return (masking * (1.0 - rising)).mean(axis=(-2, -1)), (masking * rising).mean(axis=(-2, -1))
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, Observability
-from beam_warp.brdf import specular_albedo_table
 from beam_warp.checks import require_count
 from beam_warp.devices import upload
 from beam_warp.environment_sampling import environment_blocks
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
+from beam_warp.ggx import specular_albedo_table
 from beam_warp.images import srgb_to_linear
 from beam_warp.kernels.product_sampling import EnvironmentBlocks, launch_accumulate_block_weights
 from beam_warp.kernels.residues import (
@@ -242,7 +242,7 @@ def measure_materials(
             ("noise", ()),
         )
     }
-    table = upload(specular_albedo_table(), float, device)
+    table = upload(specular_albedo_table(), wp.vec2, device)
     views = upload(view_set(), wp.vec3, device)
     is_display = cloud.radiance_color_space == DISPLAY_SRGB
     radiance = upload(cloud.radiance, wp.vec3, device)

@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.brdf import specular_albedo_table
 from beam_warp.cameras import Camera
 from beam_warp.checks import (
     require_array,
@@ -21,6 +20,7 @@ from beam_warp.checks import (
 from beam_warp.devices import resolve_device, upload
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
+from beam_warp.ggx import specular_albedo_table
 from beam_warp.kernels.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.mesh_channels import MeshChannels, launch_trace_channels
 from beam_warp.kernels.mesh_path import launch_trace_outgoing, launch_trace_pixels
@@ -136,7 +136,7 @@ def trace_radiance(
     launch_trace_pixels(
         mesh.surface,
         environment_distribution(environment, mesh.device),
-        upload(specular_albedo_table(), float, mesh.device),
+        upload(specular_albedo_table(), wp.vec2, mesh.device),
         _pixel_rays(camera),
         seed,
         sample_count,
@@ -238,7 +238,7 @@ def outgoing_radiance(
     launch_trace_outgoing(
         mesh.surface,
         environment_distribution(environment, mesh.device),
-        upload(specular_albedo_table(), float, mesh.device),
+        upload(specular_albedo_table(), wp.vec2, mesh.device),
         upload(where, int, mesh.device),
         upload(corner_weights, wp.vec3, mesh.device),
         upload(away, wp.vec3, mesh.device),

@@ -56,14 +56,18 @@ def specular_brdf(normal: wp.vec3, view: wp.vec3, light: wp.vec3, roughness: flo
 
 
 @wp.func
-def specular_albedo(table: wp.array2d[float], n_dot_v: float, roughness: float) -> float:
-    """Directional albedo of the specular lobe, bilinear in beam_warp.brdf's table (n.v, roughness)."""
-    y = wp.clamp(n_dot_v, 0.0, 1.0) * float(table.shape[0] - 1)
-    x = wp.clamp(roughness, 0.0, 1.0) * float(table.shape[1] - 1)
-    i = wp.min(int(y), table.shape[0] - 2)
-    j = wp.min(int(x), table.shape[1] - 2)
-    fy = y - float(i)
-    fx = x - float(j)
-    low = table[i, j] * (1.0 - fx) + table[i, j + 1] * fx
-    high = table[i + 1, j] * (1.0 - fx) + table[i + 1, j + 1] * fx
-    return low * (1.0 - fy) + high * fy
+def specular_albedo(terms: wp.array2d[wp.vec2], n_dot_v: float, roughness: float) -> float:
+    """Directional albedo F0 A + B of the specular lobe, bilinear in the table of beam_warp.ggx.
+
+    Rows: roughness. Columns: the square root of n.v.
+    """
+    y = wp.clamp(roughness, 0.0, 1.0) * float(terms.shape[0] - 1)
+    x = wp.sqrt(wp.clamp(n_dot_v, 0.0, 1.0)) * float(terms.shape[1] - 1)
+    row = wp.clamp(int(y), 0, terms.shape[0] - 2)
+    column = wp.clamp(int(x), 0, terms.shape[1] - 2)
+    fy = y - float(row)
+    fx = x - float(column)
+    top = terms[row, column] * (1.0 - fx) + terms[row, column + 1] * fx
+    bottom = terms[row + 1, column] * (1.0 - fx) + terms[row + 1, column + 1] * fx
+    both = top * (1.0 - fy) + bottom * fy
+    return DIELECTRIC_F0 * both[0] + both[1]

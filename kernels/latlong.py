@@ -23,24 +23,34 @@ def latlong_to_direction(u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def latlong_texel(texels: wp.array2d[wp.vec3], row: int, column: int) -> wp.vec3:
-    """Wraps around in azimuth and stops at the poles."""
-    height = texels.shape[0]
-    width = texels.shape[1]
-    r = wp.clamp(row, 0, height - 1)
-    c = column % width
+def latlong_wrap(row: int, column: int, height: int, width: int) -> wp.vec2i:
+    """Row and column of a texel that may lie one step outside: around in azimuth, and across the poles."""
+    r = row
+    c = column
+    if r < 0:
+        r = -1 - r
+        c += width / 2
+    elif r >= height:
+        r = 2 * height - 1 - r
+        c += width / 2
+    c = c % width
     if c < 0:
         c += width
-    return texels[r, c]
+    return wp.vec2i(r, c)
+
+
+@wp.func
+def latlong_texel(texels: wp.array2d[wp.vec3], row: int, column: int) -> wp.vec3:
+    place = latlong_wrap(row, column, texels.shape[0], texels.shape[1])
+    return texels[place[0], place[1]]
 
 
 @wp.func
 def latlong_nearest(texels: wp.array2d[wp.vec3], d: wp.vec3) -> wp.vec3:
     """Radiance of the texel that holds direction d: the piecewise-constant map, which sampling densities refer to."""
     uv = direction_to_latlong(d)
-    return latlong_texel(
-        texels, int(wp.floor(uv[1] * float(texels.shape[0]))), int(wp.floor(uv[0] * float(texels.shape[1])))
-    )
+    row = wp.min(int(wp.floor(uv[1] * float(texels.shape[0]))), texels.shape[0] - 1)
+    return latlong_texel(texels, row, int(wp.floor(uv[0] * float(texels.shape[1]))))
 
 
 @wp.func

@@ -44,7 +44,7 @@ class Shading:
 
 
 @wp.func
-def shading_of(point: SurfacePoint, view: wp.vec3, albedo_table: wp.array2d[float]) -> Shading:
+def shading_of(point: SurfacePoint, view: wp.vec3, albedo_table: wp.array2d[wp.vec2]) -> Shading:
     shading = Shading()
     n = point.normal
     away = GRAZING_COSINE - wp.dot(n, view)
@@ -100,7 +100,7 @@ def power_heuristic(pdf: float, other: float) -> float:
 def path_radiance(
     surface: MeshSurface,
     environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[float],
+    albedo_table: wp.array2d[wp.vec2],
     start: SurfacePoint,
     start_view: wp.vec3,
     stream: wp.uint32,
@@ -150,7 +150,7 @@ def trace_pixels_kernel(
     first: int,
     surface: MeshSurface,
     environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[float],
+    albedo_table: wp.array2d[wp.vec2],
     rays: PixelRays,
     seed: wp.uint32,
     sample_count: int,
@@ -181,7 +181,7 @@ def trace_outgoing_kernel(
     first: int,
     surface: MeshSurface,
     environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[float],
+    albedo_table: wp.array2d[wp.vec2],
     faces: wp.array[int],
     weights: wp.array[wp.vec3],
     directions: wp.array2d[wp.vec3],

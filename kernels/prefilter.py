@@ -31,7 +31,7 @@ class FluxTree:
 
 @wp.func
 def ggx_lobe_weight(distance_squared: float, alpha: float) -> float:
-    """D(h) (n·l) for n = v, up to a factor, from the squared chord between l and n: it does not cancel near the axis."""
+    """D(h) (n·l) for n = v, up to a factor, from the squared chord between l and n, which does not cancel."""
     n_dot_l = 1.0 - 0.5 * distance_squared
     if n_dot_l <= 0.0:
         return 0.0

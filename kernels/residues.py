@@ -148,7 +148,7 @@ def fit_color_kernel(
     sample_count: int,
     irradiance_map: wp.array2d[wp.vec3],
     bounce: wp.array[wp.vec3],
-    albedo_table: wp.array2d[float],
+    albedo_table: wp.array2d[wp.vec2],
     views: wp.array[wp.vec3],
     captured: CapturedColor,
     out_irradiance: wp.array[wp.vec3],

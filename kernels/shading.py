@@ -1,4 +1,4 @@
-"""Shading a G-buffer with an environment in closed form: irradiance for the diffuse lobe, split sum for the specular one.
+"""Shading a G-buffer with an environment: irradiance for the diffuse lobe, split sum for the specular one.
 
 The float64 twin is in the tests of `beam_warp.deferred`, where the formulas and their sources stand.
 """
@@ -7,7 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.latlong import direction_to_latlong, latlong_bilinear
+from beam_warp.kernels.brdf import specular_albedo
+from beam_warp.kernels.latlong import direction_to_latlong, latlong_bilinear, latlong_wrap
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -29,7 +30,6 @@ class EnvironmentLight:
     first_roughness: float  # of level 1; level 0 is the mirror
     log_ratio: float  # natural logarithm of the ratio of roughness of one level to that of the level before
     albedo_terms: wp.array2d[wp.vec2]  # (A, B) over roughness and the square root of n·v
-    dielectric_f0: float
 
 
 @wp.struct
@@ -46,9 +46,8 @@ class ShadedSurfaces:
 
 @wp.func
 def level_texel(light: EnvironmentLight, start: int, height: int, row: int, column: int) -> wp.vec3:
-    width = 2 * height
-    c = (column + width) % width
-    return light.texels[start + wp.clamp(row, 0, height - 1) * width + c]
+    place = latlong_wrap(row, column, height, 2 * height)
+    return light.texels[start + place[0] * 2 * height + place[1]]
 
 
 @wp.func
@@ -89,20 +88,6 @@ def blurred_radiance(light: EnvironmentLight, d: wp.vec3, roughness: float) -> w
 
 
 @wp.func
-def albedo_terms_at(terms: wp.array2d[wp.vec2], n_dot_v: float, roughness: float) -> wp.vec2:
-    """A and B, bilinear."""
-    y = roughness * float(terms.shape[0] - 1)
-    x = wp.sqrt(n_dot_v) * float(terms.shape[1] - 1)
-    row = wp.clamp(int(y), 0, terms.shape[0] - 2)
-    column = wp.clamp(int(x), 0, terms.shape[1] - 2)
-    fy = y - float(row)
-    fx = x - float(column)
-    top = terms[row, column] * (1.0 - fx) + terms[row, column + 1] * fx
-    bottom = terms[row + 1, column] * (1.0 - fx) + terms[row + 1, column + 1] * fx
-    return top * (1.0 - fy) + bottom * fy
-
-
-@wp.func
 def specular_occlusion(ambient_occlusion: float, n_dot_v: float, roughness: float) -> float:
     """Share of the specular lobe that is open, guessed from ambient occlusion; 1 where that is 1."""
     exponent = wp.pow(2.0, -16.0 * roughness - 1.0)
@@ -129,13 +114,12 @@ def environment_radiance(
         facing = wp.normalize(normal + (MIN_N_DOT_V - cosine) * view)
     n_dot_v = wp.clamp(cosine, MIN_N_DOT_V, 1.0)
     mirrored = 2.0 * wp.dot(facing, view) * facing - view
-    terms = albedo_terms_at(light.albedo_terms, n_dot_v, roughness)
-    specular_albedo = light.dielectric_f0 * terms[0] + terms[1]
+    reflected = specular_albedo(light.albedo_terms, n_dot_v, roughness)
     diffuse = wp.cw_mul(base_color, latlong_bilinear(light.irradiance, normal)) * (
-        (1.0 - specular_albedo) * ambient_occlusion / PI
+        (1.0 - reflected) * ambient_occlusion / PI
     )
     open_share = specular_occlusion(ambient_occlusion, n_dot_v, roughness)
-    return diffuse + blurred_radiance(light, wp.normalize(mirrored), roughness) * (specular_albedo * open_share)
+    return diffuse + blurred_radiance(light, wp.normalize(mirrored), roughness) * (reflected * open_share)
 
 
 @wp.kernel

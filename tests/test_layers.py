@@ -30,7 +30,7 @@ RANKS = {
     "beam_warp.scene": 5,
     "beam_warp.tracing": 6,
     "beam_warp.lighting": 7,
-    "beam_warp.brdf": 2,
+    "beam_warp.ggx": 2,
     "beam_warp.roughness": 5,
     "beam_warp.environment_sampling": 6,
     "beam_warp.rasterizing": 7,

@@ -1,4 +1,4 @@
-"""The main job on a small figure: everything is written, a stopped job continues to the same bytes, errors leave nothing."""
+"""The main job, small: everything is written, a stopped job continues to the same bytes, errors leave nothing."""
 
 import json
 
