@@ -149,7 +149,9 @@ class GaussianCloud:
                 require_unit(name, array)
             if np.isfinite(attribute.low) or np.isfinite(attribute.high):
                 require_range(name, array, attribute.low, attribute.high)
-            array.flags.writeable = False if array is not value else array.flags.writeable
+            if array is value:
+                array = array.view()  # protected without touching the caller's own array
+            array.flags.writeable = False
             object.__setattr__(self, name, array)
         if self.radiance is not None:
             sh_degree_of(self.radiance.shape[1])

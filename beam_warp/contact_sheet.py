@@ -22,8 +22,13 @@ BACKGROUND = 0.13
 
 MARGIN = 8
 TITLE_HEIGHT = 30
+TITLE_SIZE = 16
 WHITE_IRRADIANCE = 0.85 * np.pi
 """Relightings are exposed so that a white surface facing the light's strongest side comes to 0.85."""
+
+
+Panel = tuple[str, NDArray[np.uint8]]
+"""A title and 8-bit sRGB pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +83,18 @@ def contact_sheet(
     if cloud.radiance_color_space != DISPLAY_SRGB:
         captured = display_image(captured) / 255.0
     panels = [
-        ("captured", _over(np.clip(captured, 0.0, 1.0), alpha)),
-        ("ambient occlusion (white is open)", _over(_gray(buffer.channels["ambient_occlusion"]), alpha)),
-        ("base colour", _over(display_image(buffer.channels["base_color"]) / 255.0, alpha)),
-        ("roughness (white is 1)", _over(_gray(buffer.channels["roughness"]), alpha)),
-        ("normals (x, y, z as r, g, b)", _over(0.5 * buffer.channels["normals"] + 0.5, alpha)),
+        ("captured", over_background(np.clip(captured, 0.0, 1.0), alpha)),
+        ("ambient occlusion (white is open)", over_background(_gray(buffer.channels["ambient_occlusion"]), alpha)),
+        ("base colour", over_background(display_image(buffer.channels["base_color"]) / 255.0, alpha)),
+        ("roughness (white is 1)", over_background(_gray(buffer.channels["roughness"]), alpha)),
+        ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels["normals"] + 0.5, alpha)),
     ]
     for light in relightings:
         lighting = EnvironmentLighting.from_environment(light.environment, device=device)
         radiance = relit(buffer, lighting)
         straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
         shown = display_image(straight, display_exposure(lighting)) / 255.0
-        panels.append((light.title, _over(shown, alpha)))
+        panels.append((light.title, over_background(shown, alpha)))
     return _grid(panels)
 
 
@@ -97,11 +102,12 @@ def _gray(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
 
 
-def _over(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+def over_background(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Composite straight display colour ``(H, W, 3)`` in [0, 1] with coverage ``(H, W, 1)`` onto the background."""
     return np.rint(255.0 * (display * alpha + BACKGROUND * (1.0 - alpha))).astype(np.uint8)
 
 
-def _grid(panels: Sequence[tuple[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+def _grid(panels: Sequence[Panel]) -> NDArray[np.uint8]:
     """Lay panels out with their titles, close to 16:9 and with few empty places."""
     height, width = panels[0][1].shape[:2]
     cell = (height + TITLE_HEIGHT + MARGIN, width + MARGIN)
@@ -111,21 +117,23 @@ def _grid(panels: Sequence[tuple[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
         aspect = columns * cell[1] / (rows * cell[0])
         return abs(float(np.log(aspect * 9.0 / 16.0))) + 0.3 * (rows * columns - len(panels))
 
-    columns = min(range(1, len(panels) + 1), key=cost)
+    return lay_out(panels, min(range(1, len(panels) + 1), key=cost))
+
+
+def lay_out(panels: Sequence[Panel], columns: int) -> NDArray[np.uint8]:
+    """Return one image of panels of equal size with their titles, row by row."""
+    height, width = panels[0][1].shape[:2]
+    cell = (height + TITLE_HEIGHT + MARGIN, width + MARGIN)
     rows = -(-len(panels) // columns)
-    sheet = PillowImage.new(
-        "RGB", (columns * cell[1] + MARGIN, rows * cell[0] + MARGIN), (round(255 * BACKGROUND * 0.7),) * 3
-    )
+    shade_of_frame = round(255 * BACKGROUND * 0.7)
+    sheet = PillowImage.new("RGB", (columns * cell[1] + MARGIN, rows * cell[0] + MARGIN), (shade_of_frame,) * 3)
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=16)
     for number, (title, pixels) in enumerate(panels):
         left = MARGIN + number % columns * cell[1]
         top = MARGIN + number // columns * cell[0]
-        size = 16
-        while draw.textlength(title, font=font) > width and size > 8:
+        size = TITLE_SIZE
+        while draw.textlength(title, font=ImageFont.load_default(size=size)) > width and size > 8:
             size -= 1
-            font = ImageFont.load_default(size=size)
-        draw.text((left + 2, top + 5), title, fill=(225, 225, 225), font=font)
-        font = ImageFont.load_default(size=16)
+        draw.text((left + 2, top + 5), title, fill=(225, 225, 225), font=ImageFont.load_default(size=size))
         sheet.paste(PillowImage.fromarray(pixels), (left, top + TITLE_HEIGHT))
     return np.asarray(sheet)
