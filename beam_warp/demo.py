@@ -29,7 +29,7 @@ from beam_warp.pipeline import OverviewOptions, Progress, RunOptions, RunResult,
 from beam_warp.rasterizing import GBuffer, rasterize
 from beam_warp.spherical_harmonics import sh_basis
 
-TANGENTIAL_DEVIATION = 0.66
+TANGENTIAL_DEVIATION = 0.7
 """Of a Gaussian, in spacings: neighbours overlap so far that the surface is closed (composited alpha above 0.99)."""
 
 FLATNESS = 0.12
@@ -41,7 +41,7 @@ NORMAL_NOISE = 0.05
 POSITION_NOISE = 0.3
 """Standard deviation of its distance from the surface, in deviations across it."""
 
-OPACITY = (0.85, 0.97)
+OPACITY = (0.94, 0.99)
 SH_DEGREE = 2
 DIRECTION_COUNT = 12
 PATHS_PER_DIRECTION = 12

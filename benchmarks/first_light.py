@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import tempfile
@@ -55,7 +56,7 @@ def measure_run(path: Path, environment: EnvironmentMap, samples: int, device: s
         result = run(converters.read(path), environment, Path(folder) / "measured", options)
         total = time.perf_counter() - started
     memory = process.memory_info()
-    peak = getattr(memory, "peak_wset", None) or __import__("resource").getrusage(0).ru_maxrss * 1024
+    peak = getattr(memory, "peak_wset", None) or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     target = resolve_device(device)
     return {
         "gaussians": result.report["input"]["gaussians"],
@@ -131,12 +132,13 @@ def main() -> int:
     parser.add_argument("--device", default=None)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--points", type=int, default=20_000, help="points for the ray rate")
+    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     environment = EnvironmentMap.read(arguments.environment)
     result = {
         "benchmark": "first_light",
-        "commit": commit(),
+        "commit": arguments.commit,
         "input": arguments.input.name,
         "environment": arguments.environment.name,
         "samples": arguments.samples,
