@@ -59,7 +59,7 @@ def require_range(name: str, array: NDArray[Any], low: float, high: float, remed
 
 def require_unit(name: str, array: NDArray[Any], remedy: str = "Normalise it.") -> None:
     """Refuse rows whose length is not 1 within ``UNIT_TOLERANCE``."""
-    length = np.linalg.norm(array.astype(np.float64), axis=1)
+    length = np.sqrt(np.einsum("ij,ij->i", array, array))
     unit = np.abs(length - 1.0) <= UNIT_TOLERANCE
     if not unit.all():
         row = int(np.flatnonzero(~unit)[0])

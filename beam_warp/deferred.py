@@ -89,7 +89,7 @@ class EnvironmentLighting:
                 device=target,
             )
         light = EnvironmentLight()
-        light.irradiance = wp.array(environment.irradiance_map(), dtype=wp.vec3, device=target)
+        light.irradiance = wp.array(environment.default_irradiance, dtype=wp.vec3, device=target)
         light.texels = texels
         light.heights = wp.array(heights, dtype=int, device=target)
         light.offsets = wp.array(offsets[:-1], dtype=int, device=target)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,9 @@ from beam_warp.images import MAX_SIDE, read_image
 
 MIN_HEIGHT = 4
 """Fewest rows of a map: below, a texel spans more than an octant."""
+
+DEFAULT_IRRADIANCE_SIZE = (64, 128)
+"""Rows and columns at which bilinear lookup of irradiance errs by 3e-4."""
 
 IRRADIANCE_ROWS = 512
 """Rows of the grid behind `EnvironmentMap.irradiance_map`. Texels that straddle the horizon lose at most the fraction
@@ -116,8 +120,12 @@ class EnvironmentMap:
 
     def scaled(self, factor: float) -> EnvironmentMap:
         """Return the light times a factor of at least 0."""
+        gain = np.float32(require_number("factor", factor, 0.0, 3e38))
         with np.errstate(over="ignore"):  # infinity is refused by the record, in words
-            return EnvironmentMap(self.radiance * np.float32(require_number("factor", factor, 0.0, 3e38)))
+            result = EnvironmentMap(self.radiance * gain)
+        if "default_irradiance" in self.__dict__:
+            result.__dict__["default_irradiance"] = self.default_irradiance * gain
+        return result
 
     def exposed(self, stops: float) -> EnvironmentMap:
         """Return the light times 2^stops."""
@@ -132,7 +140,11 @@ class EnvironmentMap:
         columns = require_number("degrees", degrees, -3.6e6, 3.6e6) / 360.0 * self.width
         whole = round(columns)
         if abs(columns - whole) <= 1e-9 * self.width:  # the angle itself carries rounding
-            return EnvironmentMap(np.roll(self.radiance, -whole, axis=1))
+            result = EnvironmentMap(np.roll(self.radiance, -whole, axis=1))
+            steps = whole * DEFAULT_IRRADIANCE_SIZE[1] / self.width
+            if "default_irradiance" in self.__dict__ and steps == int(steps):
+                result.__dict__["default_irradiance"] = np.roll(self.default_irradiance, -int(steps), axis=1)
+            return result
         whole = int(np.floor(columns))
         part = np.float32(columns - whole)
         near, far = np.roll(self.radiance, -whole, axis=1), np.roll(self.radiance, -whole - 1, axis=1)
@@ -147,6 +159,11 @@ class EnvironmentMap:
         by_rows = rows @ self.radiance.reshape(self.height, -1).astype(np.float64)
         by_columns = columns @ by_rows.reshape(height, self.width, 3).transpose(1, 0, 2).reshape(self.width, -1)
         return EnvironmentMap(by_columns.reshape(width, height, 3).transpose(1, 0, 2).astype(np.float32))
+
+    @cached_property
+    def default_irradiance(self) -> NDArray[np.float32]:
+        """`irradiance_map` of the default size, computed once; scaling and turning by whole columns carry it along."""
+        return self.irradiance_map(*DEFAULT_IRRADIANCE_SIZE)
 
     def irradiance_map(self, height: int = 64, width: int = 128) -> NDArray[np.float32]:
         """Return the irradiance E(n) = ∫ L(ω) max(0, n·ω) dω of every normal n of a lat-long grid.
@@ -176,10 +193,14 @@ class EnvironmentMap:
         # azimuth from a normal's column to each source column; the first normal lies (stride - 1) / 2 columns in
         cosine = np.cos((np.arange(columns) - (stride - 1) / 2.0) * (2.0 * np.pi / columns))
         result = np.empty((height, width, 3), np.float32)
-        for row, polar in enumerate((np.arange(height) + 0.5) * (np.pi / height)):
+        for row in range((height + 1) // 2):
+            polar = (row + 0.5) * (np.pi / height)
             kernel = np.maximum(np.sin(polar) * sideways[:, None] * cosine + np.cos(polar) * upward[:, None], 0.0)
-            product = np.matmul(np.fft.rfft(kernel, axis=1).conj().T[:, None, :], spectrum)[:, 0]
-            result[row] = np.fft.irfft(product, columns, axis=0)[::stride]
+            weights = np.fft.rfft(kernel, axis=1).conj().T[:, None, :]
+            # A normal mirrored at the equator weighs the mirrored rows alike: one transform serves both.
+            for place, mirrored in ((row, weights), (height - 1 - row, weights[:, :, ::-1])):
+                product = np.matmul(mirrored, spectrum)[:, 0]
+                result[place] = np.fft.irfft(product, columns, axis=0)[::stride]
         return np.maximum(result, 0.0)  # a dark hemisphere is zero up to the rounding of the FFT
 
 

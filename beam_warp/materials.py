@@ -106,10 +106,9 @@ class PreparedLight:
     @classmethod
     def from_environment(cls, environment: EnvironmentMap, device: Any) -> PreparedLight:
         """Accumulate what sampling and the ratio estimator need."""
-        irradiance = environment.irradiance_map()
         return cls(
             environment_blocks(environment, device),
-            upload(irradiance.astype(np.float32), wp.vec3, device),
+            upload(environment.default_irradiance, wp.vec3, device),
             float(np.pi * environment.mean_radiance().mean()),
         )
 

@@ -94,7 +94,7 @@ def run_child(module: str, path: Path, seconds: float) -> dict[str, object]:
     Raises:
         AssetFormatError: The child crashed or took too long: the file is not fit to be opened here.
     """
-    command = [sys.executable, "-m", module, str(path)]
+    command = [sys.executable, "-P", "-m", module, str(path)]  # a checkout in the working folder is not the package
     # The child finds this very package even where it was imported from a path that only this process knows.
     places = [place for place in sys.path if place]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}

@@ -8,11 +8,9 @@ import pytest
 
 
 def _devices() -> list[str]:
-    import warp as wp
+    from beam_warp.devices import resolve_device
 
-    wp.config.quiet = True
-    wp.init()
-    return ["cpu", *(["cuda:0"] if wp.is_cuda_available() else [])]
+    return ["cpu", *(["cuda:0"] if resolve_device().is_cuda else [])]
 
 
 def pytest_generate_tests(metafunc):
