@@ -44,16 +44,16 @@ def commit() -> str:
     return found.stdout.strip() or "unknown"
 
 
-def measure_run(path: Path, environment: EnvironmentMap, samples: int, device: str | None) -> dict:
+def measure_run(path: Path, light: Path, samples: int, device: str | None) -> dict:
     options = RunOptions(materials=MaterialOptions(sample_count=samples), device=device)
     process = psutil.Process()
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
-        run(converters.read(path), environment, Path(folder) / "warm", options)
+        run(converters.read(path), EnvironmentMap.read(light), Path(folder) / "warm", options)
         warm_up = time.perf_counter() - started
         before = process.memory_info().rss
         started = time.perf_counter()
-        result = run(converters.read(path), environment, Path(folder) / "measured", options)
+        result = run(converters.read(path), EnvironmentMap.read(light), Path(folder) / "measured", options)
         total = time.perf_counter() - started
     memory = process.memory_info()
     peak = getattr(memory, "peak_wset", None) or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -135,14 +135,13 @@ def main() -> int:
     parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    environment = EnvironmentMap.read(arguments.environment)
     result = {
         "benchmark": "first_light",
         "commit": arguments.commit,
         "input": arguments.input.name,
         "environment": arguments.environment.name,
         "samples": arguments.samples,
-        "run": measure_run(arguments.input, environment, arguments.samples, arguments.device),
+        "run": measure_run(arguments.input, arguments.environment, arguments.samples, arguments.device),
         "rays": measure_rays(arguments.input, arguments.samples, arguments.device, arguments.points),
     }
     text = json.dumps(result, indent=2) + "\n"

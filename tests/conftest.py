@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+# Programs that tests start must not take the checkout in the working folder for the installed package.
+os.environ.setdefault("PYTHONSAFEPATH", "1")
+
 
 def _devices() -> list[str]:
     from beam_warp.devices import resolve_device
