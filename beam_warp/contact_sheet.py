@@ -12,10 +12,10 @@ from PIL import ImageDraw, ImageFont
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
 from beam_warp.cameras import Camera
-from beam_warp.deferred import EnvironmentLighting, shade
+from beam_warp.deferred import EnvironmentLighting, relight
 from beam_warp.environments import EnvironmentMap
 from beam_warp.images import display_image
-from beam_warp.rasterizing import GBuffer, rasterize
+from beam_warp.rasterizing import rasterize
 
 BACKGROUND = 0.13
 """Display grey behind the subject: dark subjects stay visible, and white ones too."""
@@ -37,19 +37,6 @@ class Relighting:
 
     title: str
     environment: EnvironmentMap
-
-
-def relit(buffer: GBuffer, lighting: EnvironmentLighting) -> NDArray[np.float32]:
-    """Return a G-buffer's radiance under a light, ``(H, W, 3)`` scene-linear, premultiplied."""
-    return shade(
-        base_color=buffer.channels["base_color"],
-        roughness=buffer.channels["roughness"],
-        ambient_occlusion=buffer.channels["ambient_occlusion"],
-        normals=buffer.channels["normals"],
-        alpha=buffer.alpha,
-        view_directions=buffer.camera.directions(),
-        lighting=lighting,
-    )
 
 
 def display_exposure(lighting: EnvironmentLighting) -> float:
@@ -91,7 +78,7 @@ def contact_sheet(
     ]
     for light in relightings:
         lighting = EnvironmentLighting.from_environment(light.environment, device=device)
-        radiance = relit(buffer, lighting)
+        radiance = relight(buffer, lighting)
         straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
         shown = display_image(straight, display_exposure(lighting)) / 255.0
         panels.append((light.title, over_background(shown, alpha)))

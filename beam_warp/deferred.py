@@ -30,6 +30,7 @@ from beam_warp.environments import EnvironmentMap, texel_directions
 from beam_warp.ggx import specular_albedo_table
 from beam_warp.kernels.prefilter import FluxTree, launch_prefilter_environment
 from beam_warp.kernels.shading import EnvironmentLight, ShadedSurfaces, launch_shade_environment
+from beam_warp.rasterizing import GBuffer
 
 FIRST_ROUGHNESS = 0.125
 """Roughness of the sharpest blurred level: its lobe, 0.03 rad wide, is the narrowest that a 256-row level resolves."""
@@ -163,6 +164,23 @@ def shade(
     out = wp.empty(opacity.size, dtype=wp.vec3, device=lighting.device)
     launch_shade_environment(lighting.light, surfaces, out_radiance=out, device=lighting.device)
     return out.numpy().reshape(*size, 3)
+
+
+def relight(buffer: GBuffer, lighting: EnvironmentLighting) -> NDArray[np.float32]:
+    """Light a G-buffer with the channels of `rasterizing.MATERIAL_CHANNELS`; see `shade`.
+
+    Returns:
+        Scene-linear radiance multiplied by alpha, ``(H, W, 3)`` float32.
+    """
+    return shade(
+        base_color=buffer.channels["base_color"],
+        roughness=buffer.channels["roughness"],
+        ambient_occlusion=buffer.channels["ambient_occlusion"],
+        normals=buffer.channels["normals"],
+        alpha=buffer.alpha,
+        view_directions=buffer.camera.directions(),
+        lighting=lighting,
+    )
 
 
 def _level_rows(roughness: float) -> int:

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
-from beam_warp.contact_sheet import Panel, Relighting, display_exposure, lay_out, over_background, relit
-from beam_warp.deferred import EnvironmentLighting
+from beam_warp.contact_sheet import Panel, Relighting, display_exposure, lay_out, over_background
+from beam_warp.deferred import EnvironmentLighting, relight
 from beam_warp.demo_environments import demo_environments
 from beam_warp.demo_figure import build_figure
 from beam_warp.environments import EnvironmentMap
@@ -186,10 +186,10 @@ def _capture(
     )
     return GaussianCloud(
         positions=points + normals * (samples.lift * FLATNESS * sigma)[:, None],
-        orientations=_quaternions(axes),
+        orientations=_quaternions(axes).astype(np.float32),
         scales=np.tile([sigma, sigma, FLATNESS * sigma], (count, 1)),
-        opacities=samples.opacities,
-        radiance=_fit_harmonics(linear_to_srgb(np.clip(radiance, 0.0, 1.0)), -outward),
+        opacities=samples.opacities.astype(np.float32),
+        radiance=_fit_harmonics(linear_to_srgb(np.clip(radiance, 0.0, 1.0)), -outward).astype(np.float32),
         radiance_color_space=DISPLAY_SRGB,
         ids=np.arange(count),
     )
@@ -279,7 +279,7 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress =
     lightings = {
         name: EnvironmentLighting.from_environment(light, device=options.device) for name, light in scene.lights.items()
     }
-    relightings = [{name: relit(buffer, lighting) for name, lighting in lightings.items()} for buffer in buffers]
+    relightings = [{name: relight(buffer, lighting) for name, lighting in lightings.items()} for buffer in buffers]
     result.report["scores"] = score_demo(scene.truth, buffers, relightings)
     result.report["seconds"]["build demo"] = built
     result.report["seconds"]["total"] = time.perf_counter() - started

@@ -50,7 +50,7 @@ def _lit(background: NDArray[np.float64], boxes: tuple[SoftBox, ...], softness: 
         edge = np.clip(0.5 - np.stack([x, y], axis=-1) / softness, 0.0, 1.0)
         inside = (edge * edge * (3.0 - 2.0 * edge)).prod(axis=-1) * (depth > 0.0)
         radiance += inside[..., None] * np.asarray(box.color)
-    light = EnvironmentMap(radiance)
+    light = EnvironmentMap(radiance.astype(np.float32))
     return light.scaled(BRIGHTEST_WHITE * np.pi / float(light.irradiance_map(32, 64).max()))
 
 
@@ -63,7 +63,9 @@ def _gradient(stops: tuple[tuple[float, tuple[float, float, float]], ...]) -> ND
 
 def studio() -> EnvironmentMap:
     """A photo studio: a large warm key to the figure's left front, a cool fill, two rim lights, a grey room."""
-    room = _gradient(((-90, (0.16, 0.15, 0.14)), (-5, (0.22, 0.21, 0.21)), (40, (0.34, 0.35, 0.37)), (90, (0.55,) * 3)))
+    room = _gradient(
+        ((-90, (0.16, 0.15, 0.14)), (-5, (0.22, 0.21, 0.21)), (40, (0.34, 0.35, 0.37)), (90, (0.55, 0.55, 0.55)))
+    )
     return _lit(
         room,
         (

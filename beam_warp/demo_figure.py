@@ -148,7 +148,11 @@ def build_figure(spacing: float = 0.011) -> Figure:
     points = _onto_surface(vertices + LOWER)
     color, roughness = paint(points)
     rest = MaterialMesh(
-        vertices=points, faces=faces, normals=vertex_normals(points, faces), base_color=color, roughness=roughness
+        vertices=points.astype(np.float32),
+        faces=faces,
+        normals=vertex_normals(points, faces).astype(np.float32),
+        base_color=color.astype(np.float32),
+        roughness=roughness.astype(np.float32),
     )
     return Figure(rest, _bone_weights(points, faces, step))
 

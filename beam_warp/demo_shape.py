@@ -7,9 +7,10 @@ real cavities to get lost in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -277,7 +278,7 @@ FAR = 1.0
 """Distance that stands for outside a part's neighbourhood [m]."""
 
 
-def rest_field(low: Sequence[float], counts: Sequence[int], spacing: float) -> FloatArray:
+def rest_field(low: FloatArray, counts: NDArray[np.integer[Any]], spacing: float) -> FloatArray:
     """Sample the figure's signed distance on a grid, each part only near itself.
 
     Args:
@@ -289,7 +290,7 @@ def rest_field(low: Sequence[float], counts: Sequence[int], spacing: float) -> F
         ``counts`` float64: negative inside; near the surface a distance, elsewhere only its sign counts.
     """
     field = np.full(tuple(counts), FAR)
-    axes = [low[axis] + spacing * np.arange(counts[axis]) for axis in range(3)]
+    axes = [float(low[axis]) + spacing * np.arange(int(counts[axis]), dtype=np.float64) for axis in range(3)]
     for part in PARTS:
         reach = part.blend + 2.0 * spacing
         spans = [

@@ -47,7 +47,7 @@ def ssim(image: ArrayLike, truth: ArrayLike) -> float:
     """Return the structural similarity of two images ``(H, W)`` or ``(H, W, 3)`` in [0, 1] (Wang et al. 2004)."""
     a, b = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     return float(
-        structural_similarity(
+        structural_similarity(  # type: ignore[arg-type]  # it returns one number unless asked for more
             a,
             b,
             data_range=1.0,

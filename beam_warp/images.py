@@ -1,7 +1,8 @@
 """Image files and the one home of the sRGB transfer: OpenEXR, Radiance HDR, PNG and JPEG.
 
 A file's values are never re-interpreted in silence: an `Image` says whether it is scene-linear or display-referred and
-whether its colour is multiplied by alpha.
+whether its colour is multiplied by alpha. OpenEXR and Pillow are imported where a file is read or written: whoever
+only encodes a colour, such as a PLY converter, does not wait for them.
 """
 
 from __future__ import annotations
@@ -14,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image as PillowImage
 
 from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.checks import require_array, require_choice, require_finite, require_number
@@ -195,6 +194,8 @@ def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[n
 
 
 def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
+    import OpenEXR
+
     try:
         lead = OpenEXR.File(str(path), header_only=True)
         header = lead.header()
@@ -238,6 +239,8 @@ _PILLOW_CHANNELS = {"L": ("Y",), "LA": ("Y", "A"), "RGB": ("R", "G", "B"), "RGBA
 
 
 def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
+    from PIL import Image as PillowImage
+
     try:
         with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
             _require_size(path, *picture.size)
@@ -297,6 +300,8 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *
         InvalidArrayError: No channels, shapes that differ, or a value too large for a half.
         OutputError: The file cannot be written.
     """
+    import OpenEXR
+
     path = Path(path)
     if not channels:
         raise InvalidArrayError("channels must hold at least one channel, got none. Pass name → (H, W) arrays.")
@@ -330,6 +335,8 @@ def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
         InvalidArrayError: Another type or shape.
         OutputError: The file cannot be written.
     """
+    from PIL import Image as PillowImage
+
     path = Path(path)
     array = np.asarray(pixels)
     if (

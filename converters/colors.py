@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
 from beam_warp.converters.activations import color_from_dc, dc_from_color
+from beam_warp.images import linear_to_srgb
 
 CAPTURED = "captured"
 BASE_COLOR_ONLY = "baseColorOnly"
@@ -15,14 +16,8 @@ NO_COLOR = "none"
 _TOE, _TOE_SLOPE = 0.0031308, 12.92
 
 
-def srgb_encode(linear: ArrayLike) -> NDArray[np.float64]:
-    """Return the display code of linear light, clamped at 0 below and free above. Source: IEC 61966-2-1."""
-    value = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
-    return np.where(value <= _TOE, _TOE_SLOPE * value, 1.055 * np.maximum(value, _TOE) ** (1.0 / 2.4) - 0.055)
-
-
 def srgb_slope(linear: ArrayLike) -> NDArray[np.float64]:
-    """Return the derivative of `srgb_encode`; on the toe, and below 0, the toe's slope."""
+    """Return the derivative of `linear_to_srgb`; on the toe, and below 0, the toe's slope."""
     value = np.asarray(linear, dtype=np.float64)
     return np.where(value <= _TOE, _TOE_SLOPE, 1.055 / 2.4 * np.maximum(value, _TOE) ** (1.0 / 2.4 - 1.0))
 
@@ -39,12 +34,12 @@ def display_radiance(cloud: GaussianCloud) -> tuple[NDArray[np.float32], str]:
             return cloud.radiance, CAPTURED
         mean = color_from_dc(cloud.radiance[:, :1])
         encoded = srgb_slope(mean) * cloud.radiance
-        encoded[:, :1] = dc_from_color(srgb_encode(mean))
+        encoded[:, :1] = dc_from_color(linear_to_srgb(np.maximum(mean, 0.0)))
         return encoded.astype(np.float32), CAPTURED
     if cloud.base_color is None:
         return np.zeros((len(cloud), 1, 3), np.float32), NO_COLOR
     shade = 1.0 if cloud.ambient_occlusion is None else cloud.ambient_occlusion[:, None].astype(np.float64)
-    return dc_from_color(srgb_encode(cloud.base_color * shade))[:, None], BASE_COLOR_ONLY
+    return dc_from_color(linear_to_srgb(cloud.base_color * shade))[:, None], BASE_COLOR_ONLY
 
 
 def resize_bands(radiance: NDArray[np.float32], degree: int | None) -> NDArray[np.float32]:

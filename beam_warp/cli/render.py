@@ -267,19 +267,11 @@ def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianClou
 
 def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting) -> None:
     """Draw one image and write it."""
-    from beam_warp.deferred import shade
+    from beam_warp.deferred import relight
     from beam_warp.rasterizing import rasterize
 
     buffer = rasterize(cloud, view.camera, device=args.device, antialiased=args.antialiased)
-    radiance = shade(
-        base_color=buffer.channels["base_color"],
-        roughness=buffer.channels["roughness"],
-        ambient_occlusion=buffer.channels["ambient_occlusion"],
-        normals=buffer.channels["normals"],
-        alpha=buffer.alpha,
-        view_directions=view.camera.directions(),
-        lighting=lighting,
-    )
+    radiance = relight(buffer, lighting)
     alpha = buffer.alpha
     if args.background != "transparent":
         behind = srgb_to_linear(np.asarray(args.background, np.float32))

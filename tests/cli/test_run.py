@@ -1,0 +1,138 @@
+"""`beam` as a user meets it: a run end to end, and one clear line for everything that can be wrong with the input."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from shapes import cloud_of, sphere_points, tiles
+
+from beam_warp import GaussianSequence, write
+from beam_warp.assets import DISPLAY_SRGB
+from beam_warp.cli.main import main
+from beam_warp.images import write_exr
+
+
+@pytest.fixture
+def ball(tmp_path):
+    points, spacing = sphere_points(300)
+    cloud = cloud_of(
+        tiles(points, points, spacing), radiance=np.full((300, 1, 3), 0.4), radiance_color_space=DISPLAY_SRGB
+    )
+    write(GaussianSequence.from_clouds([cloud]), tmp_path / "ball.ply")
+    return tmp_path / "ball.ply"
+
+
+def environment(path, radiance):
+    write_exr(path, {name: radiance[..., index] for index, name in enumerate("RGB")})
+    return path
+
+
+@pytest.fixture
+def sky(tmp_path):
+    return environment(tmp_path / "sky.exr", np.ones((32, 64, 3), np.float32))
+
+
+def beam(*words):
+    return main([str(word) for word in words])
+
+
+def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert beam("run", ball, "--environment", sky, "--out", out, "--samples", 8, "--device", "cpu", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["input"]["gaussians"] == 300
+    assert report["materials"]["flags"]["FILLED"] < 30
+    for name in ("asset.usda", "report.json", "overview.png"):
+        assert (out / name).is_file()
+    shown = tmp_path / "shown.png"
+    assert beam("render", out / "asset.usda", "--environment", sky, "--out", shown, "--width", 32, "--quiet") == 0
+    assert shown.is_file()
+    from beam_warp.cli.validate import main as validate
+
+    assert validate([str(out / "asset.usda"), "--quiet"]) == 0
+
+
+def test_text_names_what_was_written(ball, sky, tmp_path, capsys):
+    assert beam("run", ball, "--environment", sky, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu") == 0
+    said = capsys.readouterr()
+    assert "asset.usda: 1 frame, 300 Gaussians" in said.out
+    assert "overview.png" in said.out
+    assert "note: axes" in said.err or "note" not in said.err
+
+
+class TestMistakes:
+    @pytest.fixture
+    def mistake(self, capsys, tmp_path):
+        def check(*words, says):
+            out = tmp_path / "out"
+            assert beam("run", *words, "--out", out) == 2
+            said = capsys.readouterr()
+            assert said.out == ""
+            (line,) = said.err.strip().splitlines()
+            assert line.startswith("error: ")
+            assert says in line
+            assert not out.exists()
+
+        return check
+
+    def test_missing_input(self, mistake, sky, tmp_path):
+        mistake(tmp_path / "none.ply", "--environment", sky, says="input must be an existing file or folder, got")
+
+    def test_input_that_is_no_splat(self, mistake, sky, tmp_path):
+        (tmp_path / "text.ply").write_text("hello")
+        mistake(tmp_path / "text.ply", "--environment", sky, says="text.ply")
+
+    def test_missing_environment(self, mistake, ball, tmp_path):
+        mistake(ball, "--environment", tmp_path / "none.exr", says="must be a readable file, got")
+
+    def test_environment_that_is_not_two_to_one(self, mistake, ball, tmp_path):
+        path = environment(tmp_path / "square.exr", np.ones((32, 32, 3), np.float32))
+        mistake(ball, "--environment", path, says="twice as wide as high")
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+    def test_environment_with_a_bad_texel(self, mistake, ball, tmp_path, value):
+        radiance = np.ones((32, 64, 3), np.float32)
+        radiance[3, 5, 1] = value
+        path = environment(tmp_path / "bad.exr", radiance)
+        mistake(ball, "--environment", path, says="at row 3, column 5 (1 texels in all)")
+
+    def test_texture_without_its_mesh(self, mistake, ball, sky, tmp_path):
+        mistake(ball, "--environment", sky, "--roughness", tmp_path / "r.png", says="roughness-mesh must be given")
+
+    @pytest.mark.parametrize(
+        ("option", "says"),
+        [(("--samples", 0), "sample_count must be"), (("--fps", 0), "frames_per_second must be")],
+    )
+    def test_numbers_out_of_range(self, mistake, ball, sky, option, says):
+        mistake(ball, "--environment", sky, *option, says=says)
+
+
+def test_output_folder_that_cannot_be_made(ball, sky, tmp_path, capsys):
+    words = ("run", ball, "--environment", sky, "--out", tmp_path / "missing" / "out", "--device", "cpu")
+    assert beam(*words) == 2
+    assert "error: out must be a folder that can be made" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["render", "--help"], ["demo", "--help"]])
+def test_help_has_an_example(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 0
+    assert "Example: beam" in " ".join(capsys.readouterr().out.split())
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("beam 0.")
+
+
+def test_mistakes_are_found_before_warp_is_loaded(tmp_path):
+    script = (
+        "import sys\nfrom beam_warp.cli.main import main\n"
+        f"code = main(['run', {str(tmp_path / 'none.ply')!r}, '--environment', 'x.exr', '--out', 'y'])\n"
+        "assert code == 2\nassert not {'warp', 'pxr'} & set(sys.modules), sorted(sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
