@@ -31,7 +31,7 @@ types: install
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 unit: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -P -m pytest  # -P: the checkout in the working folder is not the installed package
 
 clean:
 	rm -rf $(VENV) build demo *.egg-info
