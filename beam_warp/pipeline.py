@@ -154,7 +154,9 @@ def run(
     Source: BEAM §3.2, by the direct path (see `beam_warp.materials`).
     """
     started = time.perf_counter()
-    job = _Job(sequence, environment, _make_folders(out), options or RunOptions())
+    chosen = options or RunOptions()
+    resolve_device(chosen.device)  # before a folder is made that would then stay empty
+    job = _Job(sequence, environment, _make_folders(out), chosen)
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
