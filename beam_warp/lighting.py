@@ -18,7 +18,11 @@ from beam_warp.kernels.ambient_occlusion import (
 from beam_warp.scene import Scene
 
 LIFT_IN_THICKNESSES = 4.0
-"""How far ``offset="auto"`` lifts ray origins off the local surface, in standard deviations of its thickness."""
+"""How far ``offset="auto"`` lifts ray origins off the local surface, in standard deviations of its thickness.
+
+On tiled planes, spheres and bowls with and without noise in tilt and height, 3 still shades itself by up to 0.012 and 5
+opens bowls of round Gaussians by another 0.007; 4 is the compromise.
+"""
 
 RAYS_AT_ONCE = 1 << 22
 """Rays whose results are held at a time: 16 MiB."""

@@ -19,6 +19,22 @@ from beam_warp.kernels.trace import transmittance
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def extent_along(gaussians: Gaussians, index: int, n: wp.vec3) -> float:
+    """n^T Sigma n: variance of the whole Gaussian along n; row k of the whitening is axis k over scale k."""
+    total = float(0.0)
+    for k in range(3):
+        row = gaussians.whitening_0[index]
+        if k == 1:
+            row = gaussians.whitening_1[index]
+        if k == 2:
+            row = gaussians.whitening_2[index]
+        axis = wp.vec3(row[0], row[1], row[2])
+        along = wp.dot(axis, n) / wp.dot(axis, axis)
+        total += along * along
+    return total
+
+
 @wp.kernel
 def local_surface_kernel(
     first: int,
@@ -29,11 +45,12 @@ def local_surface_kernel(
     normals: wp.array[wp.vec3],
     out_surface: wp.array[wp.vec2],
 ):
-    """(height, thickness) of the opacity along the normal's line: mean and standard deviation of the local mixture.
+    """(height, thickness) of the layer of Gaussians around a point, along its normal.
 
     On the line point + h n a Gaussian's response is again a Gaussian in h. Those that contain the point, weighted by
-    their peak alpha on the line, make a mixture; its mean is where the surface is seen from the normal's side, its
-    deviation how thick the layer is.
+    their peak alpha on the line, give the height at which the surface is seen there. Thickness joins two variances: of
+    each Gaussian along the normal as a whole, so that a tilted flat one counts with the height of its edges, and of
+    the heights among each other.
     """
     i = first + wp.tid()
     p = points[i] - scene_origin
@@ -57,7 +74,7 @@ def local_surface_kernel(
             weight = packed[3] * wp.exp(-0.5 * wp.dot(closest, closest))
             total += weight
             mean += weight * height
-            within += weight / dd
+            within += weight * extent_along(gaussians, index, n)
             count += packed[3]
             first_moment += packed[3] * height
             second_moment += packed[3] * height * height

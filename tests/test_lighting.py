@@ -91,6 +91,14 @@ class TestOffset:
         result = ambient_occlusion(scene, moved, np.tile(UP, (len(moved), 1)))
         assert result.visibility.mean() > 0.99
 
+    def test_tilted_neighbours_do_not_shade(self, device, rng):
+        """Edges of flat Gaussians stick up where their axes are noisy: here by 9 degrees per axis."""
+        points, spacing = sphere_points(8000)
+        tilted = points + 0.15 * rng.normal(size=points.shape)
+        tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+        scene = Scene.from_gaussians(cloud_of(tiles(points, tilted, spacing, opacity=0.9)), device)
+        assert ambient_occlusion(scene, points, points).visibility.mean() > 0.99
+
 
 class TestErrors:
     @pytest.mark.parametrize("sample_count", [64, 50])
