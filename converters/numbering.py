@@ -62,12 +62,13 @@ def require_no_stale_frames(path: Path, frame_count: int) -> None:
     Raises:
         OutputError: There are such frames.
     """
+    written = re.compile(
+        rf"{re.escape(path.stem)}(\d{{{DIGITS},}}){re.escape(path.suffix)}"
+    )  # a stem may end in digits
     stale = [
         other.name
         for other in path.parent.iterdir()
-        if (match := _NUMBERED.fullmatch(other.name))
-        and match["prefix"] == path.stem
-        and int(match["number"]) >= frame_count
+        if (match := written.fullmatch(other.name)) and int(match[1]) >= frame_count
     ]
     if stale:
         raise OutputError(

@@ -93,14 +93,15 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
     """
     statements = _Statements.of(header)
     notes: list[str] = []
-    if compressed_ply.is_compressed(header):
-        fields = compressed_ply.decode(header)
-    else:
-        fields = _decode(header, options, statements, notes)
     units = statements.meters_per_unit if options.meters_per_unit is None else options.meters_per_unit
-    if units != 1.0:
-        for name in ("positions", "scales"):
-            fields[name] = fields[name] * units
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is infinite or NaN, which a cloud refuses
+        if compressed_ply.is_compressed(header):
+            fields = compressed_ply.decode(header)
+        else:
+            fields = _decode(header, options, statements, notes)
+        if units != 1.0:
+            for name in ("positions", "scales"):
+                fields[name] = fields[name] * units
     axes = options.source_axes or statements.axes
     if axes is None:
         axes = DEFAULT_AXES

@@ -129,7 +129,7 @@ def convert(command: ConvertCommand) -> int:
         if is_ply:
             files = f"{paths[0]}" + (f" … {paths[-1].name}" if len(paths) > 1 else "")
         else:
-            files = f"{command.output}" + (f" and {len(paths) - 1} layers beside it" if len(paths) > 1 else "")
+            files = f"{command.output}" + (f" and {len(paths) - 1} more beside it" if len(paths) > 1 else "")
         frames = f"{len(sequence)} frames, " if len(sequence) > 1 else ""
         print(f"wrote {files}: {frames}{len(first):,} Gaussians, {seconds:.2f} s")
     return 0

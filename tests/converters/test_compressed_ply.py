@@ -207,6 +207,8 @@ ROW = (0, IDENTITY, 0, 0)
         (packed_ply([CHUNK], [ROW]).replace(b"uint packed_color", b"int packed_color"), "packed_color must be uint"),
         (packed_ply([CHUNK], [ROW]).replace(b"packed_scale", b"packed_size"), "must have packed_scale, got packed_pos"),
         (packed_ply([[math.nan, *CHUNK[1:]]], [ROW]), "positions must be finite, got NaN or infinity at row 0"),
+        (packed_ply([[*CHUNK[:12], *[3e38] * 6]], [ROW]), "radiance must be finite, got NaN or infinity at row 0"),
+        (packed_ply([[-math.inf, *CHUNK[1:]]], [ROW]), "positions must be finite, got NaN or infinity at row 0"),
         (packed_ply([[*CHUNK[:6], -400.0, *CHUNK[7:]]], [ROW]), "natural logs in [-30, 20], got -400 at row 0"),
     ],
 )
