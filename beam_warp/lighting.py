@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,8 +25,11 @@ On tiled planes, spheres and bowls with and without noise in tilt and height, 3 
 opens bowls of round Gaussians by another 0.007; 4 is the compromise.
 """
 
-RAYS_AT_ONCE = 1 << 22
-"""Rays whose results are held at a time: 16 MiB."""
+RAYS_AT_ONCE = 1 << 20
+"""Rays whose results are held at a time, 4 MiB, and after which progress is reported."""
+
+Progress = Callable[[int, int], None]
+"""Called with (points done, points in all)."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,7 @@ def ambient_occlusion(
     offset: float | Literal["auto"] = "auto",
     seed: int = 0,
     frame: int = 0,
+    progress: Progress | None = None,
 ) -> AmbientOcclusion:
     """Estimate how open the hemisphere above each surface point is.
 
@@ -90,6 +95,7 @@ def ambient_occlusion(
             off it by `LIFT_IN_THICKNESSES` times its thickness. The paper's absolute value is 0.02.
         seed: Same seed, same device, same bits.
         frame: Number of the frame; frames have independent noise, the same frame always the same.
+        progress: Called now and then with (points done, points in all).
 
     Returns:
         Visibility and its standard error; NumPy, or warp arrays if one came in.
@@ -133,4 +139,6 @@ def ambient_occlusion(
                 scene.device,
             )
             launch_reduce_visibility(samples, count, bits[0] >= 0, mean[part], error[part], scene.device)
+            if progress is not None:
+                progress(part.stop, len(at))
     return AmbientOcclusion(download_like(mean, points, normals), download_like(error, points, normals))

@@ -34,7 +34,7 @@ from beam_warp.kernels.residues import (
     launch_trace_bounce,
     launch_trace_light,
 )
-from beam_warp.lighting import ambient_occlusion, ray_offsets, stratum_bits
+from beam_warp.lighting import Progress, ambient_occlusion, ray_offsets, stratum_bits
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfaceNormals
@@ -197,6 +197,7 @@ def measure_materials(
     options: MaterialOptions,
     frame: int = 0,
     rows: NDArray[np.integer[Any]] | None = None,
+    progress: Progress | None = None,
 ) -> MaterialMeasurement:
     """Trace one frame and accumulate its evidence on base colour.
 
@@ -210,6 +211,7 @@ def measure_materials(
         frame: Number of the frame. Light rays differ from frame to frame, so that fits over frames average their
             noise; occlusion rays do not, so that ambient occlusion does not flicker.
         rows: Gaussians to measure; all of them if None.
+        progress: Called now and then with (Gaussians done, Gaussians in all).
 
     Raises:
         InvalidArrayError: The cloud has no captured radiance.
@@ -230,6 +232,8 @@ def measure_materials(
         sample_count=options.sample_count,
         offset=options.offset,
         seed=options.seed,
+        # Occlusion and light are about as much work, so each is half of the way.
+        progress=None if progress is None else lambda done, total: progress(done // 2, total),
     )
     results = {
         name: np.zeros((count, *shape), np.float32)
@@ -302,6 +306,8 @@ def measure_materials(
         for name in ("numerator", "denominator", "observed"):
             results[name][here] = getattr(fit, name).numpy()
         results["noise"][here] = fit.relative_error.numpy() ** 2
+        if progress is not None:
+            progress(count - (len(seen) - min(start + step, len(seen))) // 2, count)
     evidence = ColorEvidence.from_arrays({"openness": occlusion.visibility, **results})
     return MaterialMeasurement(occlusion.visibility, occlusion.standard_error, evidence)
 

@@ -156,7 +156,7 @@ def run(
     started = time.perf_counter()
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
-    job = _Job(sequence, environment, _make_folders(out), chosen)
+    job = _Job(sequence, environment, _make_folders(out), chosen, progress)
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
@@ -247,7 +247,12 @@ class _Frame:
     def surface(self) -> SurfaceNormals:
         scene = self.scene
         with self._job.timer("normals"):
-            return estimate_normals(self.cloud, scene, seed=self._job.options.materials.seed)
+            return estimate_normals(
+                self.cloud,
+                scene,
+                seed=self._job.options.materials.seed,
+                progress=self._job.within("normals", self.number),
+            )
 
     @cached_property
     def roughness(self) -> NDArray[np.float32]:
@@ -261,8 +266,14 @@ class _Job:
     """One call of `run`: what it was given, where its store is, and what it has found out so far."""
 
     def __init__(
-        self, sequence: GaussianSequence, environment: EnvironmentMap, folder: Path, options: RunOptions
+        self,
+        sequence: GaussianSequence,
+        environment: EnvironmentMap,
+        folder: Path,
+        options: RunOptions,
+        progress: Progress,
     ) -> None:
+        self._progress = progress
         self.sequence = sequence
         self.folder = folder
         self.options = options
@@ -311,6 +322,11 @@ class _Job:
             write_frame(path, key, {"stops": np.array([np.log2(factor)])})
         return float(read_frame(path)["stops"][0])
 
+    def within(self, stage: str, frame: int) -> Callable[[int, int], None]:
+        """Return a reporter of progress inside a frame, in Gaussians of all frames."""
+        frames = len(self.sequence)
+        return lambda done, total: self._progress(stage, frame * total + done, frames * total)
+
     def path(self, frame: int) -> Path:
         return self.folder / f"frame_{frame:06d}.h5"
 
@@ -331,6 +347,7 @@ class _Job:
                 self.light,
                 options=self.options.materials,
                 frame=number,
+                progress=self.within("materials", number),
             )
         arrays = {
             **frame.cloud.arrays(),

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from beam_warp.assets import GaussianCloud
 from beam_warp.devices import upload
 from beam_warp.kernels.neighborhoods import launch_consult_neighbors, launch_thinnest_direction
-from beam_warp.lighting import ambient_occlusion
+from beam_warp.lighting import Progress, ambient_occlusion
 from beam_warp.reference import rotation_matrices
 from beam_warp.scene import Scene
 
@@ -42,7 +42,9 @@ class SurfaceNormals:
     from_shape: NDArray[np.bool_]
 
 
-def estimate_normals(cloud: GaussianCloud, scene: Scene, *, seed: int = 0) -> SurfaceNormals:
+def estimate_normals(
+    cloud: GaussianCloud, scene: Scene, *, seed: int = 0, progress: Progress | None = None
+) -> SurfaceNormals:
     """Estimate the surface normal at every Gaussian.
 
     Where a Gaussian is flat, its shortest axis. Elsewhere the direction in which the mixture of its neighbours is
@@ -54,6 +56,7 @@ def estimate_normals(cloud: GaussianCloud, scene: Scene, *, seed: int = 0) -> Su
         cloud: Gaussians.
         scene: The same Gaussians, uploaded.
         seed: Same seed, same device, same result.
+        progress: Called now and then with (Gaussians done, Gaussians in all).
 
     Returns:
         Normals, confidence and origin.
@@ -83,7 +86,7 @@ def estimate_normals(cloud: GaussianCloud, scene: Scene, *, seed: int = 0) -> Su
     normals = np.where(from_shape[:, None], own, direction.numpy())
     certainty = np.where(from_shape, flatness, planarity.numpy())
 
-    openness = _open_side(scene, cloud.positions, normals, seed)
+    openness = _open_side(scene, cloud.positions, normals, seed, progress)
     normals *= np.where(openness < 0.0, -1.0, 1.0)[:, None]
     openness = np.abs(openness)
 
@@ -107,11 +110,17 @@ def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def _open_side(
-    scene: Scene, positions: NDArray[np.float32], normals: NDArray[np.float32], seed: int
+    scene: Scene, positions: NDArray[np.float32], normals: NDArray[np.float32], seed: int, progress: Progress | None
 ) -> NDArray[np.float32]:
     """Return how much more open the normal's side is than the other, in [-1, 1]."""
-    one, other = (
-        ambient_occlusion(scene, positions, sign * normals, sample_count=ORIENTATION_RAYS, seed=seed).visibility
-        for sign in (np.float32(1.0), np.float32(-1.0))
-    )
-    return (one - other) / np.maximum(one + other, np.float32(1e-3))
+    sides = []
+    for side in range(2):
+
+        def report(done: int, total: int, before: int = side) -> None:
+            if progress is not None:
+                progress((before * total + done) // 2, total)
+
+        up = normals if side == 0 else -normals
+        found = ambient_occlusion(scene, positions, up, sample_count=ORIENTATION_RAYS, seed=seed, progress=report)
+        sides.append(found.visibility)
+    return (sides[0] - sides[1]) / np.maximum(sides[0] + sides[1], np.float32(1e-3))

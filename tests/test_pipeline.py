@@ -53,6 +53,18 @@ def test_everything_is_written_valid_and_readable(tmp_path, light):
     assert read_image(result.overview).width > 48
 
 
+def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatch):
+    monkeypatch.setattr("beam_warp.lighting.RAYS_AT_ONCE", 8 * 100)
+    said = []
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
+    run(sequence, light, tmp_path / "out", FAST, overview=SMALL, progress=lambda *step: said.append(step))
+    for stage, total in (("normals", 800), ("materials", 800), ("decompose", 2), ("overview", 1)):
+        steps = [done for name, done, count in said if name == stage and count == total]
+        assert steps == sorted(steps)
+        assert steps[-1] == total
+    assert len([1 for name, *_ in said if name == "materials"]) > 6
+
+
 def test_stopped_job_continues_to_identical_bytes(tmp_path, light, monkeypatch):
     sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1), frame(0.2)])
     run(sequence, light, tmp_path / "whole", FAST, overview=SMALL)
