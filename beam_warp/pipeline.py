@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +18,7 @@ from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp._version import __version__
-from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence, Observability
+from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.axes import change_axes
 from beam_warp.cameras import Camera, bulk
 from beam_warp.checks import require_number
@@ -29,27 +26,24 @@ from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError, OutputError
+from beam_warp.exposure import estimate_exposure
 from beam_warp.frame_store import frame_key, read_frame, write_frame
 from beam_warp.images import write_png
 from beam_warp.kernels.launching import thread_count
 from beam_warp.materials import (
-    BaseColor,
     ColorEvidence,
     MaterialOptions,
     PreparedLight,
-    estimate_exposure,
     measure_materials,
     solve_base_color,
 )
+from beam_warp.reporting import Tally, versions, warnings_about, write_report
 from beam_warp.roughness import constant_roughness, textured_roughness
 from beam_warp.scene import Scene
 from beam_warp.surfaces import SurfaceNormals, estimate_normals
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
-
-CLIPPED_WARNING = 0.05
-"""Part of the Gaussians with base colour cut at 1 above which the stated light is called too dim."""
 
 ASSET_NAME = "asset.usda"
 EVIDENCE = "evidence_"
@@ -127,7 +121,7 @@ class RunResult:
 def run(
     sequence: GaussianSequence,
     environment: EnvironmentMap,
-    out: Path,
+    out: str | Path,
     options: RunOptions | None = None,
     *,
     overview: OverviewOptions | None = None,
@@ -156,7 +150,8 @@ def run(
     started = time.perf_counter()
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
-    job = _Job(sequence, environment, _make_folders(out), chosen, progress)
+    folder = Path(out)
+    job = _Job(sequence, environment, _make_folders(folder), chosen, progress)
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
@@ -164,16 +159,16 @@ def run(
     with job.timer("solve"):
         relightable = job.solve()
     with job.timer("write asset"):
-        asset = out / ASSET_NAME
+        asset = folder / ASSET_NAME
         converters.write(relightable, asset)
-    picture = out / "overview.png"
+    picture = folder / "overview.png"
     with job.timer("overview"):
         progress("overview", 0, 1)
         _draw_overview(job, relightable, picture, overview or OverviewOptions())
         progress("overview", 1, 1)
     report = job.report()
     report["seconds"]["total"] = time.perf_counter() - started
-    write_report(out, report)
+    write_report(folder, report)
     return RunResult(asset, picture, relightable, job.lit, report)
 
 
@@ -195,18 +190,6 @@ def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: O
         options.second_light or Relighting("relit by that light turned by 180°", job.lit.rotated(180.0)),
     ]
     write_png(path, contact_sheet(cloud, camera, lights, device=str(job.device)))
-
-
-def write_report(out: Path, report: Mapping[str, Any]) -> None:
-    """Write ``out/report.json`` whole or not at all."""
-    path = out / "report.json"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error
 
 
 class _Timer:
@@ -232,6 +215,10 @@ class _Frame:
         self._original = original
         self._job = job
         self.cloud = change_axes(original, WORLD_AXES)
+        if len(self.cloud) == 0:
+            raise InvalidArrayError(
+                f"a frame must hold at least one Gaussian, got none at frame {number}. Leave empty frames out."
+            )
         if self.cloud.radiance is None:
             raise InvalidArrayError(
                 f"radiance must be given to decompose materials, got none at frame {number}. "
@@ -380,7 +367,7 @@ class _Job:
     def solve(self) -> GaussianSequence:
         """Solve base colour, over all frames at once or each by itself, and return the relightable sequence."""
         total = len(self.sequence)
-        tally = _Tally()
+        tally = Tally()
         if self.persistent:
             joint = self.evidence(0)
             for frame in range(1, total):
@@ -435,14 +422,6 @@ class _Job:
         seconds = self.timer.seconds.get("materials", 0.0)
         rays = measured * len(self.first.cloud) * samples * 2
         notes = self.sequence.metadata.get("notes", "").splitlines()
-        warnings = []
-        if self._statistics["clipped_part"] > CLIPPED_WARNING:
-            warnings.append(
-                f"{self._statistics['clipped_part']:.0%} of what is opaque has base colour cut at 1: the environment "
-                "is too dim, or comes from other sides than the light of the capture; see --exposure and --rotate"
-            )
-        if self._statistics["flags"]["UNCERTAIN_NORMAL"] > 0.5 * self._statistics["gaussians"]:
-            warnings.append("most normals are uncertain: the Gaussians do not form a surface; relighting is a guess")
         return {
             "input": {"frames": len(self.sequence), "gaussians": len(self.first.cloud), "notes": notes},
             "device": {
@@ -450,13 +429,7 @@ class _Job:
                 "kind": "cuda" if self.device.is_cuda else "cpu",
                 "threads": None if self.device.is_cuda else thread_count(),
             },
-            "versions": {
-                "beam-warp": __version__,
-                "warp": wp.__version__,
-                "numpy": np.__version__,
-                "usd-core": version("usd-core"),
-                "python": platform.python_version(),
-            },
+            "versions": versions(),
             "options": options_as_dict(self.options),
             "exposure_stops": self.exposure,
             "resumed_frames": self.resumed,
@@ -464,51 +437,7 @@ class _Job:
             "materials": self._statistics,
             "seconds": dict(self.timer.seconds),
             "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
-            "warnings": warnings,
-        }
-
-
-class _Tally:
-    """Counts over frames, so that a report needs no frame twice."""
-
-    def __init__(self) -> None:
-        self._rows = 0
-        self._sums: dict[str, float] = {}
-        self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
-
-    def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:
-        count = len(cloud)
-        measured = (solved.observability & np.uint8(Observability.FILLED)) == 0
-        assert cloud.ambient_occlusion is not None
-        assert cloud.normal_confidence is not None
-        self._rows += count
-        for name, value in (
-            ("clipped", solved.clipped_part * count),
-            ("from_shape", stored["from_shape"].sum()),
-            ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
-            ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
-            ("error", solved.standard_error[measured].mean(axis=1).sum(dtype=np.float64)),
-            ("measured", measured.sum()),
-            ("dropped", stored["report"][1]),
-            ("raised", stored["report"][2]),
-        ):
-            self._sums[name] = self._sums.get(name, 0.0) + float(value)
-        for flag in Observability:
-            if flag and flag.name:
-                self._flags[flag.name] += int(((solved.observability & np.uint8(flag)) != 0).sum())
-
-    def summary(self) -> dict[str, Any]:
-        rows = max(self._rows, 1)
-        return {
-            "gaussians": self._rows,
-            "clipped_part": self._sums["clipped"] / rows,
-            "normals_from_shape": self._sums["from_shape"] / rows,
-            "mean_ambient_occlusion": self._sums["openness"] / rows,
-            "mean_normal_confidence": self._sums["confidence"] / rows,
-            "mean_base_color_error_where_measured": self._sums["error"] / max(self._sums["measured"], 1.0),
-            "dropped_transparent": int(self._sums["dropped"]),
-            "raised_scales": int(self._sums["raised"]),
-            "flags": self._flags,
+            "warnings": warnings_about(self._statistics),
         }
 
 

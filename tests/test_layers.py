@@ -45,10 +45,12 @@ RANKS = {
     "beam_warp.demo_environments": 5,
     "beam_warp.mesh_path_tracing": 6,
     "beam_warp.demo_gaussians": 7,
-    "beam_warp.pipeline": 10,
-    "beam_warp.demo": 11,
-    "beam_warp.cli": 12,
-    "beam_warp": 13,
+    "beam_warp.exposure": 10,
+    "beam_warp.reporting": 10,
+    "beam_warp.pipeline": 11,
+    "beam_warp.demo": 12,
+    "beam_warp.cli": 13,
+    "beam_warp": 14,
 }
 
 WITHOUT_WARP = (

@@ -8,11 +8,11 @@ from beam_warp import GaussianCloud, Observability, Scene
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
+from beam_warp.exposure import estimate_exposure
 from beam_warp.images import linear_to_srgb
 from beam_warp.materials import (
     MaterialOptions,
     PreparedLight,
-    estimate_exposure,
     measure_materials,
     solve_base_color,
     view_set,

@@ -121,6 +121,12 @@ def test_radiance_is_needed(tmp_path, light):
     assert not (tmp_path / "out" / "asset.usda").exists()
 
 
+def test_empty_frames_are_refused(tmp_path, light):
+    empty = GaussianSequence.from_clouds([frame().select(np.arange(0))])
+    with pytest.raises(InvalidArrayError, match="a frame must hold at least one Gaussian, got none at frame 0"):
+        run(empty, light, str(tmp_path / "out"), FAST)
+
+
 def test_a_folder_that_cannot_be_made(tmp_path, light):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="out must be a folder that can be made"):
