@@ -29,10 +29,10 @@ def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> Non
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with h5py.File(temporary, "w", track_order=True) as file:
+        with h5py.File(temporary, "w") as file:
             file.attrs[KEY] = key
             for name, array in arrays.items():
-                file.create_dataset(name, data=np.ascontiguousarray(array))
+                file.create_dataset(name, data=np.ascontiguousarray(array), track_times=False)  # same bytes again
         temporary.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
