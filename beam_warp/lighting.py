@@ -17,6 +17,7 @@ from beam_warp.kernels.ambient_occlusion import (
     launch_trace_occlusion,
 )
 from beam_warp.scene import Scene
+from beam_warp.tracing import EXACT, TraceOptions
 
 LIFT_IN_THICKNESSES = 4.0
 """How far ``offset="auto"`` lifts ray origins off the local surface, in standard deviations of its thickness.
@@ -54,10 +55,8 @@ def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float
     if offset != "auto":
         value = require_number("offset", offset)
         return wp.full(len(points), value, dtype=float, device=scene.device)
-    if scene.bvh is None:
-        return wp.zeros(len(points), dtype=float, device=scene.device)
     surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
-    launch_local_surface(scene.bvh.id, scene.gaussians, scene.device_origin, points, normals, surface, scene.device)
+    launch_local_surface(scene.occluders, points, normals, surface, scene.device)
     height, thickness = surface.numpy().T
     return wp.array(height + LIFT_IN_THICKNESSES * thickness, dtype=float, device=scene.device)
 
@@ -77,6 +76,7 @@ def ambient_occlusion(
     *,
     sample_count: int = 64,
     offset: float | Literal["auto"] = "auto",
+    options: TraceOptions = EXACT,
     seed: int = 0,
     frame: int = 0,
     progress: Progress | None = None,
@@ -93,6 +93,7 @@ def ambient_occlusion(
         sample_count: Rays per point; a power of two gives the full benefit of the sample set and a tighter error.
         offset: Distance [m] from point to ray origin along the normal, or ``"auto"``: onto the local surface and
             off it by `LIFT_IN_THICKNESSES` times its thickness. The paper's absolute value is 0.02.
+        options: What counts as a hit, and whether transmittances multiply or are sampled.
         seed: Same seed, same device, same bits.
         frame: Number of the frame; frames have independent noise, the same frame always the same.
         progress: Called now and then with (points done, points in all).
@@ -116,7 +117,8 @@ def ambient_occlusion(
     require_same_length("normals", up, "points", len(at))
     mean = wp.ones(len(at), dtype=float, device=scene.device)
     error = wp.zeros(len(at), dtype=float, device=scene.device)
-    if scene.bvh is not None and len(at):
+    if len(at):
+        settings = options.settings(scene)
         offsets = ray_offsets(scene, at, up, offset)
         bits = stratum_bits(count)
         step = max(1, RAYS_AT_ONCE // count)
@@ -124,9 +126,8 @@ def ambient_occlusion(
         for start in range(0, len(at), step):
             part = slice(start, min(start + step, len(at)))
             launch_trace_occlusion(
-                scene.bvh.id,
-                scene.gaussians,
-                scene.device_origin,
+                scene.occluders,
+                settings,
                 at[part],
                 up[part],
                 offsets[part],

@@ -38,6 +38,7 @@ from beam_warp.lighting import Progress, ambient_occlusion, ray_offsets, stratum
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfaceNormals
+from beam_warp.tracing import EXACT
 
 POINTS_AT_ONCE = 1 << 14
 """Gaussians whose rays are held at a time: 64 rays of 28 bytes and 512 block weights each, 60 MiB."""
@@ -253,10 +254,11 @@ def measure_materials(
     mean_color = 0.5 + SH_C0 * cloud.radiance[:, 0]
     if is_display:
         mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
-    hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32)[scene.rows], wp.vec3, device)
+    hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32), wp.vec3, device)
     samples = options.sample_count
+    settings = EXACT.settings(scene)
     # What is buried is filled from neighbours anyway: its light is not traced.
-    seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY) if scene.bvh is not None else np.zeros(0, np.intp)
+    seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY)
     step = POINTS_AT_ONCE_ON_CUDA if device.is_cuda else POINTS_AT_ONCE
     for start in range(0, len(seen), step):
         here = seen[start : start + step]
@@ -274,12 +276,23 @@ def measure_materials(
         rays.radiance_over_pdf = wp.empty(size * samples, dtype=wp.vec3, device=device)
         rays.visibility = wp.empty(size * samples, dtype=float, device=device)
         launch_trace_light(
-            scene, points, light.blocks, cumulative, (options.seed, frame), start, samples, stratum_bits(samples), rays
+            scene,
+            settings,
+            points,
+            light.blocks,
+            cumulative,
+            (options.seed, frame),
+            start,
+            samples,
+            stratum_bits(samples),
+            rays,
         )
         bounce = wp.zeros(size, dtype=wp.vec3, device=device)
         if options.bounce:
             bounce_samples = max(samples // BOUNCE_PART, 2)
-            launch_trace_bounce(scene, points, hit_radiance, (options.seed, frame), start, bounce_samples, bounce)
+            launch_trace_bounce(
+                scene, settings, points, hit_radiance, (options.seed, frame), start, bounce_samples, bounce
+            )
         captured = CapturedColor()
         captured.radiance = radiance
         captured.rows = upload(at.astype(np.int32), int, device)

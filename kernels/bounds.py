@@ -3,10 +3,16 @@
 import warp as wp
 
 from beam_warp.kernels.constants import ALPHA_MIN
-from beam_warp.kernels.gaussian import Gaussians
+from beam_warp.kernels.gaussian import QUARTIC_FALLOFF, Gaussians
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
+
+TRACED, RAISED, INVISIBLE, NOT_FINITE = (wp.constant(k) for k in range(4))
+"""What becomes of a Gaussian; raised ones are traced with a scale raised to the smallest that float32 resolves."""
+
+LARGEST_LENGTH = wp.constant(1.0e18)
+"""Beyond it squares overflow float32."""
 
 
 @wp.kernel
@@ -22,16 +28,38 @@ def pack_gaussians_kernel(
     out_gaussians: Gaussians,
     out_lower: wp.array[wp.vec3],
     out_upper: wp.array[wp.vec3],
+    out_fate: wp.array[int],
 ):
+    """Pack one Gaussian; what cannot be traced gets radius -1 and a point for bounds, and ``out_fate`` says why."""
     i = first + wp.tid()
     center = positions[i] - origin
     scale = scales[i]
-    largest = wp.max(scale)
-    floor = wp.max(smallest_scale, largest * largest_ratio)
-    scale = wp.vec3(wp.max(scale[0], floor), wp.max(scale[1], floor), wp.max(scale[2], floor))
-    rotation = wp.quat_to_matrix(wp.normalize(orientations[i]))
+    orientation = orientations[i]
     opacity = opacities[i]
-    radius_squared = 2.0 * wp.log(opacity / ALPHA_MIN)
+    norm = wp.length(orientation)
+    fate = int(TRACED)
+    # Comparisons are phrased so that NaN and infinity fail them.
+    usable = wp.length(center) < LARGEST_LENGTH and norm > 0.0 and norm < LARGEST_LENGTH and opacity <= 1.0
+    usable = usable and wp.min(scale) >= 0.0 and wp.max(scale) < LARGEST_LENGTH
+    if not usable:
+        fate = NOT_FINITE
+        center = wp.vec3()
+        orientation = wp.quat_identity()
+        scale = wp.vec3(1.0)
+    if not (opacity > ALPHA_MIN):
+        if usable:
+            fate = INVISIBLE
+        opacity = 0.0
+    floor = wp.max(smallest_scale, wp.max(scale) * largest_ratio)
+    if fate == TRACED and wp.min(scale) < floor:
+        fate = RAISED
+    scale = wp.vec3(wp.max(scale[0], floor), wp.max(scale[1], floor), wp.max(scale[2], floor))
+    rotation = wp.quat_to_matrix(wp.normalize(orientation))
+    radius_squared = float(-1.0)
+    if fate == TRACED or fate == RAISED:
+        radius_squared = 2.0 * wp.log(opacity / ALPHA_MIN)
+        if out_gaussians.degree == 4:
+            radius_squared = wp.sqrt(wp.log(opacity / ALPHA_MIN) / QUARTIC_FALLOFF)
 
     out_gaussians.center_opacity[i] = wp.vec4(center[0], center[1], center[2], opacity)
     out_gaussians.whitening_0[i] = wp.vec4(
@@ -45,7 +73,7 @@ def pack_gaussians_kernel(
     )
 
     # The half-extent of {x : |M x| <= r} along axis k is r |row k of R S|: tight, unlike the box of the rotated box.
-    radius = wp.sqrt(radius_squared)
+    radius = wp.sqrt(wp.max(radius_squared, 0.0))
     half = wp.vec3()
     for k in range(3):
         row = wp.vec3(rotation[k, 0] * scale[0], rotation[k, 1] * scale[1], rotation[k, 2] * scale[2])
@@ -53,16 +81,28 @@ def pack_gaussians_kernel(
         half[k] = radius * wp.length(row) * 1.00001 + 2.4e-7 * wp.abs(center[k])
     out_lower[i] = center - half
     out_upper[i] = center + half
+    out_fate[i] = fate
 
 
 def launch_pack_gaussians(
-    positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio, gaussians, lower, upper, device
+    positions,
+    orientations,
+    scales,
+    opacities,
+    origin,
+    smallest_scale,
+    largest_ratio,
+    gaussians,
+    lower,
+    upper,
+    fates,
+    device,
 ):
     """Pack every Gaussian and its bounds; ``positions`` are world space, the outputs relative to ``origin``."""
     launch(
         pack_gaussians_kernel,
         len(positions),
         inputs=[positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio],
-        outputs=[gaussians, lower, upper],
+        outputs=[gaussians, lower, upper, fates],
         device=device,
     )

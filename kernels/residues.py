@@ -4,13 +4,15 @@ Rays are traced once per Gaussian; every view's diffuse and specular residue (BE
 same rays, because visibility does not depend on the view.
 """
 
+from typing import Any
+
 import warp as wp
 
 from beam_warp.kernels.brdf import specular_albedo, specular_brdf
 from beam_warp.kernels.constants import LARGEST_FLOAT
-from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.latlong import latlong_bilinear
 from beam_warp.kernels.launching import launch
+from beam_warp.kernels.occluders import sampled_hit, transmittance
 from beam_warp.kernels.product_sampling import EnvironmentBlocks, square_to_product
 from beam_warp.kernels.sampling import (
     hash_combine,
@@ -23,7 +25,7 @@ from beam_warp.kernels.sampling import (
     unit_float,
 )
 from beam_warp.kernels.spherical_harmonics import captured_radiance
-from beam_warp.kernels.trace import sampled_hit, transmittance
+from beam_warp.kernels.trace_settings import TraceSettings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,9 +75,8 @@ class ColorFit:
 @wp.kernel
 def trace_light_kernel(
     first: int,
-    bvh: wp.uint64,
-    gaussians: Gaussians,
-    scene_origin: wp.vec3,
+    occluders: Any,
+    settings: TraceSettings,
     points: SurfacePoints,
     blocks: EnvironmentBlocks,
     cumulative: wp.array2d[float],
@@ -100,8 +101,8 @@ def trace_light_kernel(
     n = points.normals[point]
     v = float(0.0)
     if wp.dot(n, drawn.direction) > 0.0:
-        origin = points.positions[point] - scene_origin + n * points.offsets[point]
-        v = transmittance(bvh, gaussians, origin, drawn.direction, LARGEST_FLOAT)
+        origin = points.positions[point] - occluders.origin + n * points.offsets[point]
+        v = transmittance(occluders, settings, origin, drawn.direction, LARGEST_FLOAT, stream + wp.uint32(sample))
     out_rays.directions[slot] = drawn.direction
     out_rays.radiance_over_pdf[slot] = drawn.radiance_over_pdf
     out_rays.visibility[slot] = v
@@ -110,9 +111,8 @@ def trace_light_kernel(
 @wp.kernel
 def trace_bounce_kernel(
     first: int,
-    bvh: wp.uint64,
-    gaussians: Gaussians,
-    scene_origin: wp.vec3,
+    occluders: Any,
+    settings: TraceSettings,
     points: SurfacePoints,
     gaussian_radiance: wp.array[wp.vec3],
     seed: wp.uint32,
@@ -125,7 +125,7 @@ def trace_bounce_kernel(
     point = first + wp.tid()
     n = points.normals[point]
     basis = tangent_frame(n)
-    origin = points.positions[point] - scene_origin + n * points.offsets[point]
+    origin = points.positions[point] - occluders.origin + n * points.offsets[point]
     stream = hash_combine(stream_of(seed, frame, wp.uint32(first_point + point)), BOUNCE_STREAM)
     total = wp.vec3()
     for sample in range(sample_count):
@@ -133,7 +133,7 @@ def trace_bounce_kernel(
             unit_float(owen_sobol_x(sample, stream)), unit_float(owen_sobol_y(sample, stream))
         )
         hit = sampled_hit(
-            bvh, gaussians, origin, direction, LARGEST_FLOAT, hash_combine(stream, wp.uint32(sample + 16))
+            occluders, settings, origin, direction, LARGEST_FLOAT, hash_combine(stream, wp.uint32(sample + 16))
         )
         if hit >= 0:
             total += gaussian_radiance[hit]
@@ -221,15 +221,16 @@ def fit_color_kernel(
     out_fit.relative_error[point] = relative_error
 
 
-def launch_trace_light(scene, points, blocks, cumulative, stream, first_point, sample_count, stratum_bits, out_rays):
+def launch_trace_light(
+    scene, settings, points, blocks, cumulative, stream, first_point, sample_count, stratum_bits, out_rays
+):
     """Draw and trace the rays towards the environment; ``stream`` is (seed, frame)."""
     launch(
         trace_light_kernel,
         len(points.positions) * sample_count,
         inputs=[
-            scene.bvh.id,
-            scene.gaussians,
-            scene.device_origin,
+            scene.occluders,
+            settings,
             points,
             blocks,
             cumulative,
@@ -245,15 +246,14 @@ def launch_trace_light(scene, points, blocks, cumulative, stream, first_point, s
     )
 
 
-def launch_trace_bounce(scene, points, gaussian_radiance, stream, first_point, sample_count, out_irradiance):
+def launch_trace_bounce(scene, settings, points, gaussian_radiance, stream, first_point, sample_count, out_irradiance):
     """Gather one bounce; ``stream`` is (seed, frame)."""
     launch(
         trace_bounce_kernel,
         len(points.positions),
         inputs=[
-            scene.bvh.id,
-            scene.gaussians,
-            scene.device_origin,
+            scene.occluders,
+            settings,
             points,
             gaussian_radiance,
             wp.uint32(stream[0]),

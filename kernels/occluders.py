@@ -1,0 +1,96 @@
+"""What rays meet, whatever it is made of: Gaussians under either hierarchy.
+
+Kernels take occluders as ``Any`` and are compiled for the structure that they are given, so that neither backend pays
+for the other's registers and shared memory.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.gaussian import Gaussians
+from beam_warp.kernels.surface_layer import SurfaceLayer, add_to_layer, height_and_thickness
+from beam_warp.kernels.trace_settings import TraceSettings
+from beam_warp.kernels.warp_tree import WarpTree, warp_tree_sampled_hit, warp_tree_transmittance
+
+
+@wp.struct
+class WarpTreeOccluders:
+    """Gaussians under ``wp.Bvh``."""
+
+    tree: WarpTree
+    gaussians: Gaussians
+    origin: wp.vec3  # world position that everything here is relative to
+
+
+@wp.func
+def tree_transmittance(
+    tree: WarpTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    stream: wp.uint32,
+) -> float:
+    return warp_tree_transmittance(tree, gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
+def tree_sampled_hit(
+    tree: WarpTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    stream: wp.uint32,
+) -> int:
+    return warp_tree_sampled_hit(tree, gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
+def tree_layer(tree: WarpTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
+    layer = SurfaceLayer()
+    query = wp.bvh_query_aabb(tree.bvh, p, p)
+    index = int(0)
+    while wp.bvh_query_next(query, index):
+        layer = add_to_layer(layer, gaussians, index, p, n)
+    return layer
+
+
+@wp.func
+def transmittance(
+    occluders: Any, settings: TraceSettings, origin: wp.vec3, direction: wp.vec3, t_max: float, stream: wp.uint32
+) -> float:
+    """V = product of (1 - alpha) over what the ray meets, in any order, or one Bernoulli sample of it.
+
+    Args:
+        occluders: Any of the structures above.
+        settings: What counts as a hit, and when to stop.
+        origin: Relative to ``occluders.origin`` [m]: subtract that first and offset then, or the offset is
+            rounded away far from the world's origin.
+        direction: Unit vector.
+        t_max: Reach [m].
+        stream: Random stream of the ray; Bernoulli acceptance draws from (stream, Gaussian), so that the result does
+            not depend on traversal order.
+    """
+    return tree_transmittance(occluders.tree, occluders.gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
+def sampled_hit(
+    occluders: Any, settings: TraceSettings, origin: wp.vec3, direction: wp.vec3, t_max: float, stream: wp.uint32
+) -> int:
+    """Index of a Gaussian drawn with probability alpha times the transmittance before it, or -1 for none.
+
+    Each Gaussian stops the ray with probability alpha, independently; the nearest that does wins. One unsorted
+    traversal with a shrinking ``t_max`` is enough (Sun et al. 2025). Arguments as `transmittance`.
+    """
+    return tree_sampled_hit(occluders.tree, occluders.gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
+def surface_layer(occluders: Any, point: wp.vec3, normal: wp.vec3) -> wp.vec2:
+    """(height, thickness) [m] along ``normal`` of the layer of Gaussians around a point, relative as above."""
+    return height_and_thickness(tree_layer(occluders.tree, occluders.gaussians, point, normal))
