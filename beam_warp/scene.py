@@ -59,6 +59,10 @@ class Scene:
             precision does not suffer far from the world's origin.
         extent: Largest side of the centres' bounding box [m].
         report: What was left out or changed.
+        orientations: Quaternions of the cloud as given, one row for each of its Gaussians, on the device; gradients
+            refer to them.
+        scales: Scales of the cloud as given, likewise.
+        smallest_scale: Scales below it were raised to it [m].
     """
 
     device: Any
@@ -67,6 +71,9 @@ class Scene:
     origin: NDArray[np.float32]
     extent: float
     report: SceneReport
+    orientations: Any
+    scales: Any
+    smallest_scale: float
     _keep: Any = None
 
     @classmethod
@@ -111,12 +118,14 @@ class Scene:
         lowers = wp.empty(count, dtype=wp.vec3, device=target)
         uppers = wp.empty(count, dtype=wp.vec3, device=target)
         fates = wp.empty(count, dtype=int, device=target)
+        orientations = upload(cloud.orientations, wp.quat, target)
+        scales = upload(cloud.scales, wp.vec3, target)
         if not len(cloud):  # one Gaussian that nothing sees: kernels need no case for an empty scene
             cloud = NOTHING
         launch_pack_gaussians(
             upload(cloud.positions, wp.vec3, target),
-            upload(cloud.orientations, wp.quat, target),
-            upload(cloud.scales, wp.vec3, target),
+            orientations if traceable else upload(cloud.orientations, wp.quat, target),
+            scales if traceable else upload(cloud.scales, wp.vec3, target),
             upload(cloud.opacities, float, target),
             wp.vec3(*origin.tolist()),
             smallest,
@@ -140,7 +149,7 @@ class Scene:
             raised_scales=int(number[RAISED]),
             not_finite=int(number[NOT_FINITE]),
         )
-        return cls(target, backend, occluders, origin, extent, report, bvh)
+        return cls(target, backend, occluders, origin, extent, report, orientations, scales, smallest, bvh)
 
     @property
     def has_normals(self) -> bool:

@@ -105,14 +105,14 @@ def visibility(
     starts = upload_vectors("origins", origins, scene.device)
     ways = upload_vectors("directions", directions, scene.device, unit_length=True)
     require_same_length("directions", ways, "origins", len(starts))
-    reaches = _reaches(t_max, len(starts), scene.device)
+    reaches = ray_reaches(t_max, len(starts), scene.device)
     require_count("seed", seed, 0, 2**32 - 1)
     result = wp.empty(len(starts), dtype=float, device=scene.device)
     launch_trace_visibility(scene.occluders, options.settings(scene), starts, ways, reaches, seed, result, scene.device)
     return download_like(result, origins, directions)
 
 
-def _reaches(t_max: Any, count: int, device: Any) -> wp.array:
+def ray_reaches(t_max: Any, count: int, device: Any) -> wp.array:
     """Return ``t_max`` on the device, one number or one a ray; infinity becomes the largest float."""
     if isinstance(t_max, wp.array):
         require_same_length("t_max", t_max, "origins", count)

@@ -29,6 +29,7 @@ RANKS = {
     "beam_warp.devices": 4,
     "beam_warp.scene": 5,
     "beam_warp.tracing": 6,
+    "beam_warp.gradients": 7,
     "beam_warp.lighting": 7,
     "beam_warp.ggx": 2,
     "beam_warp.roughness": 5,
