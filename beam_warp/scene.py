@@ -154,4 +154,5 @@ class Scene:
     @property
     def has_normals(self) -> bool:
         """Whether the cloud came with normals."""
-        return self.occluders.gaussians.normals.shape[0] > 0
+        normals = self.occluders.gaussians.normals
+        return normals is not None and len(normals) > 0
