@@ -354,6 +354,35 @@ class TestBits:
                 assert np.array_equal(getattr(results[0], name), getattr(other, name))
             assert np.array_equal(getattr(results[4][0], name), getattr(results[5], name))
 
+    @pytest.mark.parametrize("more", [-1, 1])
+    def test_a_tie_that_the_traversals_decide_differently_overflows_no_slot(
+        self, device, backend, rng, monkeypatch, more
+    ):
+        """A compiler may round one test differently in the two kernels: the loss of a hit is all that may cause."""
+        scene = Scene.from_gaussians(random_cloud(rng, 300, scale=(-2.0, 0.4)), device, backend=backend)
+        rays, adjoints = random_rays(rng, 200), np.ones(200, np.float32)
+        expected = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
+        launch_count_hits = gradients.launch_count_hits
+        changed = []
+
+        def count_differently(*arguments):
+            launch_count_hits(*arguments)
+            counts = arguments[-2].numpy()
+            changed.append(counts.copy())
+            counts[10:20] += more * (counts[10:20] > 0)
+            arguments[-2].assign(counts)
+
+        monkeypatch.setattr(gradients, "launch_count_hits", count_differently)
+        result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
+        assert (changed[0][10:20] > 0).any()
+        others = np.r_[:10, 20:200]
+        assert np.array_equal(result.origins[others], expected.origins[others])
+        if more == 1:  # slots stay free
+            for name in ATTRIBUTES:
+                assert np.array_equal(getattr(result, name), getattr(expected, name))
+        else:
+            assert not np.array_equal(result.opacities, expected.opacities)
+
     @pytest.mark.parametrize("counts", [[], [0], [0, 0], [3], [0, 3, 0], [9, 0, 1, 2, 3, 4], [4, 4, 4], [5] * 20])
     def test_parts_cover_every_hit_once_and_are_bounded(self, counts, monkeypatch):
         monkeypatch.setattr(gradients, "HITS_AT_ONCE", 4)
