@@ -14,18 +14,20 @@ from numpy.typing import NDArray
 from beam_warp.checks import require_array, require_finite, require_same_length
 from beam_warp.devices import download_like, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.hit_gradients import CloudGradients, HitRecords, Moments
+from beam_warp.kernels.hit_gradients import CloudGradients, HitMoments, HitRecords
 from beam_warp.kernels.visibility_adjoint import (
+    SUM_BLOCK,
     launch_add_moments,
     launch_count_hits,
     launch_resolve_moments,
     launch_store_hits,
+    launch_sum_blocks,
 )
 from beam_warp.scene import SMALLEST_SCALE_RATIO, Scene
 from beam_warp.tracing import EXACT, TraceOptions, ray_reaches
 
 HITS_AT_ONCE = 1 << 22
-"""Hits held at a time, 32 bytes each: 128 MiB, or one ray's hits if they are more."""
+"""Hits held at a time, 33 bytes each: 132 MiB, or one ray's hits if they are more."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def visibility_gradients(
     ``TraceOptions(stop=0.0)``, to `visibility` as well, for the exact gradients.
 
     The bits depend on the device alone, not on the run or the number of threads. Memory besides inputs and outputs is
-    8 bytes a ray, 80 bytes a Gaussian and 32 bytes a hit, of which at most `HITS_AT_ONCE` are held, or one ray's.
+    8 bytes a ray, 80 bytes a Gaussian and 33 bytes a hit, of which at most `HITS_AT_ONCE` are held, or one ray's.
 
     Args:
         scene: Occluders; the work runs on its device.
@@ -101,8 +103,8 @@ def visibility_gradients(
             "is 0 or 1 and has no derivative; the product is what its mean estimates."
         )
     settings = options.settings(scene)
-    gaussian_count, ray_count = len(scene.scales), len(starts)
-    moments = _no_moments(gaussian_count, device)
+    gaussian_count, ray_count, degree = len(scene.scales), len(starts), scene.occluders.gaussians.degree
+    moments = wp.zeros(gaussian_count, dtype=HitMoments, device=device)
     to_origins = wp.zeros(ray_count, dtype=wp.vec3, device=device)
     to_directions = wp.zeros(ray_count, dtype=wp.vec3, device=device)
     transmittances = wp.empty(ray_count, dtype=float, device=device)
@@ -133,7 +135,9 @@ def visibility_gradients(
             device,
         )
         wp.utils.radix_sort_pairs(hits.gaussian, order, hit_count, end_bit=gaussian_count.bit_length())
-        launch_add_moments(scene.occluders.gaussians.degree, hits, order, hit_count, moments, device)
+        sums = wp.empty(hit_count // SUM_BLOCK, dtype=HitMoments, device=device)
+        launch_sum_blocks(degree, hits, order, sums, device)
+        launch_add_moments(degree, hits, order, hit_count, sums, moments, device)
     gradients = CloudGradients()
     gradients.positions = wp.empty(gaussian_count, dtype=wp.vec3, device=device)
     gradients.orientations = wp.empty(gaussian_count, dtype=wp.vec4, device=device)
@@ -175,14 +179,6 @@ def _upload_adjoints(adjoints: Any, count: int, device: Any) -> wp.array:
     require_finite("adjoints", array)
     require_same_length("adjoints", array, "origins", count)
     return upload(array, float, device)
-
-
-def _no_moments(count: int, device: Any) -> Moments:
-    moments = Moments()
-    moments.weight = wp.zeros(count, dtype=wp.float64, device=device)
-    for name in ("point", "square", "cross"):
-        setattr(moments, name, wp.zeros(count, dtype=wp.vec3d, device=device))
-    return moments
 
 
 def _parts(counts: NDArray[np.int32]) -> Iterator[tuple[slice, int]]:

@@ -25,16 +25,16 @@ class HitRecords:
 
 
 @wp.struct
-class Moments:
-    """Sums over each Gaussian's hits, in float64: one Gaussian may have millions.
+class HitMoments:
+    """Sums over hits of one Gaussian, in float64: there may be millions.
 
     e is the gradient with respect to log(alpha), w = e dlog(alpha)/dD with respect to D.
     """
 
-    weight: wp.array[wp.float64]  # sum of e
-    point: wp.array[wp.vec3d]  # sum of w q
-    square: wp.array[wp.vec3d]  # sum of w (q_x^2, q_y^2, q_z^2)
-    cross: wp.array[wp.vec3d]  # sum of w (q_y q_z, q_z q_x, q_x q_y)
+    weight: wp.float64  # sum of e
+    point: wp.vec3d  # sum of w q
+    square: wp.vec3d  # sum of w (q_x^2, q_y^2, q_z^2)
+    cross: wp.vec3d  # sum of w (q_y q_z, q_z q_x, q_x q_y)
 
 
 @wp.struct
@@ -83,29 +83,36 @@ def log_response_slope(degree: int, distance_squared: float) -> float:
 
 
 @wp.func
-def add_moments(
-    moments: Moments, degree: int, index: int, hits: HitRecords, order: wp.array[int], begin: int, end: int
-):
-    """Add hits ``order[begin:end]`` to a Gaussian's moments, in that order."""
-    weight = moments.weight[index]
-    point = moments.point[index]
-    square = moments.square[index]
-    cross = moments.cross[index]
+def add_hits(
+    start: HitMoments, degree: int, records: wp.array[wp.vec4], order: wp.array[int], begin: int, end: int
+) -> HitMoments:
+    """Add the hits at slots ``order[begin:end]``, in that order."""
+    total = start
     for k in range(begin, end):
-        record = hits.record[order[k]]
+        record = records[order[k]]
         q = wp.vec3(record[0], record[1], record[2])
         w = wp.float64(record[3] * log_response_slope(degree, wp.dot(q, q)))
         x = wp.float64(q[0])
         y = wp.float64(q[1])
         z = wp.float64(q[2])
-        weight += wp.float64(record[3])
-        point += w * wp.vec3d(x, y, z)
-        square += w * wp.vec3d(x * x, y * y, z * z)
-        cross += w * wp.vec3d(y * z, z * x, x * y)
-    moments.weight[index] = weight
-    moments.point[index] = point
-    moments.square[index] = square
-    moments.cross[index] = cross
+        total.weight += wp.float64(record[3])
+        total.point += w * wp.vec3d(x, y, z)
+        total.square += w * wp.vec3d(x * x, y * y, z * z)
+        total.cross += w * wp.vec3d(y * z, z * x, x * y)
+    return total
+
+
+@wp.func
+def add_sums(start: HitMoments, sums: wp.array[HitMoments], begin: int, end: int) -> HitMoments:
+    """Add the sums of parts ``begin`` to ``end``, in that order."""
+    total = start
+    for k in range(begin, end):
+        part = sums[k]
+        total.weight += part.weight
+        total.point += part.point
+        total.square += part.square
+        total.cross += part.cross
+    return total
 
 
 @wp.func

@@ -2,8 +2,8 @@
 
 V = product of (1 - alpha_i), so dV/dlog(alpha_i) = -V alpha_i / (1 - alpha_i) whatever the order. Autodiff through the
 traversal's loop is silently wrong; here the first traversal counts hits and finds V, the second stores them at slots
-that belong to the ray alone, and after a stable sort by Gaussian one thread a Gaussian adds its hits in the order of
-rays. No float atomics: the same bits in every run, for any number of threads.
+that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
+No float atomics: the same bits in every run, for any number of threads.
 
 A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over candidates around `tally_hit` and
 `store_hit`, in the same order both times.
@@ -17,9 +17,10 @@ from beam_warp.kernels.constants import ALPHA_MAX
 from beam_warp.kernels.gaussian import Gaussians, ray_peak
 from beam_warp.kernels.hit_gradients import (
     CloudGradients,
+    HitMoments,
     HitRecords,
-    Moments,
-    add_moments,
+    add_hits,
+    add_sums,
     log_response_slope,
     orientation_gradient,
     scale_gradient,
@@ -32,6 +33,10 @@ from beam_warp.kernels.trace_settings import TraceSettings, counts
 from beam_warp.kernels.warp_tree import WarpTree, box_test_direction
 
 wp.set_module_options({"enable_backward": False})
+
+
+SUM_BLOCK = wp.constant(256)
+"""Hits in a block that one thread sums: a Gaussian with n hits costs its thread at most 512 + n / 256 additions."""
 
 
 @wp.struct
@@ -275,28 +280,57 @@ def first_not_below(sorted_values: wp.array[int], begin: int, end: int, value: i
 
 
 @wp.kernel
+def sum_blocks_kernel(
+    first: int,
+    degree: int,
+    hits: HitRecords,
+    order: wp.array[int],
+    out_sums: wp.array[HitMoments],
+):
+    """Sum each block of `SUM_BLOCK` sorted hits that are all of one Gaussian; the other sums are not used."""
+    i = first + wp.tid()
+    begin = i * SUM_BLOCK
+    end = begin + SUM_BLOCK
+    if hits.gaussian[begin] == hits.gaussian[end - 1]:
+        out_sums[i] = add_hits(HitMoments(), degree, hits.record, order, begin, end)
+
+
+def launch_sum_blocks(degree, hits, order, out_sums, device):
+    """Sum whole blocks of sorted hits, one a thread, so that a Gaussian that all rays hit is not one thread's work."""
+    launch(sum_blocks_kernel, len(out_sums), inputs=[degree, hits, order], outputs=[out_sums], device=device)
+
+
+@wp.kernel
 def add_moments_kernel(
     first: int,
     degree: int,
     hits: HitRecords,
     order: wp.array[int],
     hit_count: int,
-    out_moments: Moments,
+    sums: wp.array[HitMoments],
+    out_moments: wp.array[HitMoments],
 ):
     """``hits.gaussian`` is sorted, ``order`` says at which slot each hit's record is."""
     i = first + wp.tid()
     begin = first_not_below(hits.gaussian, 0, hit_count, i)
     end = first_not_below(hits.gaussian, begin, hit_count, i + 1)
     if begin < end:
-        add_moments(out_moments, degree, i, hits, order, begin, end)
+        total = out_moments[i]
+        first_block = (begin + SUM_BLOCK - 1) // SUM_BLOCK
+        end_block = end // SUM_BLOCK
+        if first_block < end_block:
+            total = add_hits(total, degree, hits.record, order, begin, first_block * SUM_BLOCK)
+            total = add_sums(total, sums, first_block, end_block)
+            begin = end_block * SUM_BLOCK
+        out_moments[i] = add_hits(total, degree, hits.record, order, begin, end)
 
 
-def launch_add_moments(degree, hits, order, hit_count, moments, device):
-    """Add sorted hits to the moments of their Gaussians, one Gaussian a thread."""
+def launch_add_moments(degree, hits, order, hit_count, sums, moments, device):
+    """Add sorted hits to the moments of their Gaussians, one Gaussian a thread; ``sums`` from `launch_sum_blocks`."""
     launch(
         add_moments_kernel,
-        len(moments.weight),
-        inputs=[degree, hits, order, hit_count],
+        len(moments),
+        inputs=[degree, hits, order, hit_count, sums],
         outputs=[moments],
         device=device,
     )
@@ -310,7 +344,7 @@ def resolve_moments_kernel(
     scales: wp.array[wp.vec3],
     smallest_scale: float,
     largest_ratio: float,
-    moments: Moments,
+    moments: wp.array[HitMoments],
     out_gradients: CloudGradients,
 ):
     """From moments to gradients of the cloud's arrays; 0 for Gaussians that take no part."""
@@ -320,13 +354,14 @@ def resolve_moments_kernel(
     scale = wp.vec3()
     opacity = float(0.0)
     if gaussians.whitening_0[i][3] > 0.0:
+        total = moments[i]
         given = scales[i]
         floor = wp.max(smallest_scale, wp.max(given) * largest_ratio)  # as `pack_gaussians_kernel`
         raised = wp.vec3(wp.max(given[0], floor), wp.max(given[1], floor), wp.max(given[2], floor))
-        opacity = wp.float32(moments.weight[i]) / gaussians.center_opacity[i][3]
-        position = -2.0 * transposed_whitening_times(gaussians, i, single(moments.point[i]))
-        scale = scale_gradient(single(moments.square[i]), given, floor)
-        orientation = orientation_gradient(single(moments.cross[i]), raised, orientations[i])
+        opacity = wp.float32(total.weight) / gaussians.center_opacity[i][3]
+        position = -2.0 * transposed_whitening_times(gaussians, i, single(total.point))
+        scale = scale_gradient(single(total.square), given, floor)
+        orientation = orientation_gradient(single(total.cross), raised, orientations[i])
     out_gradients.positions[i] = position
     out_gradients.orientations[i] = orientation
     out_gradients.scales[i] = scale
@@ -339,7 +374,7 @@ def launch_resolve_moments(
     """Resolve every Gaussian's moments to its gradients."""
     launch(
         resolve_moments_kernel,
-        len(moments.weight),
+        len(moments),
         inputs=[gaussians, orientations, scales, smallest_scale, largest_ratio, moments],
         outputs=[out_gradients],
         device=device,

@@ -356,6 +356,42 @@ class TestBits:
             assert all(np.array_equal(getattr(whole, name), getattr(other, name)) for other in others)
             assert np.array_equal(getattr(few, name), getattr(ray_by_ray, name))
 
+    @pytest.mark.parametrize("first", [0, 1, 255, 256, 257, 700])
+    @pytest.mark.parametrize("second", [1, 255, 256, 257, 512, 2000])
+    def test_sums_over_blocks_of_hits_add_each_hit_once(self, device, backend, first, second):
+        cloud = GaussianCloud(
+            positions=[[0, 0, 0], [0, 5, 0], [0, 9, 0]],
+            orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
+            scales=np.full((3, 3), 0.1),
+            opacities=[0.5, 0.5, 0.5],
+        )
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        origins = np.tile([-2.0, 0.0, 0.0], (first + second, 1))
+        origins[first:, 1] = 5.0
+        directions = np.tile([1.0, 0.0, 0.0], (first + second, 1))
+        mixed = np.argsort(np.arange(first + second) * 7 % 11, kind="stable")
+        result = visibility_gradients(scene, origins[mixed], directions, np.ones(first + second))
+        assert result.opacities.tolist() == [-first, -second, 0.0]
+
+    def test_many_rays_through_few_gaussians(self, device, backend, rng, monkeypatch):
+        cloud = random_cloud(rng, 3, scale=(-0.7, 0.2), opacity=(0.3, 0.9))
+        origins, directions = random_rays(rng, 3000)
+        clear = ~FrozenVisibility(cloud, origins, directions).near_tie
+        rays = origins[clear], directions[clear]
+        adjoints = rng.normal(size=clear.sum()).astype(np.float32)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        whole = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
+        monkeypatch.setenv("BEAM_WARP_THREADS", "2")
+        again = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
+        monkeypatch.setattr(gradients, "HITS_AT_ONCE", 1000)
+        parts = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
+        for name, expected in FrozenVisibility(cloud, *rays).gradients(adjoints).items():
+            value = getattr(whole, name)
+            assert relative_error(value, expected) <= rounding(cloud, expected), name
+            assert np.array_equal(value, getattr(again, name))
+            # other parts, other blocks, other roundings of float64 sums: the last bit of float32 may differ
+            assert relative_error(getattr(parts, name), value) <= 2.0**-23
+
     @pytest.mark.parametrize("more", [-1, 1])
     def test_a_tie_that_the_traversals_decide_differently_overflows_no_slot(
         self, device, backend, rng, monkeypatch, more
