@@ -5,8 +5,8 @@ traversal's loop is silently wrong; here the first traversal counts hits and fin
 that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
 No float atomics: the same bits in every run, for any number of threads.
 
-A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over candidates around `tally_hit` and
-`store_hit`, in the same order both times.
+A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over hits around `tally_hit` and `store_hit`,
+in the same order both times.
 """
 
 from typing import Any
@@ -59,22 +59,11 @@ class RayReturn:
 
 
 @wp.func
-def tally_hit(
-    tally: HitTally,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    index: int,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-) -> HitTally:
-    """Multiply and count one candidate if it is a hit."""
+def tally_hit(tally: HitTally, alpha: float) -> HitTally:
     result = tally
-    peak = ray_peak(gaussians, index, origin, direction)
-    if counts(gaussians, settings, index, peak, direction, t_max):
-        result.transmittance *= 1.0 - peak.alpha
-        if peak.alpha < ALPHA_MAX:
-            result.count += 1
+    result.transmittance *= 1.0 - alpha
+    if alpha < ALPHA_MAX:
+        result.count += 1
     return result
 
 
@@ -82,25 +71,24 @@ def tally_hit(
 def store_hit(
     ray: RayReturn,
     gaussians: Gaussians,
-    settings: TraceSettings,
     index: int,
+    alpha: float,
+    t: float,
     origin: wp.vec3,
     direction: wp.vec3,
-    t_max: float,
     out_hits: HitRecords,
 ) -> RayReturn:
-    """Store one candidate if it is a hit with a gradient, and add that gradient to the ray's."""
+    """Store a hit with its peak at ``t``, unless it has no gradient, and add that gradient to the ray's."""
     result = ray
-    peak = ray_peak(gaussians, index, origin, direction)
-    if counts(gaussians, settings, index, peak, direction, t_max) and peak.alpha < ALPHA_MAX:
+    if alpha < ALPHA_MAX:
         q = whitened_closest_point(gaussians, index, origin, direction)
-        e = ray.weight * peak.alpha / (1.0 - peak.alpha)
+        e = ray.weight * alpha / (1.0 - alpha)
         out_hits.gaussian[ray.slot] = index
         out_hits.record[ray.slot] = wp.vec4(q[0], q[1], q[2], e)
         w = e * log_response_slope(gaussians.degree, wp.dot(q, q))
         pull = transposed_whitening_times(gaussians, index, q) * (2.0 * w)
         result.origin += pull
-        result.direction += pull * peak.t
+        result.direction += pull * t
         result.slot += 1
     return result
 
@@ -114,15 +102,17 @@ def tally_hits(
     direction: wp.vec3,
     t_max: float,
 ) -> HitTally:
-    """V and the number of hits, over what `warp_tree_transmittance` visits."""
+    """V and the number of hits with gradients, over what `warp_tree_transmittance` visits."""
     tally = HitTally()
     tally.transmittance = float(1.0)
     query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
     index = int(0)
     while wp.bvh_query_next(query, index, t_max):
-        tally = tally_hit(tally, gaussians, settings, index, origin, direction, t_max)
-        if tally.transmittance < settings.stop:
-            break
+        peak = ray_peak(gaussians, index, origin, direction)
+        if counts(gaussians, settings, index, peak, direction, t_max):
+            tally = tally_hit(tally, peak.alpha)
+            if tally.transmittance < settings.stop:
+                break
     return tally
 
 
@@ -142,9 +132,11 @@ def store_hits(
     query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
     index = int(0)
     while wp.bvh_query_next(query, index, t_max):
-        ray = store_hit(ray, gaussians, settings, index, origin, direction, t_max, out_hits)
-        if ray.slot == ray.end:
-            break
+        peak = ray_peak(gaussians, index, origin, direction)
+        if counts(gaussians, settings, index, peak, direction, t_max):
+            ray = store_hit(ray, gaussians, index, peak.alpha, peak.t, origin, direction, out_hits)
+            if ray.slot == ray.end:
+                break
     return ray
 
 
