@@ -180,6 +180,22 @@ class TestAgainstDifferences:
         for name, expected in frozen.gradients(adjoints).items():
             assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected), name
 
+    @pytest.mark.parametrize("scales", [(0.3, 3e-4, 3e-4), (0.1, 0.1, 1e-4)])
+    def test_needles_and_discs(self, device, backend, rng, scales):
+        count, rays = 100, 1000
+        cloud = random_cloud(rng, count, opacity=(0.1, 0.95)).with_arrays(scales=np.tile(scales, (count, 1)))
+        aims = rng.integers(0, count, rays)
+        local = 0.7 * cloud.scales[aims] * rng.normal(size=(rays, 3))
+        targets = cloud.positions[aims] + np.einsum("nij,nj->ni", rotation_matrices(cloud.orientations)[aims], local)
+        _, directions = random_rays(rng, rays)
+        origins = (targets - rng.uniform(0.2, 1.0, (rays, 1)) * directions).astype(np.float32)
+        clear = ~FrozenVisibility(cloud, origins, directions).near_tie
+        adjoints = rng.normal(size=clear.sum()).astype(np.float32)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        result = visibility_gradients(scene, origins[clear], directions[clear], adjoints, options=WHOLE)
+        for name, expected in FrozenVisibility(cloud, origins[clear], directions[clear]).gradients(adjoints).items():
+            assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected) < 1e-2, name
+
     def test_far_from_the_origin(self, device, backend, rng):
         """The scene is recentred: moved by a power of two it keeps its gradients but for the grid of 1/1024."""
         cloud, rays, _, adjoints, _ = case(rng)

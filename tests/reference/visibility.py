@@ -8,7 +8,7 @@ import numpy as np
 from beam_warp.reference import rotation_matrices
 
 ALPHA_MIN, ALPHA_MAX = 1.0 / 255.0, 0.99
-STEP = 1e-5  # times each parameter's own size: truncation about STEP^2, rounding about 1e-16 / STEP
+STEP = 1e-5  # relative truncation is about STEP^2, rounding about 1e-16 / STEP
 
 
 class FrozenVisibility:
@@ -93,8 +93,12 @@ class FrozenVisibility:
         return result
 
     def _steps(self, name, value):
+        """Steps that move the point closest to a centre by about STEP standard deviations."""
+        smallest = self.parameters["scales"].min(axis=1)
         if name == "positions":
-            return STEP * self.parameters["scales"].min(axis=1)
+            return STEP * smallest
+        if name == "orientations":
+            return STEP * smallest / self.parameters["scales"].max(axis=1)
         if name in ("origins", "directions"):
-            return STEP * self.parameters["scales"].min()
-        return np.full_like(value, STEP) if name == "orientations" else STEP * value
+            return STEP * smallest.min()
+        return STEP * value
