@@ -23,7 +23,8 @@ from beam_warp.kernels.visibility_adjoint import (
     launch_store_hits,
     launch_sum_blocks,
 )
-from beam_warp.scene import SMALLEST_SCALE_RATIO, Scene
+from beam_warp.packed_gaussians import SMALLEST_SCALE_RATIO
+from beam_warp.scene import Scene
 from beam_warp.tracing import EXACT, TraceOptions, ray_reaches
 
 HITS_AT_ONCE = 1 << 22
@@ -103,7 +104,7 @@ def visibility_gradients(
             "is 0 or 1 and has no derivative; the product is what its mean estimates."
         )
     settings = options.settings(scene)
-    gaussian_count, ray_count, degree = len(scene.scales), len(starts), scene.occluders.gaussians.degree
+    gaussian_count, ray_count, degree = len(scene), len(starts), scene.occluders.gaussians.degree
     moments = wp.zeros(gaussian_count, dtype=HitMoments, device=device)
     to_origins = wp.zeros(ray_count, dtype=wp.vec3, device=device)
     to_directions = wp.zeros(ray_count, dtype=wp.vec3, device=device)
@@ -145,9 +146,9 @@ def visibility_gradients(
     gradients.opacities = wp.empty(gaussian_count, dtype=float, device=device)
     launch_resolve_moments(
         scene.occluders.gaussians,
-        scene.orientations,
-        scene.scales,
-        scene.smallest_scale,
+        scene.packed.orientations,
+        scene.packed.scales,
+        scene.packed.smallest_scale,
         SMALLEST_SCALE_RATIO,
         moments,
         gradients,

@@ -31,6 +31,7 @@ from beam_warp.kernels.hit_gradients import (
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.trace_settings import TraceSettings, counts
 from beam_warp.kernels.warp_tree import WarpTree, box_test_direction
+from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -137,6 +138,93 @@ def store_hits(
             ray = store_hit(ray, gaussians, index, peak.alpha, peak.t, origin, direction, out_hits)
             if ray.slot == ray.end:
                 break
+    return ray
+
+
+@wp.func
+def tally_hits(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+) -> HitTally:
+    """The same, over what `wide_tree_transmittance` visits."""
+    inverse = reciprocal(direction)
+    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    depth = int(0)
+    first_node = int(0)
+    inner = int(1)
+    tally = HitTally()
+    tally.transmittance = float(1.0)
+    while inner != 0:
+        node = first_node + lowest_bit(inner)
+        inner = inner & (inner - 1)
+        if inner != 0:
+            stack[depth] = (first_node << 4) | inner
+            depth += 1
+        hits = meet_node(tree, node, origin, inverse, t_max)
+        first_node = hits.first_node
+        inner = hits.inner
+        leaf = hits.leaf
+        while leaf != 0:
+            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
+            leaf = leaf & (leaf - 1)
+            if peak.alpha > 0.0:
+                tally = tally_hit(tally, peak.alpha)
+                if tally.transmittance < settings.stop:
+                    leaf = 0
+                    inner = 0
+                    depth = 0
+        if inner == 0 and depth > 0:
+            depth -= 1
+            first_node = stack[depth] >> 4
+            inner = stack[depth] & 15
+    return tally
+
+
+@wp.func
+def store_hits(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    start: RayReturn,
+    out_hits: HitRecords,
+) -> RayReturn:
+    """The same, for the wide tree."""
+    inverse = reciprocal(direction)
+    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    depth = int(0)
+    first_node = int(0)
+    inner = int(1)
+    ray = start
+    while inner != 0:
+        node = first_node + lowest_bit(inner)
+        inner = inner & (inner - 1)
+        if inner != 0:
+            stack[depth] = (first_node << 4) | inner
+            depth += 1
+        hits = meet_node(tree, node, origin, inverse, t_max)
+        first_node = hits.first_node
+        inner = hits.inner
+        leaf = hits.leaf
+        while leaf != 0:
+            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
+            leaf = leaf & (leaf - 1)
+            if peak.alpha > 0.0:
+                ray = store_hit(ray, gaussians, peak.index, peak.alpha, peak.t, origin, direction, out_hits)
+                if ray.slot == ray.end:
+                    leaf = 0
+                    inner = 0
+                    depth = 0
+        if inner == 0 and depth > 0:
+            depth -= 1
+            first_node = stack[depth] >> 4
+            inner = stack[depth] & 15
     return ray
 
 

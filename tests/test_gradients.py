@@ -14,7 +14,7 @@ from beam_warp.tracing import TraceOptions
 WHOLE = TraceOptions(stop=0.0)
 OF_GAUSSIANS = ("positions", "orientations", "scales", "opacities")
 ATTRIBUTES = (*OF_GAUSSIANS, "origins", "directions")
-BACKENDS = ("warp",)
+BACKENDS = ("wide", "warp")
 
 
 def rounding(cloud, gradient):
@@ -484,6 +484,19 @@ class TestSizes:
             assert (value.shape, value.dtype) == (shape, np.float32)
             assert np.isfinite(value).all()
             assert not (count and rays > 60) or np.abs(value).max() > 0.0
+
+    def test_a_moved_scene_has_the_gradients_of_where_it_is(self, device, backend, rng):
+        cloud, rays, _, adjoints, _ = case(rng)
+        other = random_cloud(rng, 200, scale=(-2.0, 0.4)).with_arrays(opacities=cloud.opacities)
+        moved = Scene.from_gaussians(other, device, backend=backend)
+        moved.move(cloud.positions, cloud.orientations, cloud.scales)
+        result = visibility_gradients(moved, *rays, adjoints, options=WHOLE)
+        expected = visibility_gradients(
+            Scene.from_gaussians(cloud, device, backend=backend), *rays, adjoints, options=WHOLE
+        )
+        for name in ATTRIBUTES:
+            reference = getattr(expected, name)
+            assert relative_error(getattr(result, name), reference) <= rounding(cloud, reference)
 
     def test_zero_adjoints(self, device, backend, rng):
         scene = Scene.from_gaussians(random_cloud(rng, 50, scale=(-1.0, 0.2)), device, backend=backend)
