@@ -9,12 +9,11 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.occluders import WideTreeOccluders, transmittance
 from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.trace_settings import TraceSettings
-from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf_by_default, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,19 +57,18 @@ def trace_rays_kernel(first: int, occluders: Any, settings: TraceSettings, rays:
 def trace_rays_wide_kernel(
     first: int,
     tree: WideTree,
-    gaussians: Gaussians,
     settings: TraceSettings,
     rays: Rays,
     lanes: int,
     share: int,
     out_visibility: wp.array[float],
 ):
-    """``share`` rays a thread; neighbouring lanes, ``lanes`` of them, take neighbouring rays."""
+    """``share`` rays a thread, by the default rules; neighbouring lanes, ``lanes`` of them, take neighbouring rays."""
     thread = first + wp.tid()
     count = rays.origins.shape[0]
     ray = (thread / lanes) * lanes * share + thread % lanes
     end = wp.min(ray + lanes * share, count)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(0)
@@ -110,17 +108,15 @@ def trace_rays_wide_kernel(
             inner = hits.inner
             leaf = hits.leaf
             while leaf != 0:
-                peak = meet_leaf(
-                    tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max
-                )
+                met = meet_leaf_by_default(tree, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
                 leaf = leaf & (leaf - 1)
-                if peak.alpha > 0.0:
+                if met.alpha > 0.0:
                     if settings.bernoulli == 1:
                         stream = hash_combine(rays.stream, wp.uint32(ray))
-                        if unit_float(hash_combine(stream, wp.uint32(peak.index))) < peak.alpha:
+                        if unit_float(hash_combine(stream, wp.uint32(met.index))) < met.alpha:
                             v = 0.0
                     else:
-                        v *= 1.0 - peak.alpha
+                        v *= 1.0 - met.alpha
                     if v < settings.stop or v == 0.0:
                         leaf = 0
                         inner = 0
@@ -132,7 +128,8 @@ def trace_rays_wide_kernel(
 def launch_trace_rays(occluders, settings, rays, out_visibility, device):
     """Trace a batch of rays."""
     count = len(rays.origins)
-    if not isinstance(occluders, WideTreeOccluders.cls):
+    by_default = settings.entry_in_front == 0 and settings.cull == 0 and occluders.gaussians.degree == 2
+    if not by_default or not isinstance(occluders, WideTreeOccluders.cls):
         launch(
             trace_rays_kernel,
             count,
@@ -148,7 +145,7 @@ def launch_trace_rays(occluders, settings, rays, out_visibility, device):
     launch(
         trace_rays_wide_kernel,
         -(-count // (lanes * share)) * lanes,
-        inputs=[occluders.tree, occluders.gaussians, settings, rays, lanes, share],
+        inputs=[occluders.tree, settings, rays, lanes, share],
         outputs=[out_visibility],
         device=device,
         block_dim=64,

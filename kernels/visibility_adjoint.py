@@ -31,7 +31,7 @@ from beam_warp.kernels.hit_gradients import (
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.trace_settings import TraceSettings, counts
 from beam_warp.kernels.warp_tree import WarpTree, box_test_direction
-from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,7 +152,7 @@ def tally_hits(  # noqa: F811
 ) -> HitTally:
     """The same, over what `wide_tree_transmittance` visits."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -197,7 +197,7 @@ def store_hits(  # noqa: F811
 ) -> RayReturn:
     """The same, for the wide tree."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)

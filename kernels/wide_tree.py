@@ -10,12 +10,14 @@ import warp as wp
 
 from beam_warp.kernels.constants import ALPHA_MAX, DIRECTION_FLOOR
 from beam_warp.kernels.gaussian import Gaussians, response
+from beam_warp.kernels.row_loads import load_row, load_words
 from beam_warp.kernels.trace_settings import TraceSettings
 
 NODE_ROWS = wp.constant(3)
 LEAF_ROWS = wp.constant(4)
 LARGEST_DEPTH = 31
-STACK_SIZE = wp.constant(32)
+Stack = wp.types.vector(length=32, dtype=wp.int32)
+"""One entry a level. A vector, because Warp's local arrays carry a header that every access would read."""
 
 FAR_SLACK = wp.constant(1.000001)
 """Widens the far end of a slab by eight ulp, more than its rounding errors: no box is missed (Ize 2013)."""
@@ -157,9 +159,9 @@ def boxes_met(
 @wp.func
 def meet_node(tree: WideTree, node: int, origin: wp.vec3, inverse: wp.vec3, t_max: float) -> NodeHits:
     row = node * NODE_ROWS
-    row_0 = tree.nodes[row]
-    row_1 = tree.nodes[row + 1]
-    row_2 = tree.nodes[row + 2]
+    row_0 = load_words(tree.nodes, row)
+    row_1 = load_words(tree.nodes, row + 1)
+    row_2 = load_words(tree.nodes, row + 2)
     inner = (row_0[3] >> 24) & 15
     count = (row_0[3] >> 28) & 15
     mask = boxes_met(row_0, row_1, row_2, origin, inverse, t_max) & ((1 << count) - 1)
@@ -169,6 +171,67 @@ def meet_node(tree: WideTree, node: int, origin: wp.vec3, inverse: wp.vec3, t_ma
     hits.inner = mask & ((1 << inner) - 1)
     hits.leaf = mask >> inner
     return hits
+
+
+@wp.struct
+class CanonicalRay:
+    """A ray in the space where a leaf's Gaussian is the unit sphere, begun at its point closest to the centre."""
+
+    q: wp.vec3  # whitened closest point
+    d: wp.vec3  # whitened direction, not of unit length
+    dd: float  # d.d
+    cc: float  # |q x d|^2: dd times the squared distance to the centre
+    t_dd: float  # dd times t of the largest response
+
+
+@wp.func
+def canonical_ray(
+    center: wp.vec4, m_0: wp.vec4, m_1: wp.vec4, m_2: wp.vec4, origin: wp.vec3, direction: wp.vec3
+) -> CanonicalRay:
+    """Arithmetic of `ray_peak`, without its divisions."""
+    ray = CanonicalRay()
+    p = origin - wp.vec3(center[0], center[1], center[2])
+    t_closest = -wp.dot(p, direction)
+    p = p + direction * t_closest
+    ray.q = wp.vec3(
+        m_0[0] * p[0] + m_0[1] * p[1] + m_0[2] * p[2],
+        m_1[0] * p[0] + m_1[1] * p[1] + m_1[2] * p[2],
+        m_2[0] * p[0] + m_2[1] * p[1] + m_2[2] * p[2],
+    )
+    ray.d = wp.vec3(
+        m_0[0] * direction[0] + m_0[1] * direction[1] + m_0[2] * direction[2],
+        m_1[0] * direction[0] + m_1[1] * direction[1] + m_1[2] * direction[2],
+        m_2[0] * direction[0] + m_2[1] * direction[1] + m_2[2] * direction[2],
+    )
+    ray.dd = wp.dot(ray.d, ray.d)
+    c = wp.cross(ray.q, ray.d)
+    ray.cc = wp.dot(c, c)
+    ray.t_dd = t_closest * ray.dd - wp.dot(ray.q, ray.d)
+    return ray
+
+
+@wp.struct
+class LeafAlpha:
+    """How strongly a leaf's Gaussian acts on a ray, by the default rules."""
+
+    alpha: float  # 0 where it does not count
+    index: int
+
+
+@wp.func
+def meet_leaf_by_default(tree: WideTree, leaf: int, origin: wp.vec3, direction: wp.vec3, t_max: float) -> LeafAlpha:
+    """Peak in front, no culling, degree 2: what almost every ray asks for, a tenth faster than `meet_leaf`."""
+    row = leaf * LEAF_ROWS
+    center = load_row(tree.leaves, row)
+    m_0 = load_row(tree.leaves, row + 1)
+    m_1 = load_row(tree.leaves, row + 2)
+    m_2 = load_row(tree.leaves, row + 3)
+    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
+    result = LeafAlpha()
+    if ray.cc < m_0[3] * ray.dd and ray.t_dd > 0.0 and ray.t_dd < t_max * ray.dd:
+        result.alpha = wp.min(ALPHA_MAX, center[3] * wp.exp(-0.5 * ray.cc / ray.dd))
+        result.index = wp.cast(m_1[3], int)
+    return result
 
 
 @wp.struct
@@ -190,36 +253,21 @@ def meet_leaf(
     direction: wp.vec3,
     t_max: float,
 ) -> LeafPeak:
-    """The same arithmetic as `ray_peak` and `counts`, from the leaf's own rows."""
+    """The same as `ray_peak` and `counts`, from the leaf's own rows."""
     row = leaf * LEAF_ROWS
-    center = tree.leaves[row]
-    m_0 = tree.leaves[row + 1]
-    m_1 = tree.leaves[row + 2]
-    m_2 = tree.leaves[row + 3]
-    p = origin - wp.vec3(center[0], center[1], center[2])
-    t_closest = -wp.dot(p, direction)
-    p = p + direction * t_closest
-    q = wp.vec3(
-        m_0[0] * p[0] + m_0[1] * p[1] + m_0[2] * p[2],
-        m_1[0] * p[0] + m_1[1] * p[1] + m_1[2] * p[2],
-        m_2[0] * p[0] + m_2[1] * p[1] + m_2[2] * p[2],
-    )
-    d = wp.vec3(
-        m_0[0] * direction[0] + m_0[1] * direction[1] + m_0[2] * direction[2],
-        m_1[0] * direction[0] + m_1[1] * direction[1] + m_1[2] * direction[2],
-        m_2[0] * direction[0] + m_2[1] * direction[1] + m_2[2] * direction[2],
-    )
-    dd = wp.dot(d, d)
-    c = wp.cross(q, d)
-    cc = wp.dot(c, c)
+    center = load_row(tree.leaves, row)
+    m_0 = load_row(tree.leaves, row + 1)
+    m_1 = load_row(tree.leaves, row + 2)
+    m_2 = load_row(tree.leaves, row + 3)
+    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
     peak = LeafPeak()
-    if cc < m_0[3] * dd:
-        distance_squared = cc / dd
-        peak.t = t_closest - wp.dot(q, d) / dd
+    if ray.cc < m_0[3] * ray.dd:
+        distance_squared = ray.cc / ray.dd
+        peak.t = ray.t_dd / ray.dd
         peak.index = wp.cast(m_1[3], int)
         start = peak.t
         if settings.entry_in_front == 1:
-            start -= wp.sqrt((m_0[3] - distance_squared) / dd)
+            start -= wp.sqrt((m_0[3] - distance_squared) / ray.dd)
         met = start > 0.0 and peak.t < t_max
         if met and settings.cull == 1:
             met = wp.dot(gaussians.normals[peak.index], direction) <= 0.0
