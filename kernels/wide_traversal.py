@@ -38,7 +38,7 @@ def wide_tree_transmittance(
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_max)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -86,7 +86,7 @@ def wide_tree_sampled_hit(
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_nearest)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_nearest)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -120,7 +120,7 @@ def wide_tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, p, inverse, 0.0)
+        hits = meet_node(tree, node, p, inverse, 0.0, 0.0)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
