@@ -75,9 +75,9 @@ def trace_plain_bvh_kernel(
     i = first + wp.tid()
     origin = origins[i]
     direction = directions[i]
-    v = float(1.0)
+    v = wp.float32(1.0)
     query = wp.bvh_query_ray(bvh, origin, direction)
-    index = int(0)
+    index = wp.int32(0)
     while wp.bvh_query_next(query, index):
         head = rows[index, 0]
         a = rows[index, 1]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
+from beam_warp.cameras import Camera
 from beam_warp.kernels.constants import ALPHA_MAX, ALPHA_MIN
 from beam_warp.reference import rotation_matrices
 
@@ -144,6 +145,13 @@ def cosine_rays(cloud: GaussianCloud, point_count: int, rays_per_point: int = 50
     directions = normals + sphere
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return Rays(origins.astype(np.float32), directions.astype(np.float32))
+
+
+def camera_rays(cloud: GaussianCloud, width: int, height: int) -> Rays:
+    """Return one ray through every pixel of a camera whose image the cloud fills, row by row."""
+    camera = Camera.frame_cloud(cloud.positions, azimuth=25.0, elevation=35.0, width=width, height=height)
+    directions = camera.directions().reshape(-1, 3).astype(np.float32)
+    return Rays(np.tile(np.asarray(camera.position, dtype=np.float32), (len(directions), 1)), directions)
 
 
 def brute_force_visibility(cloud: GaussianCloud, rays: Rays) -> NDArray[np.float64]:
