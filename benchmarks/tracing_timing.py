@@ -49,10 +49,13 @@ class Times:
         return float(np.median(other.alone / self.alone))
 
     def thread_gain(self) -> float | None:
-        """Return how many times faster two threads are than one by wall-clock time; None where not measured."""
+        """Return how many times faster two threads are than one by wall-clock time; None where not measured.
+
+        Of the fastest repeats: two threads of a machine that others use are slowed down by them, not by their work.
+        """
         if self.one_thread is None or self.two_threads is None:
             return None
-        return float(np.median(self.one_thread / self.two_threads))
+        return float(self.one_thread.min() / self.two_threads.min())
 
 
 def rates(seconds: NDArray[np.float64], count: int) -> dict[str, float]:
@@ -74,23 +77,29 @@ def launch_threads(count: int) -> Iterator[None]:
             os.environ["BEAM_WARP_THREADS"] = before
 
 
-def take_turns(tasks: Mapping[str, Task], repeats: int, device: Any) -> dict[str, Times]:
+def take_turns(tasks: Mapping[str, Task], repeats: int, device: Any, *, two_threads: bool = False) -> dict[str, Times]:
     """Time tasks in turn, after one unmeasured round, so that a busy machine is equally busy for all of them.
 
     Every second round runs backwards: no task always follows the same one.
+
+    Args:
+        tasks: By name.
+        repeats: Measured rounds.
+        device: Where they run.
+        two_threads: On the CPU, also time two threads by wall clock.
     """
     names = list(tasks)
     rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
     for repeat in range(-1, repeats):
         for name in names if repeat % 2 else reversed(names):
-            row = _timed_on_cuda(tasks[name], device) if device.is_cuda else _timed_on_cpu(tasks[name])
+            row = _timed_on_cuda(tasks[name], device) if device.is_cuda else _timed_on_cpu(tasks[name], two_threads)
             if repeat >= 0:
                 rows[name].append(row)
     found = {}
     for name, task in tasks.items():
         alone, one, two = np.array(rows[name]).T
         on_cpu = not device.is_cuda
-        found[name] = Times(alone, one if on_cpu else None, two if on_cpu and task.threaded else None)
+        found[name] = Times(alone, one if on_cpu else None, two if on_cpu and two_threads and task.threaded else None)
     return found
 
 
@@ -102,12 +111,12 @@ def _timed_on_cuda(task: Task, device: Any) -> tuple[float, float, float]:
     return time.perf_counter() - started, np.nan, np.nan
 
 
-def _timed_on_cpu(task: Task) -> tuple[float, float, float]:
+def _timed_on_cpu(task: Task, two_threads: bool) -> tuple[float, float, float]:
     with launch_threads(1):
         cpu, wall = time.process_time(), time.perf_counter()
         task.run()
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    if not task.threaded:
+    if not (two_threads and task.threaded):
         return cpu, wall, np.nan
     with launch_threads(2):
         both = time.perf_counter()
