@@ -7,6 +7,7 @@ import pytest
 import tracing as benchmark
 import warp as wp
 from shapes import random_cloud, random_rays
+from timing import Times, launch_threads
 from tracing_baselines import EmbreeScene, EmbreeUnavailableError, PlainBvh, pack_gaussians
 from tracing_plot import draw_growth
 from tracing_scenes import (
@@ -20,7 +21,6 @@ from tracing_scenes import (
     torus_area,
     torus_surface,
 )
-from tracing_timing import Times, launch_threads
 
 from beam_warp.devices import resolve_device
 from beam_warp.kernels.launching import thread_count

@@ -1,19 +1,25 @@
-"""How long work takes on a machine that others use too: interleaved repeats, process CPU time, paired ratios."""
+"""How long work takes on a machine that others use too, and what that machine is.
+
+Repeats are interleaved, ratios are taken within a turn, one CPU thread is timed by process CPU time.
+"""
 
 from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+
+Name = TypeVar("Name", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,9 @@ def launch_threads(count: int) -> Iterator[None]:
             os.environ["BEAM_WARP_THREADS"] = before
 
 
-def take_turns(tasks: Mapping[str, Task], repeats: int, device: Any, *, two_threads: bool = False) -> dict[str, Times]:
+def take_turns(
+    tasks: Mapping[Name, Task], repeats: int, device: Any, *, two_threads: bool = False
+) -> dict[Name, Times]:
     """Time tasks in turn, after one unmeasured round, so that a busy machine is equally busy for all of them.
 
     Every second round runs backwards: no task always follows the same one.
@@ -89,7 +97,7 @@ def take_turns(tasks: Mapping[str, Task], repeats: int, device: Any, *, two_thre
         two_threads: On the CPU, also time two threads by wall clock.
     """
     names = list(tasks)
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
+    rows: dict[Name, list[tuple[float, float, float]]] = {name: [] for name in names}
     for repeat in range(-1, repeats):
         for name in names if repeat % 2 else reversed(names):
             row = _timed_on_cuda(tasks[name], device) if device.is_cuda else _timed_on_cpu(tasks[name], two_threads)
@@ -123,6 +131,17 @@ def _timed_on_cpu(task: Task, two_threads: bool) -> tuple[float, float, float]:
         task.run()
         both = time.perf_counter() - both
     return cpu, wall, both
+
+
+def commit() -> str:
+    """The checkout's commit, or 'unknown' outside one."""
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
+        )
+    except OSError:
+        return "unknown"
+    return found.stdout.strip() or "unknown"
 
 
 def machine(device: Any) -> dict[str, Any]:
