@@ -90,8 +90,8 @@ class Effort:
     overlaps: tuple[float, ...] = (0.5, 1.0, 2.0)
     opacities: tuple[float, ...] = (0.9, 0.5, 0.2)
     sweep_count: int = 140_000
-    growth_rays: int = 50_000
-    growth_repeats: int = 5
+    growth_rays: int = 30_000
+    growth_repeats: int = 8
     image: tuple[int, int] = (256, 256)
     parity_rays: int = 200_000
 
@@ -577,7 +577,7 @@ def measure(effort: Effort, device: Any, say: Callable[[str], None]) -> dict[str
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the JSON and the plot")
     parser.add_argument("--quick", action="store_true", help="fewer rays and repeats: a minute on two cores")

@@ -24,6 +24,8 @@ JITTER = 0.2
 """Standard deviation of the logarithm of every scale."""
 LIFT = 0.02
 """Distance of ray origins from the surface [m]."""
+POINTS_AT_ONCE = 1 << 15
+"""Points tried at a time: their arrays fit into a processor's cache."""
 PAIRS_AT_ONCE = 1 << 23
 """Pairs of ray and Gaussian held at a time by the brute force, 64 MiB a matrix."""
 
@@ -92,7 +94,7 @@ def bumpy_torus(
     points, normals = np.empty((count, 3)), np.empty((count, 3))
     filled = 0
     while filled < count:
-        u, v = rng.uniform(0.0, 2.0 * np.pi, (2, max(count, 1024)))
+        u, v = rng.uniform(0.0, 2.0 * np.pi, (2, POINTS_AT_ONCE))
         surface = torus_surface(u, v)
         kept = np.flatnonzero(rng.uniform(0.0, highest, len(u)) < surface.densities)[: count - filled]
         points[filled : filled + len(kept)] = surface.points[kept]

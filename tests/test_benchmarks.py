@@ -1,6 +1,7 @@
 """The tracing benchmark: its scene is what it says, its baselines compute the same V, and all of it runs."""
 
 import json
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -168,6 +169,22 @@ class TestBaselines:
         cloud = random_cloud(rng, 200, scale=(-2.0, 0.5), opacity=(0.0, 0.02))
         rays = random_rays(rng, 200)
         assert np.abs(embree(cloud).visibility(*rays) - visibility_reference(cloud, *rays)).max() < ROUNDING
+
+    def test_report_says_why_embree_is_absent(self, monkeypatch):
+        monkeypatch.setattr("tracing_baselines.embree_library", lambda: "libembree4.so")
+        monkeypatch.setattr("tracing_baselines.shutil.which", lambda name: None)
+        cloud, _ = bumpy_torus(100)
+        with ExitStack() as closing:
+            found, absent = benchmark.contenders_for(cloud, cosine_rays(cloud, 5), resolve_device("cpu"), closing)
+        assert absent == {"Embree 4": "no gcc"}
+        assert "Embree 4" not in found
+
+    def test_library_that_is_not_embree_is_named(self, monkeypatch, tmp_path):
+        (tmp_path / "libembree4.so").write_bytes(b"not a library")
+        monkeypatch.setattr("tracing_baselines.embree_library", lambda: tmp_path / "libembree4.so")
+        monkeypatch.setattr("tracing_baselines.shutil.which", lambda name: "gcc")
+        with pytest.raises(EmbreeUnavailableError, match="does not load"):
+            EmbreeScene(pack_gaussians(bumpy_torus(10)[0]))
 
 
 class TestTimes:
