@@ -84,14 +84,14 @@ class Effort:
 
     gaussians: int = 140_000
     points: int = 4_000
-    repeats: int = 9
+    repeats: int = 7
     truth_rays: int = 1_000
     counts: tuple[int, ...] = (10_000, 40_000, 140_000, 600_000)
     overlaps: tuple[float, ...] = (0.5, 1.0, 2.0)
     opacities: tuple[float, ...] = (0.9, 0.5, 0.2)
     sweep_count: int = 140_000
-    growth_rays: int = 30_000
-    growth_repeats: int = 8
+    growth_rays: int = 20_000
+    growth_repeats: int = 7
     image: tuple[int, int] = (256, 256)
     parity_rays: int = 200_000
 
