@@ -47,7 +47,7 @@ def draw_growth(result: dict[str, Any], path: Path) -> None:
     ):
         axes.set(title=title, xlabel=across, ylabel=up)
         axes.grid(True, which="both", alpha=0.25)
-    for axes in (by_count, building, error):  # colours mean the same in the whole row
+    for axes in (by_overlap, building, error):  # colours mean the same in the whole row
         axes.legend()
     machine = result["machine"]
     name = machine["processor"] if machine["device"] == "cpu" else machine["device"]
