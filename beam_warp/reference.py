@@ -26,8 +26,8 @@ QUARTIC_FALLOFF = 4.5 / 81.0
 FLOAT32_ROUNDOFF = 2.0**-24
 """Largest relative error of one float32 operation, u."""
 
-PAIRS_AT_ONCE = 1 << 21
-"""Ray and Gaussian pairs that are looked at together, 16 MiB an array."""
+PAIRS_AT_ONCE = 1 << 16
+"""Ray and Gaussian pairs that are looked at together: arrays of half a megabyte stay in a core's own cache."""
 
 
 def rotation_matrices(orientations: ArrayLike) -> NDArray[np.float64]:
@@ -214,8 +214,8 @@ def _candidates(
         near = distance_squared - np.square(along) / dd[:, None] <= np.square(reach) * (1.0 + 1e-9) + slack
         ray, index = np.nonzero(near)
         # A pile of Gaussians makes many pairs for few rays.
-        for first in range(0, len(ray), PAIRS_AT_ONCE // 8):
-            piece = slice(first, first + PAIRS_AT_ONCE // 8)
+        for first in range(0, len(ray), PAIRS_AT_ONCE):
+            piece = slice(first, first + PAIRS_AT_ONCE)
             yield ray[piece] + start, index[piece]
 
 
@@ -276,7 +276,8 @@ class _Pairs:
         upper = gaussians.alpha(index, np.maximum(distance - distance_error, 0.0))
         return cls(
             alpha=alpha,
-            alpha_low=lower * (1.0 - 24.0 * roundoff),  # exponent and exp: about 24 roundings of the exponent, at most 5.6
+            alpha_low=lower
+            * (1.0 - 24.0 * roundoff),  # exponent and exp: about 24 roundings of the exponent, at most 5.6
             alpha_high=np.minimum(upper * (1.0 + 24.0 * roundoff), ALPHA_MAX + roundoff),
             distance=distance,
             distance_error=distance_error + 8.0 * roundoff * gaussians.radii[index],

@@ -130,7 +130,9 @@ CASES: list[StressCase] = []
 """Every case, in the order of the table."""
 
 
-def stress_case(name: str, fails: str, *, large: bool = False) -> Callable[[Callable[[], Stress]], Callable[[], Stress]]:
+def stress_case(
+    name: str, fails: str, *, large: bool = False
+) -> Callable[[Callable[[], Stress]], Callable[[], Stress]]:
     """Register the function below it as a case."""
 
     def register(build: Callable[[], Stress]) -> Callable[[], Stress]:
@@ -687,7 +689,11 @@ def _reach() -> Stress:
     known = np.full(400, np.nan)
     known[:20] = 1.0
     return Stress(
-        cloud=cloud, origins=origins, directions=directions, t_max=np.maximum(t_max, 0.0).astype(np.float32), known=known
+        cloud=cloud,
+        origins=origins,
+        directions=directions,
+        t_max=np.maximum(t_max, 0.0).astype(np.float32),
+        known=known,
     )
 
 
