@@ -16,6 +16,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.assets import GaussianCloud
+from beam_warp.devices import device_label
 from beam_warp.lighting import ambient_occlusion, ray_offsets
 from beam_warp.reference import visibility_reference
 from beam_warp.scene import BACKENDS, Scene
@@ -204,7 +205,7 @@ def measure_occlusion(
         outcomes.append(
             OcclusionOutcome(
                 shape=shape.name,
-                device=str(scene.device),
+                device=device_label(scene.device),
                 backend=backend,
                 spacing=distance,
                 gaussians=len(tiled.cloud),
