@@ -212,29 +212,25 @@ class GaussianCloud:
             InvalidArrayError: As the constructor, after broken rows are gone.
             InvalidOptionError: As the constructor.
         """
+        if any(fields.get(name) is None for name, attribute in ATTRIBUTES.items() if attribute.required):
+            cls(**fields)  # refuses, in its own words
         arrays: dict[str, NDArray[Any]] = {}
         for name, attribute in ATTRIBUTES.items():
             if fields.get(name) is not None:
                 with np.errstate(over="ignore"):  # beyond float32 is infinity, and so counted below
                     array = require_array(name, fields[name], (None, *attribute.trailing), np.dtype(attribute.dtype))
-                require_same_length(name, array, "positions", len(np.atleast_1d(np.asarray(fields["positions"]))))
                 arrays[name] = array
-        count = len(arrays["positions"]) if "positions" in arrays else 0
-        broken = np.zeros(count, bool)
+                require_same_length(name, array, "positions", len(arrays["positions"]))
+        not_finite = np.zeros(len(arrays["positions"]), bool)
         for array in arrays.values():
             if array.dtype.kind == "f":
-                broken |= ~np.isfinite(array).reshape(count, -1).all(axis=1)
-        negative, zero = np.zeros(count, bool), np.zeros(count, bool)
-        if "scales" in arrays:
-            negative = ~broken & (arrays["scales"] < 0.0).any(axis=1)
-        if "orientations" in arrays:
-            zero = ~broken & ~negative & (arrays["orientations"] == 0.0).all(axis=1)
-        left_out = broken | negative | zero
-        kept = {name: array[~left_out] if left_out.any() else array for name, array in arrays.items()}
-        found = InvalidRows(
-            np.flatnonzero(left_out), *(int(np.count_nonzero(reason)) for reason in (broken, negative, zero))
-        )
-        return cls(**(fields | kept)), found
+                not_finite |= ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+        negative = ~not_finite & (arrays["scales"] < 0.0).any(axis=1)
+        zero = ~not_finite & ~negative & (arrays["orientations"] == 0.0).all(axis=1)
+        broken = not_finite | negative | zero
+        counts = (int(np.count_nonzero(reason)) for reason in (not_finite, negative, zero))
+        kept = {name: array[~broken] for name, array in arrays.items()}
+        return cls(**(fields | kept)), InvalidRows(np.flatnonzero(broken), *counts)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

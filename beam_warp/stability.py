@@ -798,6 +798,7 @@ def _two_million() -> Stress:
     count = 2_000_000
     direction = _unit(rng.normal(size=(count, 3)))
     positions = direction * (1.0 + 0.01 * rng.normal(size=(count, 1)))
-    cloud = _cloud(rng, count, 0.002 * np.exp(rng.normal(0.0, 0.3, (count, 3))), positions=positions)
+    scales = 0.001 * np.exp(rng.normal(0.0, 0.3, (count, 3)))
+    cloud = _cloud(rng, count, scales, positions=positions, opacities=(0.02, 0.6))
     origins, directions = _aimed(rng, cloud, 192, distance=(0.05, 1.5))
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": count})
