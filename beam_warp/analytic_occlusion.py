@@ -266,7 +266,8 @@ def tile(points: ArrayLike, normals: ArrayLike, spacing: float) -> dict[str, NDA
 
 def _joined(*parts: dict[str, NDArray[Any]]) -> GaussianCloud:
     """Return one cloud of several sets of tiles."""
-    return GaussianCloud(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    arrays: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return GaussianCloud(**arrays)
 
 
 def _rectangle(width: float, height: float, spacing: float) -> NDArray[np.float64]:

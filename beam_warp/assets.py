@@ -229,7 +229,7 @@ class GaussianCloud:
         zero = ~not_finite & ~negative & (arrays["orientations"] == 0.0).all(axis=1)
         broken = not_finite | negative | zero
         counts = (int(np.count_nonzero(reason)) for reason in (not_finite, negative, zero))
-        kept = {name: array[~broken] for name, array in arrays.items()}
+        kept: dict[str, Any] = {name: array[~broken] for name, array in arrays.items()}
         return cls(**(fields | kept)), InvalidRows(np.flatnonzero(broken), *counts)
 
     def __len__(self) -> int:

@@ -94,6 +94,7 @@ class Outcome:
         did: What came out, in words.
         error: Largest difference from float64; a V that is not finite counts as 1.
         bound: Largest difference that rounding and the early stop explain, over the rays.
+        typical_bound: Median over the rays of the same.
         raising: Largest change of V by raising scales, in float64; 0 where none was raised.
         detected: What was found in the input, in words.
         done: What was done about it, in words.
@@ -109,6 +110,7 @@ class Outcome:
     did: str
     error: float
     bound: float
+    typical_bound: float
     raising: float
     detected: str
     done: str
@@ -206,6 +208,7 @@ def run_case(case: StressCase, device: str | None = None, *, backends: Sequence[
                 did=did,
                 error=float(np.where(np.isfinite(error), error, 1.0).max(initial=0.0)),
                 bound=float(truth.rays.width.max(initial=0.0)),
+                typical_bound=float(np.median(truth.rays.width)) if len(result) else 0.0,
                 raising=truth.raising,
                 detected=_detected(stress, scene),
                 done=_done(stress, scene, truth.raising),
@@ -350,7 +353,7 @@ def _cloud(
         "positions": rng.uniform(-side, side, (count, 3)),
         "orientations": _orientations(rng, count),
         "scales": np.broadcast_to(scales, (count, 3)),
-        "opacities": rng.uniform(*opacities, count) if isinstance(opacities, tuple) else opacities,
+        "opacities": rng.uniform(opacities[0], opacities[1], count) if isinstance(opacities, tuple) else opacities,
     }
     return GaussianCloud(**(arrays | changes))
 
@@ -480,7 +483,7 @@ def _points() -> Stress:
 def _far_away() -> Stress:
     rng = np.random.default_rng(11)
     cloud = _cloud(rng, 500, 0.05 * np.exp(rng.normal(0.0, 0.4, (500, 3))))
-    cloud = cloud.with_arrays(positions=cloud.positions + np.float32([1e4, -1e4, 1e4]))
+    cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
     origins, directions = _aimed(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 500})
 
@@ -489,7 +492,7 @@ def _far_away() -> Stress:
 def _far_away_thin() -> Stress:
     rng = np.random.default_rng(12)
     cloud = _cloud(rng, 500, (0.05, 0.05, 4e-4))
-    cloud = cloud.with_arrays(positions=cloud.positions + np.float32([1e4, -1e4, 1e4]))
+    cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
     origins, directions = _aimed(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
 
@@ -506,7 +509,7 @@ def _long_rays() -> Stress:
 def _clusters() -> Stress:
     rng = np.random.default_rng(35)
     cloud = _cloud(rng, 400, 1e-3 * np.exp(rng.normal(0.0, 0.3, (400, 3))), side=0.01, opacities=(0.05, 0.6))
-    side = np.where(np.arange(400) % 2 == 0, 500.0, -500.0)[:, None] * np.float64([1.0, 0.3, -0.7])
+    side = np.where(np.arange(400) % 2 == 0, 500.0, -500.0)[:, None] * np.array([1.0, 0.3, -0.7])
     cloud = cloud.with_arrays(positions=cloud.positions + side)
     origins, directions = _aimed(rng, cloud, 300, distance=(0.0, 0.05))
     return Stress(cloud=cloud, origins=origins, directions=directions)
@@ -520,7 +523,7 @@ def _parallel() -> Stress:
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
-@stress_case("axis-parallel rays on box planes", "0 · ∞ is NaN: Warp's own test loses 32 of 36 hits")
+@stress_case("axis-parallel rays on box planes", "0 · ∞ is NaN in the box test: boxes that a ray touches are missed")
 def _on_planes() -> Stress:
     rng = np.random.default_rng(15)
     # A grid whose middle is the origin exactly, so that box planes are at the same floats in world and scene.
@@ -550,7 +553,7 @@ def _denormal() -> Stress:
     cloud = _cloud(rng, 400, 0.1 * np.exp(rng.normal(0.0, 0.4, (400, 3))), opacities=(0.05, 0.5))
     d = _axis_parallel(rng, 400)
     tiny = np.float32(10.0) ** rng.uniform(-44.0, -9.0, (400, 3)).astype(np.float32)
-    d = np.where(d == 0.0, tiny * rng.choice(np.float32([-1.0, 1.0]), (400, 3)), d).astype(np.float32)
+    d = np.where(d == 0.0, tiny * rng.choice(np.array([-1.0, 1.0], np.float32), (400, 3)), d).astype(np.float32)
     origins, directions = _aimed(rng, cloud, 400, directions=d)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
@@ -581,7 +584,7 @@ def _chain() -> Stress:
         rng,
         800,
         (place * 0.2)[:, None],
-        positions=place[:, None] * np.float64([1.0, 0.5, 0.25]),
+        positions=place[:, None] * np.array([1.0, 0.5, 0.25]),
         opacities=(0.02, 0.2),
     )
     origins, directions = _aimed(rng, cloud, 200)
@@ -591,7 +594,7 @@ def _chain() -> Stress:
 @stress_case("all centres on a line", "boxes of centres with no area: costs of 0 / 0")
 def _line() -> Stress:
     rng = np.random.default_rng(19)
-    positions = rng.uniform(-1.0, 1.0, (500, 1)) * np.float64([1.0, 0.0, 0.0])
+    positions = rng.uniform(-1.0, 1.0, (500, 1)) * np.array([1.0, 0.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
     origins, directions = _aimed(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions)
@@ -600,7 +603,7 @@ def _line() -> Stress:
 @stress_case("all centres on a plane", "one axis without extent: 0 / 0 in Morton codes")
 def _plane() -> Stress:
     rng = np.random.default_rng(20)
-    positions = rng.uniform(-1.0, 1.0, (500, 3)) * np.float64([1.0, 1.0, 0.0])
+    positions = rng.uniform(-1.0, 1.0, (500, 3)) * np.array([1.0, 1.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
     origins, directions = _aimed(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions)
@@ -620,7 +623,7 @@ def _one_place() -> Stress:
 def _opacities() -> Stress:
     rng = np.random.default_rng(22)
     cut = np.float32(1.0 / 255.0)
-    levels = np.float32([0.0, cut, np.nextafter(cut, np.float32(1.0)), 1.001 * cut, 0.99, 1.0])
+    levels = np.array([0.0, cut, np.nextafter(cut, np.float32(1.0)), 1.001 * cut, 0.99, 1.0], np.float32)
     cloud = _cloud(rng, 600, 0.05, opacities=np.repeat(levels, 100))
     origins, directions = _aimed(rng, cloud, 400, spread=0.5)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"dropped": 200, "traced": 400})
@@ -680,7 +683,7 @@ def _no_offset() -> Stress:
     )
     up = rng.normal(size=(400, 3))
     up[:, 2] = np.abs(up[:, 2])
-    normals = np.tile(np.float32([0.0, 0.0, 1.0]), (400, 1))
+    normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (400, 1))
     return Stress(cloud=cloud, origins=positions, directions=_unit(up), occlusion_points=(positions, normals))
 
 
@@ -745,8 +748,14 @@ def _symmetry() -> Stress:
 
 @stress_case("one Gaussian", "a tree without an inner node")
 def _one() -> Stress:
-    cloud = GaussianCloud(
-        positions=[[1.0, 2.0, 3.0]], orientations=[[0.0, 0.0, 0.0, 1.0]], scales=[[0.1, 0.2, 0.3]], opacities=[0.7]
+    rng = np.random.default_rng(30)
+    cloud = _cloud(
+        rng,
+        1,
+        [0.1, 0.2, 0.3],
+        positions=np.array([[1.0, 2.0, 3.0]]),
+        orientations=np.array([[0.0, 0.0, 0.0, 1.0]]),
+        opacities=np.array([0.7]),
     )
     z = np.linspace(-1.2, 1.2, 49)
     origins = np.stack([np.zeros(49), np.full(49, 2.0), 3.0 + z], axis=1).astype(np.float32)
@@ -755,7 +764,7 @@ def _one() -> Stress:
     return Stress(
         cloud=cloud,
         origins=origins,
-        directions=np.tile(np.float32([1.0, 0.0, 0.0]), (49, 1)),
+        directions=np.tile(np.array([1.0, 0.0, 0.0], np.float32), (49, 1)),
         known=np.where(alpha >= 1.0 / 255.0, 1.0 - alpha, 1.0),
         expected={"traced": 1},
     )
@@ -771,7 +780,7 @@ def _none() -> Stress:
         directions=_unit(rng.normal(size=(50, 3))),
         known=np.ones(50),
         expected={"traced": 0},
-        occlusion_points=(np.zeros((3, 3), np.float32), np.tile(np.float32([0.0, 0.0, 1.0]), (3, 1))),
+        occlusion_points=(np.zeros((3, 3), np.float32), np.tile(np.array([0.0, 0.0, 1.0], np.float32), (3, 1))),
     )
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from beam_warp._version import __version__
 from beam_warp.analytic_occlusion import SHAPES, OcclusionOutcome
@@ -20,14 +20,16 @@ those of one run of
 
     {command}
 
-**Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the largest difference that float32
-explains there. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval for each ray and each
+A column for each device: run it there with `--json`, and give those files to `--beside` of the run that writes the page.
+
+**Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the difference that float32 explains
+there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval for each ray and each
 Gaussian, from a count of the tracer's roundings. A ray's position relative to a Gaussian is rounded to about
 6e-8 × distance, so its whitened distance to 6e-8 × distance / smallest σ; a decision that falls within that (in front
 or not, above the cut of 1/255 or not) may go either way; and the early stop may add 1e-4. Each ray must lie in its own
-interval, which is mostly far narrower than the largest; V must be finite and in [0, 1]; and what was detected must be
+interval, so that a hit that is certain cannot be missed; V must be finite and in [0, 1]; and what was detected must be
 what the case put in. Where *allowed* is large, float32 rays do not say what V is: no tracer of that precision does
-better, and the remedy is to move the scene's origin or to enlarge its Gaussians.
+better, and the remedy is to split the scene or to enlarge its Gaussians.
 
 **Detected** and **done** say what happened to the input before tracing. Rows that are no Gaussian (NaN, infinity,
 negative scales, zero quaternions) are refused by `GaussianCloud(...)`, which names the first, and left out and
@@ -88,8 +90,8 @@ def read_result(path: Path) -> StabilityResult:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         return StabilityResult(
-            tuple(Outcome(**_values(Outcome, row) | {"faults": tuple(row["faults"])}) for row in record["cases"]),
-            tuple(OcclusionOutcome(**_values(OcclusionOutcome, row)) for row in record["occlusion"]),
+            tuple(_record(Outcome, row) for row in record["cases"]),
+            tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
         )
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
@@ -99,9 +101,16 @@ def read_result(path: Path) -> StabilityResult:
         ) from error
 
 
-def _values(record: type, row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row's values for the fields of a record."""
-    return {entry.name: row[entry.name] for entry in fields(record)}
+_Record = TypeVar("_Record", Outcome, OcclusionOutcome)
+
+
+def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
+    """Return a record from its JSON form, whose tuples are lists."""
+    values: dict[str, Any] = {
+        entry.name: tuple(row[entry.name]) if isinstance(row[entry.name], list) else row[entry.name]
+        for entry in fields(kind)
+    }
+    return kind(**values)
 
 
 def columns_of(outcomes: Sequence[Outcome | OcclusionOutcome]) -> list[tuple[str, str]]:
@@ -114,6 +123,11 @@ def verdict_of(outcomes: Sequence[Outcome]) -> str:
     return "; ".join(f"{o.device} {o.backend}: {o.faults[0]}" for o in outcomes if o.faults) or "ok"
 
 
+def allowed_by(outcome: Outcome) -> str:
+    """Return median and largest of what rounding explains, for a table."""
+    return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
+
+
 def markdown(result: StabilityResult, command: str) -> str:
     """Return the page.
 
@@ -124,7 +138,7 @@ def markdown(result: StabilityResult, command: str) -> str:
     columns = columns_of(result.outcomes)
     lines = ["# Stability", "", HOW_TO_READ.format(command=command), "## Stress cases", ""]
     lines += _header(
-        ["case", "a tracer without precautions", "detected", "done", "result", "allowed"]
+        ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]
         + [f"error, {device}, {backend}" for device, backend in columns]
         + ["verdict"]
     )
@@ -132,10 +146,9 @@ def markdown(result: StabilityResult, command: str) -> str:
         rows = {(o.device, o.backend): o for o in result.outcomes if o.case == case.name}
         if rows:
             first = next(iter(rows.values()))
-            allowed = max(o.bound for o in rows.values())
             lines.append(
                 _row(
-                    [case.name, case.fails, first.detected, first.done, first.did, _number(allowed)]
+                    [case.name, case.fails, first.detected, first.done, first.did, allowed_by(first)]
                     + [_number(rows[key].error) if key in rows else "not run" for key in columns]
                     + [verdict_of(list(rows.values()))]
                 )

@@ -1,6 +1,7 @@
 """Every stress case on every device and backend; that the suite notices faults; and how naive tracers fail."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.reference import rotation_matrices, visibility_enclosure, visibility_reference
 from beam_warp.scene import BACKENDS
 from beam_warp.stability import CASES, case_of, run_case
+from beam_warp.stability_report import HOW_TO_READ, OCCLUSION_TEXT
 
 SMALL = [case for case in CASES if not case.large]
 
@@ -42,6 +44,16 @@ class TestCases:
             (outcome,) = run_case(case, "cpu", backends=("warp",))
             truth = stability.Truth.of(stress, stability.Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
             assert (truth.rays.hits > 0).mean() > 0.5, outcome.did
+
+
+def test_the_page_in_the_docs_is_of_these_cases():
+    """After a change of cases or of the text: beam stability --large --out docs/stability.md."""
+    page = (Path(__file__).parent.parent / "docs" / "stability.md").read_text(encoding="utf-8")
+    listed = [line.split(" | ")[0].removeprefix("| ") for line in page.splitlines() if line.startswith("| ")]
+    names = [case.name for case in CASES]
+    assert [name for name in listed if name in names] == names
+    assert HOW_TO_READ.partition("{command}")[2] in page
+    assert OCCLUSION_TEXT in page
 
 
 class TestTheSuiteItself:

@@ -87,7 +87,7 @@ def _print_tables(result: StabilityResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.stability_report import columns_of
+    from beam_warp.stability_report import allowed_by, columns_of
 
     console = Console(width=None if sys.stdout.isatty() else 200)
     columns = columns_of(result.outcomes)
@@ -103,7 +103,7 @@ def _print_tables(result: StabilityResult) -> None:
             rows[0].did,
             rows[0].detected,
             rows[0].done,
-            f"{rows[0].bound:.1e}",
+            allowed_by(rows[0]),
             *(f"{outcome.error:.1e}" for outcome in rows),
             "ok" if all(outcome.passed for outcome in rows) else "[red]failed[/red]",
         )
