@@ -158,6 +158,7 @@ class _Gaussians:
 
     centers: NDArray[np.float64]
     whitening: NDArray[np.float64]
+    scales: NDArray[np.float64]
     smallest: NDArray[np.float64]
     largest: NDArray[np.float64]
     opacities: NDArray[np.float64]
@@ -172,6 +173,7 @@ class _Gaussians:
         return cls(
             centers=cloud.positions.astype(np.float64) - middle,
             whitening=rotation_matrices(cloud.orientations).transpose(0, 2, 1) / scales[:, :, None],
+            scales=scales,
             smallest=scales.min(axis=1),
             largest=scales.max(axis=1),
             opacities=opacities,
@@ -192,11 +194,11 @@ def _candidates(
     """Yield (ray, Gaussian) pairs that may count: the line passes the centre within the support's longest axis.
 
     With a whitened distance r, the line's distance from the centre is at most r sigma_max. The interval around r has
-    half-width at most dp / sigma_min + 64 u r sigma_max / sigma_min (see `_Pairs`), hence the reach below.
+    half-width at most dp / sigma_min + 88 u r sigma_max / sigma_min (see `_Pairs`), hence the reach below.
     """
     centers = gaussians.centers
     ratio = gaussians.largest / gaussians.smallest
-    spread = 64.0 * roundoff * ratio
+    spread = 88.0 * roundoff * ratio
     own = gaussians.radii * gaussians.largest
     center_squared = np.einsum("nk,nk->n", centers, centers)
     step = max(1, PAIRS_AT_ONCE // len(centers))
@@ -225,10 +227,12 @@ class _Pairs:
 
     With u the roundoff, o and c the coordinates of ray and centre, p = o - c, p' the point of the line nearest to the
     centre, q = M p', v = M d: the tracer rounds o, c, p, d t and p' once each, so that p' is off the line by at most
-    dp = u (|o| + |c| + |p| + |t| + |p'|); what lies along the line does not matter. Each entry of M stems from
-    about 16 roundings of a unit quaternion's products and one division, and a product with M has three more, so that
-    dq = (dp + 20 u |p'|) / sigma_min and dv = 20 u / sigma_min. The distance r = |q x v| / |v| is off by at most
-    dq + |q.v| / |v|^2 dv + 4 u (|q| + r), the parameter t of the peak by the like.
+    dp = u (|o| + |c| + |p| + |t| + |p'|); what lies along the line does not matter. The rows of M come from about 16
+    roundings of a unit quaternion's products and a division, and its product with a vector rounds thrice: as if
+    p' were off by another 24 u |p'|, and d by 24 u. M carries these to q and v, and only what is perpendicular to
+    v changes the distance r = |q x v| / |v|: the leverage of M there is at most 1 / sigma_min, and for a disc that
+    is crossed steeply about 1 / sigma_max. An error of v turns the line about the nearest point, by the shift from
+    there to the peak. Products in q x v round as they are large. The parameter t of the peak is bounded likewise.
     """
 
     alpha: NDArray[np.float64]
@@ -250,7 +254,8 @@ class _Pairs:
         index: NDArray[np.int64],
         roundoff: float,
     ) -> _Pairs:
-        whitening, smallest, c = gaussians.whitening[index], gaussians.smallest[index], gaussians.centers[index]
+        whitening, c = gaussians.whitening[index], gaussians.centers[index]
+        smallest, scales = gaussians.smallest[index], gaussians.scales[index]
         p = o - c
         t_closest = -np.einsum("nk,nk->n", p, d)
         closest = p + d * t_closest[:, None]
@@ -262,13 +267,21 @@ class _Pairs:
         distance = np.linalg.norm(np.cross(q, v), axis=1) / speed
         lengths = {"p": p, "closest": closest, "q": q, "o": o, "c": c}
         size = {name: np.linalg.norm(value, axis=1) for name, value in lengths.items()}
-        point_error = roundoff * (size["o"] + size["c"] + size["p"] + np.abs(t_closest) + size["closest"])
-        q_error = (point_error + 20.0 * roundoff * size["closest"]) / smallest
-        v_error = 20.0 * roundoff / smallest
-        distance_error = q_error + np.abs(shift) * v_error + 4.0 * roundoff * (size["q"] + distance)
+        point_error = roundoff * (size["o"] + size["c"] + size["p"] + np.abs(t_closest) + 25.0 * size["closest"])
+        squares = np.square(v / speed[:, None])
+        across = squares[:, [1, 2, 0]] + squares[:, [2, 0, 1]]  # 1 - squares, without cancellation
+        leverage = np.minimum(1.0 / smallest, np.sqrt((across / np.square(scales)).sum(axis=1)))
+        one, other = [1, 2, 0], [2, 0, 1]
+        products = np.abs(q[:, one] * v[:, other]) + np.abs(q[:, other] * v[:, one])
+        distance_error = (
+            (point_error + np.abs(shift) * 24.0 * roundoff) * leverage
+            + 2.0 * roundoff * products.sum(axis=1) / speed
+            + 4.0 * roundoff * distance
+        )
+        v_error = 24.0 * roundoff / smallest
         t_error = (
             roundoff * (size["o"] + size["c"] + 4.0 * size["p"])
-            + (q_error + 3.0 * roundoff * size["q"]) / speed
+            + (point_error / smallest + 3.0 * roundoff * size["q"]) / speed
             + 3.0 * size["q"] * v_error / vv
         )
         alpha = gaussians.alpha(index, distance)

@@ -20,16 +20,17 @@ those of one run of
 
     {command}
 
-A column for each device: run it there with `--json`, and give those files to `--beside` of the run that writes the page.
+Each device has its columns: run with `--json` there, and give those files to `--beside` of the run that writes the
+page.
 
 **Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the difference that float32 explains
-there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval for each ray and each
-Gaussian, from a count of the tracer's roundings. A ray's position relative to a Gaussian is rounded to about
-6e-8 × distance, so its whitened distance to 6e-8 × distance / smallest σ; a decision that falls within that (in front
-or not, above the cut of 1/255 or not) may go either way; and the early stop may add 1e-4. Each ray must lie in its own
-interval, so that a hit that is certain cannot be missed; V must be finite and in [0, 1]; and what was detected must be
-what the case put in. Where *allowed* is large, float32 rays do not say what V is: no tracer of that precision does
-better, and the remedy is to split the scene or to enlarge its Gaussians.
+there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval
+for each ray and each Gaussian, from a count of the tracer's roundings. A ray's position relative to a Gaussian is
+rounded to about 6e-8 × distance, so its whitened distance to 6e-8 × distance / smallest σ; a decision that falls within
+that (in front or not, above the cut of 1/255 or not) may go either way; and the early stop may add 1e-4. Each ray must
+lie in its own interval, so that a hit that is certain cannot be missed; V must be finite and in [0, 1]; and what was
+detected must be what the case put in. Where *allowed* is large, float32 rays do not say what V is: no tracer of that
+precision does better, and the remedy is to split the scene or to enlarge its Gaussians.
 
 **Detected** and **done** say what happened to the input before tracing. Rows that are no Gaussian (NaN, infinity,
 negative scales, zero quaternions) are refused by `GaussianCloud(...)`, which names the first, and left out and

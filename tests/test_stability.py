@@ -8,13 +8,14 @@ import pytest
 import warp as wp
 from shapes import random_cloud, random_rays
 
-from beam_warp import GaussianCloud, stability
+from beam_warp import GaussianCloud, Scene, stability, visibility
 from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, launch_pack_gaussians
 from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.reference import rotation_matrices, visibility_enclosure, visibility_reference
 from beam_warp.scene import BACKENDS
 from beam_warp.stability import CASES, case_of, run_case
 from beam_warp.stability_report import HOW_TO_READ, OCCLUSION_TEXT
+from beam_warp.tracing import TraceOptions
 
 SMALL = [case for case in CASES if not case.large]
 
@@ -26,6 +27,28 @@ class TestCases:
         """The bound of each ray is derived in `beam_warp.reference`: no case has a tolerance."""
         (outcome,) = run_case(case, device, backends=(backend,))
         assert outcome.faults == ()
+
+    @pytest.mark.parametrize("backend", BACKENDS)
+    @pytest.mark.parametrize("seed", range(12))
+    def test_random_clouds_stay_in_their_intervals(self, device, backend, seed):
+        """Every mixture of scales, rules and degrees, without the stop that would hide rounding below it."""
+        rng = np.random.default_rng(seed)
+        cloud = random_cloud(rng, 300, scale=[(-3.5, 0.8), (-5.0, 1.5), (-3.0, 2.5), (-7.0, 1.0)][seed % 4])
+        cloud = cloud.with_arrays(opacities=0.6 * cloud.opacities)
+        rays = stability._aimed(rng, cloud, 300, distance=(-0.1, 2.0))
+        degree, front = (2, 2, 4)[seed % 3], ("peak", "entry")[seed // 2 % 2]
+        t_max = rng.uniform(0.0, 2.0, 300).astype(np.float32) if seed % 5 == 0 else np.inf
+        scene = Scene.from_gaussians(cloud, device, backend=backend, response_degree=degree)
+        result = visibility(scene, *rays, t_max=t_max, options=TraceOptions(front=front, stop=0.0))
+        truth = visibility_enclosure(
+            stability.traced_cloud(cloud, scene),
+            *rays,
+            t_max=t_max,
+            front=front,
+            response_degree=degree,
+            middle=scene.origin,
+        )
+        assert ((result >= truth.low) & (result <= truth.high)).all()
 
     def test_names_are_unique(self):
         assert len({case.name for case in CASES}) == len(CASES)
@@ -42,7 +65,7 @@ class TestCases:
         stress = case.build()
         if stress.known is None and len(stress.origins):
             (outcome,) = run_case(case, "cpu", backends=("warp",))
-            truth = stability.Truth.of(stress, stability.Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
+            truth = stability.Truth.of(stress, Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
             assert (truth.rays.hits > 0).mean() > 0.5, outcome.did
 
 
