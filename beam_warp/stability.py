@@ -20,8 +20,9 @@ from beam_warp.assets import GaussianCloud, InvalidRows
 from beam_warp.checks import require_choice
 from beam_warp.devices import device_label
 from beam_warp.lighting import ambient_occlusion
+from beam_warp.packed_gaussians import SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO
 from beam_warp.reference import Enclosure, rotation_matrices, visibility_enclosure, visibility_reference
-from beam_warp.scene import BACKENDS, SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO, Scene
+from beam_warp.scene import BACKENDS, Scene
 from beam_warp.tracing import EXACT, TraceOptions, visibility
 
 NONE_LEFT_OUT = InvalidRows(np.zeros(0, np.int64), 0, 0, 0)

@@ -324,8 +324,9 @@ class TestOnTheDevice:
             setattr(gaussians, name, wp.zeros(1, dtype=wp.vec4, device=device))
         gaussians.degree = 2
         lower, upper = (wp.zeros(1, dtype=wp.vec3, device=device) for _ in range(2))
-        fates = wp.zeros(1, dtype=int, device=device)
-        launch_pack_gaussians(*inputs, wp.vec3(), 1e-7, 1e-4, gaussians, lower, upper, fates, wp.get_device(device))
+        fates, takes_part = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        outputs = (gaussians, lower, upper, fates, takes_part)
+        launch_pack_gaussians(*inputs, wp.vec3(), 1e-7, 1e-4, *outputs, wp.get_device(device))
         packed = [getattr(gaussians, f"whitening_{k}").numpy() for k in range(3)]
         values = [gaussians.center_opacity.numpy()[:, :3], lower.numpy(), upper.numpy(), *packed]
         return int(fates.numpy()[0]), float(packed[0][0, 3]), all(np.isfinite(value).all() for value in values)
