@@ -22,10 +22,13 @@ from beam_warp.devices import device_label
 from beam_warp.lighting import ambient_occlusion
 from beam_warp.packed_gaussians import SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO
 from beam_warp.reference import Enclosure, rotation_matrices, visibility_enclosure, visibility_reference
-from beam_warp.scene import BACKENDS, Scene
+from beam_warp.scene import Scene
 from beam_warp.tracing import EXACT, TraceOptions, visibility
 
 NONE_LEFT_OUT = InvalidRows(np.zeros(0, np.int64), 0, 0, 0)
+
+HIERARCHIES = ("wide", "wide, fast", "wide, refitted", "warp")
+"""The own tree by either build, one that was built for other places and refitted, and ``wp.Bvh``."""
 
 SCALE_FOR_ZERO = 1e-7
 """In the truth of an unraised cloud a scale of 0 stands for this part of the smallest one traced."""
@@ -84,12 +87,12 @@ class StressCase:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one backend on one device made of one case.
+    """What one hierarchy on one device made of one case.
 
     Attributes:
         case: Name of the case.
         device: Warp device.
-        backend: Hierarchy.
+        hierarchy: From `HIERARCHIES`.
         gaussians: Number of Gaussians given, broken rows included.
         rays: Number of rays.
         did: What came out, in words.
@@ -105,7 +108,7 @@ class Outcome:
 
     case: str
     device: str
-    backend: str
+    hierarchy: str
     gaussians: int
     rays: int
     did: str
@@ -159,36 +162,31 @@ def run_cases(
     cases: Sequence[StressCase],
     device: str | None = None,
     *,
-    backends: Sequence[str] = BACKENDS,
+    hierarchies: Sequence[str] = HIERARCHIES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[Outcome]:
-    """Run cases one after the other, each on every backend.
+    """Run cases one after the other, each under every hierarchy.
 
     Args:
         cases: From `CASES`.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
-        backends: Hierarchies to try.
+        hierarchies: From `HIERARCHIES`.
         progress: Called with (cases done, cases in all).
     """
     for done, case in enumerate(cases, start=1):
-        yield from run_case(case, device, backends=backends)
+        yield from run_case(case, device, hierarchies=hierarchies)
         if progress is not None:
             progress(done, len(cases))
 
 
-def run_case(case: StressCase, device: str | None = None, *, backends: Sequence[str] = BACKENDS) -> list[Outcome]:
-    """Run one case on each backend; they share the float64 truth."""
+def run_case(case: StressCase, device: str | None = None, *, hierarchies: Sequence[str] = HIERARCHIES) -> list[Outcome]:
+    """Run one case under each hierarchy; they share the float64 truth."""
     stress = case.build()
     outcomes: list[Outcome] = []
     truth: Truth | None = None
-    for backend in backends:
+    for hierarchy in hierarchies:
         start = time.perf_counter()
-        scene = Scene.from_gaussians(
-            stress.cloud,
-            device,
-            backend=backend,  # type: ignore[arg-type]
-            response_degree=stress.response_degree,
-        )
+        scene = scene_under(hierarchy, stress.cloud, device, stress.response_degree)
         result = visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=stress.options)
         truth = truth or Truth.of(stress, scene)
         faults = _faults(stress, scene, result, truth)
@@ -203,7 +201,7 @@ def run_case(case: StressCase, device: str | None = None, *, backends: Sequence[
             Outcome(
                 case=case.name,
                 device=device_label(scene.device),
-                backend=backend,
+                hierarchy=hierarchy,
                 gaussians=len(stress.cloud) + len(stress.left_out),
                 rays=len(stress.origins),
                 did=did,
@@ -218,6 +216,27 @@ def run_case(case: StressCase, device: str | None = None, *, backends: Sequence[
             )
         )
     return outcomes
+
+
+def scene_under(hierarchy: str, cloud: GaussianCloud, device: str | None, response_degree: Any = 2) -> Scene:
+    """Return the scene of a cloud under one of `HIERARCHIES`.
+
+    The refitted tree was built for a scene of the same extent in which every Gaussian was in its neighbour's place.
+    """
+    require_choice("hierarchy", hierarchy, HIERARCHIES)
+    if hierarchy == "warp":
+        return Scene.from_gaussians(cloud, device, backend="warp", response_degree=response_degree)
+    if hierarchy != "wide, refitted":
+        build = "fast" if hierarchy == "wide, fast" else "quality"
+        return Scene.from_gaussians(cloud, device, backend="wide", build=build, response_degree=response_degree)
+    seen = np.flatnonzero(cloud.opacities > 1.0 / 255.0)
+    positions = cloud.positions.copy()
+    positions[seen] = cloud.positions[np.roll(seen, 1)]
+    scene = Scene.from_gaussians(
+        cloud.with_arrays(positions=positions), device, backend="wide", response_degree=response_degree
+    )
+    scene.move(cloud.positions, cloud.orientations, cloud.scales, tree="refit")
+    return scene
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The stability suite as a page: what every case, backend and device made of every scene, side by side."""
+"""The stability suite as a page: what every hierarchy and device made of every scene, side by side."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ those of one run of
 
     {command}
 
-Each device has its columns: run with `--json` there, and give those files to `--beside` of the run that writes the
-page.
+Each case runs under the own tree in both builds, under one that was built for other places and refitted, and under
+`wp.Bvh`; the table has the worst of them. Each device has a column: run with `--json` there, and give those files to
+`--beside` of the run that writes the page.
 
 **Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the difference that float32 explains
 there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval
@@ -114,14 +115,14 @@ def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
     return kind(**values)
 
 
-def columns_of(outcomes: Sequence[Outcome | OcclusionOutcome]) -> list[tuple[str, str]]:
-    """Return the (device, backend) pairs that occur, in order."""
-    return list(dict.fromkeys((outcome.device, outcome.backend) for outcome in outcomes))
+def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome]) -> list[str]:
+    """Return the devices that occur, in order."""
+    return list(dict.fromkeys(outcome.device for outcome in outcomes))
 
 
 def verdict_of(outcomes: Sequence[Outcome]) -> str:
     """Return ``ok``, or the first fault of each that failed."""
-    return "; ".join(f"{o.device} {o.backend}: {o.faults[0]}" for o in outcomes if o.faults) or "ok"
+    return "; ".join(f"{o.device}, {o.hierarchy}: {o.faults[0]}" for o in outcomes if o.faults) or "ok"
 
 
 def allowed_by(outcome: Outcome) -> str:
@@ -133,49 +134,45 @@ def markdown(result: StabilityResult, command: str) -> str:
     """Return the page.
 
     Args:
-        result: Of any number of devices and backends.
+        result: Of any number of devices and hierarchies.
         command: That makes the page, for its text.
     """
-    columns = columns_of(result.outcomes)
+    devices = devices_of(result.outcomes)
     lines = ["# Stability", "", HOW_TO_READ.format(command=command), "## Stress cases", ""]
     lines += _header(
         ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]
-        + [f"error, {device}, {backend}" for device, backend in columns]
+        + [f"error, {device}" for device in devices]
         + ["verdict"]
     )
     for case in CASES:
-        rows = {(o.device, o.backend): o for o in result.outcomes if o.case == case.name}
-        if rows:
-            first = next(iter(rows.values()))
+        same = [outcome for outcome in result.outcomes if outcome.case == case.name]
+        if same:
+            first = same[0]
+            errors = {device: [o.error for o in same if o.device == device] for device in devices}
             lines.append(
                 _row(
                     [case.name, case.fails, first.detected, first.done, first.did, allowed_by(first)]
-                    + [_number(rows[key].error) if key in rows else "not run" for key in columns]
-                    + [verdict_of(list(rows.values()))]
+                    + [_number(max(found)) if found else "not run" for found in errors.values()]
+                    + [verdict_of(same)]
                 )
             )
+    devices = devices_of(result.occlusion)
     lines += ["", "## Ambient occlusion of known shapes", "", OCCLUSION_TEXT]
-    columns = columns_of(result.occlusion)
     lines += _header(
         ["shape", "closed form", "spacing", "Gaussians", "smooth", "tiled", "discretisation"]
-        + [f"estimate, largest z, true z², {device}, {backend}" for device, backend in columns]
+        + [f"estimate, largest z, true z², {device}" for device in devices]
         + ["verdict"]
     )
     for shape in SHAPES:
         for spacing in dict.fromkeys(o.spacing for o in result.occlusion if o.shape == shape.name):
-            same = [o for o in result.occlusion if (o.shape, o.spacing) == (shape.name, spacing)]
-            found = {(o.device, o.backend): o for o in same}
+            tiles = [o for o in result.occlusion if (o.shape, o.spacing) == (shape.name, spacing)]
+            smooth = (tiles[0].closed_form, tiles[0].quadrature, tiles[0].discretisation)
             lines.append(
                 _row(
-                    [shape.name, shape.formula, f"{spacing:g}", f"{same[0].gaussians:,}"]
-                    + [f"{value:.4f}" for value in (same[0].closed_form, same[0].quadrature, same[0].discretisation)]
-                    + [
-                        f"{o.estimate:.4f}, {o.largest_z:.2f}, {o.chi_square:.2f}"
-                        if (o := found.get(key)) is not None
-                        else "not run"
-                        for key in columns
-                    ]
-                    + ["ok" if all(o.passed for o in same) else "**beyond 3 standard errors**"]
+                    [shape.name, shape.formula, f"{spacing:g}", f"{tiles[0].gaussians:,}"]
+                    + [f"{value:.4f}" for value in smooth]
+                    + [_estimates([o for o in tiles if o.device == device]) for device in devices]
+                    + ["ok" if all(o.passed for o in tiles) else "**beyond 3 standard errors**"]
                 )
             )
     return "\n".join(lines) + "\n"
@@ -194,6 +191,14 @@ def write_page(path: Path, result: StabilityResult, command: str) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error
+
+
+def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:
+    """Return the estimate that is farthest from its truth, for a table."""
+    if not outcomes:
+        return "not run"
+    worst = max(outcomes, key=lambda outcome: outcome.largest_z)
+    return f"{worst.estimate:.4f}, {worst.largest_z:.2f}, {worst.chi_square:.2f}"
 
 
 def _number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Every stress case on every device and backend; that the suite notices faults; and how naive tracers fail."""
+"""Every stress case on every device under every hierarchy; that the suite notices faults; how naive tracers fail."""
 
 import dataclasses
 from pathlib import Path
@@ -12,8 +12,7 @@ from beam_warp import GaussianCloud, Scene, stability, visibility
 from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, launch_pack_gaussians
 from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.reference import rotation_matrices, visibility_enclosure, visibility_reference
-from beam_warp.scene import BACKENDS
-from beam_warp.stability import CASES, case_of, run_case
+from beam_warp.stability import CASES, HIERARCHIES, case_of, run_case, scene_under
 from beam_warp.stability_report import HOW_TO_READ, OCCLUSION_TEXT
 from beam_warp.tracing import TraceOptions
 
@@ -21,16 +20,16 @@ SMALL = [case for case in CASES if not case.large]
 
 
 class TestCases:
-    @pytest.mark.parametrize("backend", BACKENDS)
+    @pytest.mark.parametrize("hierarchy", HIERARCHIES)
     @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
-    def test_holds(self, device, backend, case):
+    def test_holds(self, device, hierarchy, case):
         """The bound of each ray is derived in `beam_warp.reference`: no case has a tolerance."""
-        (outcome,) = run_case(case, device, backends=(backend,))
+        (outcome,) = run_case(case, device, hierarchies=(hierarchy,))
         assert outcome.faults == ()
 
-    @pytest.mark.parametrize("backend", BACKENDS)
+    @pytest.mark.parametrize("hierarchy", HIERARCHIES)
     @pytest.mark.parametrize("seed", range(12))
-    def test_random_clouds_stay_in_their_intervals(self, device, backend, seed):
+    def test_random_clouds_stay_in_their_intervals(self, device, hierarchy, seed):
         """Every mixture of scales, rules and degrees, without the stop that would hide rounding below it."""
         rng = np.random.default_rng(seed)
         cloud = random_cloud(rng, 300, scale=[(-3.5, 0.8), (-5.0, 1.5), (-3.0, 2.5), (-7.0, 1.0)][seed % 4])
@@ -38,7 +37,7 @@ class TestCases:
         rays = stability._aimed(rng, cloud, 300, distance=(-0.1, 2.0))
         degree, front = (2, 2, 4)[seed % 3], ("peak", "entry")[seed // 2 % 2]
         t_max = rng.uniform(0.0, 2.0, 300).astype(np.float32) if seed % 5 == 0 else np.inf
-        scene = Scene.from_gaussians(cloud, device, backend=backend, response_degree=degree)
+        scene = scene_under(hierarchy, cloud, device, degree)
         result = visibility(scene, *rays, t_max=t_max, options=TraceOptions(front=front, stop=0.0))
         truth = visibility_enclosure(
             stability.traced_cloud(cloud, scene),
@@ -64,7 +63,7 @@ class TestCases:
         """A case whose rays all miss would prove nothing."""
         stress = case.build()
         if stress.known is None and len(stress.origins):
-            (outcome,) = run_case(case, "cpu", backends=("warp",))
+            (outcome,) = run_case(case, "cpu", hierarchies=("warp",))
             truth = stability.Truth.of(stress, Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
             assert (truth.rays.hits > 0).mean() > 0.5, outcome.did
 
@@ -85,7 +84,7 @@ class TestTheSuiteItself:
     def outcome(self, monkeypatch, change, name="round"):
         real = stability.visibility
         monkeypatch.setattr(stability, "visibility", lambda *rays, **options: change(real(*rays, **options)))
-        return run_case(case_of(name), "cpu", backends=("warp",))[0]
+        return run_case(case_of(name), "cpu", hierarchies=("warp",))[0]
 
     def test_a_small_bias_is_noticed(self, monkeypatch):
         outcome = self.outcome(monkeypatch, lambda v: v * np.float32(1.0 + 1e-3))
@@ -114,7 +113,7 @@ class TestTheSuiteItself:
         wrong = dataclasses.replace(
             case, build=lambda: dataclasses.replace(case.build(), expected={"dropped": 7}, expected_left_out=(1, 0, 0))
         )
-        (outcome,) = run_case(wrong, "cpu", backends=("warp",))
+        (outcome,) = run_case(wrong, "cpu", hierarchies=("warp",))
         assert outcome.faults == ("dropped must be 7, got 200", "rows left out must be (1, 0, 0), got (0, 0, 0)")
 
 

@@ -71,7 +71,7 @@ def stability(args: Stability) -> int:
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
     lines = [
-        f"failed: {outcome.case} on {outcome.device}, {outcome.backend}: {'; '.join(outcome.faults)}"
+        f"failed: {outcome.case} on {outcome.device}, {outcome.hierarchy}: {'; '.join(outcome.faults)}"
         for outcome in result.outcomes
         if not outcome.passed
     ]
@@ -83,29 +83,27 @@ def _faults(result: StabilityResult) -> list[str]:
 
 
 def _print_tables(result: StabilityResult) -> None:
-    """Print one row a case, its backends side by side, and one a shape."""
+    """Print one row a case, the worst of its hierarchies, and one a shape."""
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.stability_report import allowed_by, columns_of
+    from beam_warp.stability_report import allowed_by, devices_of
 
     console = Console(width=None if sys.stdout.isatty() else 200)
-    columns = columns_of(result.outcomes)
-    device = columns[0][0] if columns else ""
-    table = Table("case", "did", "detected", "done", "allowed", title=f"stress cases on {device}")
-    for _, backend in columns:
-        table.add_column(f"error, {backend}")
-    table.add_column("verdict")
+    device = ", ".join(devices_of(result.outcomes))
+    titles = ("case", "did", "detected", "done", "allowed", "error", "verdict")
+    table = Table(*titles, title=f"stress cases on {device}")
     for name in dict.fromkeys(outcome.case for outcome in result.outcomes):
         rows = [outcome for outcome in result.outcomes if outcome.case == name]
+        failed = ", ".join(outcome.hierarchy for outcome in rows if not outcome.passed)
         table.add_row(
             name,
             rows[0].did,
             rows[0].detected,
             rows[0].done,
             allowed_by(rows[0]),
-            *(f"{outcome.error:.1e}" for outcome in rows),
-            "ok" if all(outcome.passed for outcome in rows) else "[red]failed[/red]",
+            f"{max(outcome.error for outcome in rows):.1e}",
+            f"[red]failed: {failed}[/red]" if failed else "ok",
         )
     console.print(table)
     titles = ("shape", "spacing", "backend", "smooth", "tiled", "discretisation", "estimate", "largest z", "verdict")

@@ -41,7 +41,7 @@ def test_page(tmp_path, capsys):
     assert run("--out", tmp_path / "page.md", "--quiet") == 0
     assert capsys.readouterr().out == ""
     page = (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert "| error, cpu, wide | error, cpu, warp | verdict |" in page
+    assert "| error, cpu | verdict |" in page
     row = next(line for line in page.splitlines() if line.startswith("| broken rows |"))
     assert "60 not finite, 10 with a negative scale, 10 with a zero quaternion | left out |" in row
     assert row.endswith("| ok |")
@@ -52,8 +52,8 @@ def test_json_of_another_device_stands_beside(tmp_path, capsys):
     assert run("--json") == 0
     record = json.loads(capsys.readouterr().out)
     assert record["passed"]
-    assert [(row["case"], row["backend"]) for row in record["cases"]] == [
-        (name, backend) for name in NAMES[:2] for backend in ("wide", "warp")
+    assert [(row["case"], row["hierarchy"]) for row in record["cases"]] == [
+        (name, hierarchy) for name in NAMES[:2] for hierarchy in stability.HIERARCHIES
     ]
     for row in (*record["cases"], *record["occlusion"]):
         row["device"] = "Some GPU"
@@ -61,8 +61,8 @@ def test_json_of_another_device_stands_beside(tmp_path, capsys):
     (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
     assert run("--out", tmp_path / "page.md", "--beside", tmp_path / "gpu.json", "--quiet") == 0
     page = (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert "| error, cpu, wide | error, cpu, warp | error, Some GPU, wide | error, Some GPU, warp |" in page
-    assert "| Some GPU warp: 3 rays differ by more than rounding explains |" in page
+    assert "| error, cpu | error, Some GPU | verdict |" in page
+    assert "| Some GPU, wide, fast: 3 rays differ by more than rounding explains |" in page
 
 
 def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
