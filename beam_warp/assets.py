@@ -86,6 +86,36 @@ ATTRIBUTES: Mapping[str, Attribute] = {
 """Every per-Gaussian array that a cloud can hold, in the order in which files list them."""
 
 
+@dataclass(frozen=True, eq=False)
+class InvalidRows:
+    """Rows that no reading can make a Gaussian of, and why; a row with several faults counts for the first.
+
+    Attributes:
+        rows: Their numbers, ascending, ``(K,)`` int64.
+        not_finite: With NaN or infinity in any array.
+        negative_scales: With a scale below 0.
+        zero_quaternions: With an orientation of length 0.
+    """
+
+    rows: NDArray[np.int64]
+    not_finite: int
+    negative_scales: int
+    zero_quaternions: int
+
+    def __len__(self) -> int:
+        """Return their number."""
+        return len(self.rows)
+
+    def __str__(self) -> str:
+        """Return the counts in words: ``2 not finite, 1 with a zero quaternion``; empty if there are none."""
+        counts = (
+            (self.not_finite, "not finite"),
+            (self.negative_scales, "with a negative scale"),
+            (self.zero_quaternions, "with a zero quaternion"),
+        )
+        return ", ".join(f"{count} {what}" for count, what in counts if count)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GaussianCloud:
     """Gaussians of one moment.
@@ -162,6 +192,45 @@ class GaussianCloud:
             )
         if self.radiance_color_space is not None:
             require_choice("radiance_color_space", self.radiance_color_space, COLOR_SPACES)
+
+    @classmethod
+    def leaving_out_invalid(cls, **fields: Any) -> tuple[GaussianCloud, InvalidRows]:
+        """Make a cloud of the rows that are Gaussians, and say which were left out.
+
+        The constructor refuses an array with a broken row, since a row that vanishes silently takes its neighbours'
+        numbers along. This one is for data that has them, as trainings leave them: it leaves out rows with NaN or
+        infinity in any array, negative scales and zero quaternions. What is wrong with a whole array (its shape, its
+        range, logits for opacities) is refused as ever.
+
+        Args:
+            fields: As the constructor's.
+
+        Returns:
+            The cloud, and the rows that it lacks.
+
+        Raises:
+            InvalidArrayError: As the constructor, after broken rows are gone.
+            InvalidOptionError: As the constructor.
+        """
+        if any(fields.get(name) is None for name, attribute in ATTRIBUTES.items() if attribute.required):
+            cls(**fields)  # refuses, in its own words
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, attribute in ATTRIBUTES.items():
+            if fields.get(name) is not None:
+                with np.errstate(over="ignore"):  # beyond float32 is infinity, and so counted below
+                    array = require_array(name, fields[name], (None, *attribute.trailing), np.dtype(attribute.dtype))
+                arrays[name] = array
+                require_same_length(name, array, "positions", len(arrays["positions"]))
+        not_finite = np.zeros(len(arrays["positions"]), bool)
+        for array in arrays.values():
+            if array.dtype.kind == "f":
+                not_finite |= ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+        negative = ~not_finite & (arrays["scales"] < 0.0).any(axis=1)
+        zero = ~not_finite & ~negative & (arrays["orientations"] == 0.0).all(axis=1)
+        broken = not_finite | negative | zero
+        counts = (int(np.count_nonzero(reason)) for reason in (not_finite, negative, zero))
+        kept: dict[str, Any] = {name: array[~broken] for name, array in arrays.items()}
+        return cls(**(fields | kept)), InvalidRows(np.flatnonzero(broken), *counts)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

@@ -34,6 +34,11 @@ def resolve_device(device: str | None = None) -> Any:
         raise DeviceError(f"device must be one of {known}, got {device!r}. Choose one of them.") from error
 
 
+def device_label(device: Any) -> str:
+    """Return what a table calls a device: ``cpu``, or the name of a GPU."""
+    return str(device.name) if device.is_cuda else str(device)
+
+
 @cache
 def _init_warp() -> None:
     """Initialise Warp without its line on stderr that a machine has no GPU: half of our users have none, and know it.

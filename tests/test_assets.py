@@ -110,3 +110,65 @@ class TestSequence:
             GaussianSequence(1, lambda _: cloud, constant=frozenset({"colour"}))
         with pytest.raises(InvalidOptionError, match=r"len\(clouds\) must be an integer"):
             GaussianSequence.from_clouds([])
+
+
+class TestBrokenRows:
+    def broken(self):
+        fields = arrays(8)
+        fields = {name: np.array(value, np.float64) for name, value in fields.items()}
+        fields["positions"][0, 1] = np.nan
+        fields["scales"][1, 2] = -0.1
+        fields["orientations"][2] = 0.0
+        fields["opacities"][3] = np.inf
+        fields["scales"][4, 0] = 1e300  # infinite in float32
+        return fields
+
+    def test_they_are_left_out_and_counted(self):
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**self.broken(), ids=range(8))
+        assert cloud.ids.tolist() == [5, 6, 7]
+        assert left_out.rows.tolist() == [0, 1, 2, 3, 4]
+        assert (left_out.not_finite, left_out.negative_scales, left_out.zero_quaternions) == (3, 1, 1)
+        assert len(left_out) == 5
+        assert str(left_out) == "3 not finite, 1 with a negative scale, 1 with a zero quaternion"
+
+    def test_any_array_can_break_a_row_and_each_row_counts_once(self):
+        normals = np.tile([0.0, 0.0, 1.0], (8, 1))
+        normals[[0, 6]] = np.nan
+        fields = self.broken()
+        fields["scales"][0] = -1.0
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**fields, normals=normals)
+        assert left_out.rows.tolist() == [0, 1, 2, 3, 4, 6]
+        assert (left_out.not_finite, left_out.negative_scales, left_out.zero_quaternions) == (4, 1, 1)
+        assert len(cloud) == 2
+
+    def test_sound_rows_pass_unchanged(self):
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(), axes="rdf")
+        assert len(left_out) == 0
+        assert str(left_out) == ""
+        assert cloud.axes == "rdf"
+        assert len(cloud) == 4
+
+    def test_none_given_none_left(self):
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(0))
+        assert (len(cloud), len(left_out)) == (0, 0)
+
+    def test_all_broken_leaves_none(self):
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(positions=np.full((4, 3), np.nan)))
+        assert (len(cloud), len(left_out)) == (0, 4)
+
+    def test_the_constructor_refuses_them(self):
+        with pytest.raises(InvalidArrayError, match="positions must be finite, got NaN or infinity at row 0"):
+            GaussianCloud(**self.broken())
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"opacities": [-3.0, 2.0, 5.0, 1.0]}, r"opacities must lie in \[0, 1\], got -3"),
+            ({"orientations": np.full((4, 4), 2.0)}, r"orientations must have unit length, got \|v\| = 4 at row 0"),
+            ({"scales": np.ones((3, 3))}, r"scales must have as many rows as positions \(4\), got 3"),
+            ({"positions": None}, "positions must be given, got None"),
+        ],
+    )
+    def test_what_is_wrong_with_a_whole_array_is_refused(self, changes, message):
+        with pytest.raises(InvalidArrayError, match=message):
+            GaussianCloud.leaving_out_invalid(**arrays(**changes))

@@ -14,6 +14,7 @@ from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
+from beam_warp.cli.stability import Stability, stability
 
 _HELP = """Relightable 4D Gaussian assets: decompose, relight, demonstrate.
 
@@ -26,6 +27,7 @@ Command = (
     Annotated[Run, subcommand("run", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
+    | Annotated[Stability, subcommand("stability", prefix_name=False)]
 )
 
 
@@ -40,4 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: run(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
+    if isinstance(command, Stability):
+        return run_command(lambda: stability(command))
     return run_command(lambda: demo(command))

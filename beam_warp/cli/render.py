@@ -74,6 +74,7 @@ class Render:
     aov: Annotated[bool, arg(help="Also write base colour, roughness, occlusion, normal and depth (.exr).")] = False
     antialiased: Annotated[bool, arg(help="For an asset trained with the 2D anti-aliasing filter.")] = False
     source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
+    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
     quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
     json: Annotated[bool, arg(help="Print the result as JSON.")] = False
@@ -101,7 +102,7 @@ def render(args: Render) -> int:
             "environment must be given, got none. Pass --environment with a lat-long .exr or .hdr image."
         )
     environment = EnvironmentMap.read(environment_path).rotated(args.rotate).exposed(args.exposure)
-    sequence = converters.read(args.asset, source_axes=args.source_axes)
+    sequence = converters.read(args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     _require_frame(args, len(sequence))
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     if capture is not None:

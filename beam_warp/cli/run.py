@@ -57,6 +57,7 @@ class Run:
     persistent: Annotated[bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames.")] = False
     fps: Annotated[float | None, arg(metavar="RATE", help="Frames per second; else the input's word, else 30.")] = None
     seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
+    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
     quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
     json: Annotated[bool, arg(help="Print the report as JSON.")] = False
@@ -65,7 +66,7 @@ class Run:
 def run(args: Run) -> int:
     """Run the job and say what came out."""
     started = time.perf_counter()
-    sequence = converters.read(args.input, source_axes=args.source_axes)
+    sequence = converters.read(args.input, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     environment = EnvironmentMap.read(args.environment).rotated(args.rotate)
     if isinstance(args.roughness, Path) != (args.roughness_mesh is not None):
         raise InvalidOptionError(

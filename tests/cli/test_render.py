@@ -278,3 +278,17 @@ def test_capture_refusals(ball, white_light, tmp_path, capsys):
     out.touch()
     assert run(*common, "--capture", tmp_path / "bent") == 2
     assert "out must be a folder with --capture, got the file" in capsys.readouterr().err
+
+
+def test_broken_rows_are_refused_or_left_out_and_counted(ball, white_light, tmp_path, capsys):
+    content = bytearray(ball.read_bytes())
+    start = content.index(b"end_header\n") + len(b"end_header\n")
+    content[start : start + 4] = np.float32(np.nan).tobytes()
+    ball.write_bytes(content)
+    words = (ball, "--environment", white_light, "--out", tmp_path / "x.png", *SIDE, "--device", "cpu")
+    assert run(*words) == 2
+    assert "must be finite" in capsys.readouterr().err
+    assert run(*words, "--drop-invalid") == 0
+    out, err = capsys.readouterr()
+    assert "1 of 10000 Gaussians dropped: not finite" in err
+    assert "9,999 Gaussians" in out

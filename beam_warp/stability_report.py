@@ -1,0 +1,214 @@
+"""The stability suite as a page: what every hierarchy and device made of every scene, side by side."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from beam_warp._version import __version__
+from beam_warp.analytic_occlusion import SHAPES, OcclusionOutcome
+from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
+from beam_warp.stability import CASES, Outcome
+
+HOW_TO_READ = """\
+Scenes on which ray tracers lose hits, return NaN or never return, and what this one makes of them. The numbers are
+those of one run of
+
+    {command}
+
+Each case runs under the own tree in both builds, under one that was built for other places and refitted, and under
+`wp.Bvh`; the table has the worst of them. Each device has a column: run with `--json` there, and give those files to
+`--beside` of the run that writes the page.
+
+**Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the difference that float32 explains
+there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/reference.py`) carries an interval
+for each ray and each Gaussian, from a count of the tracer's roundings. A ray's position relative to a Gaussian is
+rounded to about 6e-8 × distance, so its whitened distance to 6e-8 × distance / smallest σ; a decision that falls within
+that (in front or not, above the cut of 1/255 or not) may go either way; and the early stop may add 1e-4. Each ray must
+lie in its own interval, so that a hit that is certain cannot be missed; V must be finite and in [0, 1]; and what was
+detected must be what the case put in. Where *allowed* is large, float32 rays do not say what V is: no tracer of that
+precision does better, and the remedy is to split the scene or to enlarge its Gaussians.
+
+**Detected** and **done** say what happened to the input before tracing. Rows that are no Gaussian (NaN, infinity,
+negative scales, zero quaternions) are refused by `GaussianCloud(...)`, which names the first, and left out and
+counted by `GaussianCloud.leaving_out_invalid(...)`; files behave alike, refused unless read with `drop_invalid=True`
+(`--drop-invalid`). What no ray can see (opacity up to 1/255) is dropped. Scales below 1e-7 of the scene's extent or
+1e-4 of their Gaussian's largest are raised to that; the truth is then that of the raised Gaussians, and how much
+raising itself changes V is told in *done*. Coordinates are relative to the middle of the cloud.
+"""
+
+OCCLUSION_TEXT = """\
+Shapes with closed forms, tiled with flat Gaussians (one standard deviation a spacing). Two errors are told apart.
+*Noise*: the estimate (64 rays a point, automatic offset) against a float64 quadrature of the same Gaussians from the
+same ray origins, as the largest difference over the points in stated standard errors; it must be at most 3. The
+stated error is a safe one; *true z²* is the mean square of the differences in units of the spread of 16 independent
+frames, and should be near 1. *Discretisation*: that quadrature against the smooth shape. Tiles have soft edges and ray
+origins lie above the surface, both by a number of spacings: it must shrink with the spacing.
+"""
+
+
+@dataclass(frozen=True)
+class StabilityResult:
+    """Everything that one or several runs found.
+
+    Attributes:
+        outcomes: Of the stress cases.
+        occlusion: Of the shapes with known ambient occlusion.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    occlusion: tuple[OcclusionOutcome, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every verdict is good."""
+        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion))
+
+    def joined(self, other: StabilityResult) -> StabilityResult:
+        """Return both results as one, this one's first."""
+        return StabilityResult(self.outcomes + other.outcomes, self.occlusion + other.occlusion)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-able record."""
+        return {
+            "version": __version__,
+            "passed": self.passed,
+            "cases": [outcome.as_dict() for outcome in self.outcomes],
+            "occlusion": [outcome.as_dict() for outcome in self.occlusion],
+        }
+
+
+def read_result(path: Path) -> StabilityResult:
+    """Read what ``beam stability --json`` wrote.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: It is something else.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return StabilityResult(
+            tuple(_record(Outcome, row) for row in record["cases"]),
+            tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
+        )
+    except OSError as error:
+        raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise AssetFormatError(
+            f"beside must be what beam stability --json printed, got {path.name} ({error!r}). Run it again."
+        ) from error
+
+
+_Record = TypeVar("_Record", Outcome, OcclusionOutcome)
+
+
+def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
+    """Return a record from its JSON form, whose tuples are lists."""
+    values: dict[str, Any] = {
+        entry.name: tuple(row[entry.name]) if isinstance(row[entry.name], list) else row[entry.name]
+        for entry in fields(kind)
+    }
+    return kind(**values)
+
+
+def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome]) -> list[str]:
+    """Return the devices that occur, in order."""
+    return list(dict.fromkeys(outcome.device for outcome in outcomes))
+
+
+def verdict_of(outcomes: Sequence[Outcome]) -> str:
+    """Return ``ok``, or the first fault of each that failed."""
+    return "; ".join(f"{o.device}, {o.hierarchy}: {o.faults[0]}" for o in outcomes if o.faults) or "ok"
+
+
+def allowed_by(outcome: Outcome) -> str:
+    """Return median and largest of what rounding explains, for a table."""
+    return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
+
+
+def markdown(result: StabilityResult, command: str) -> str:
+    """Return the page.
+
+    Args:
+        result: Of any number of devices and hierarchies.
+        command: That makes the page, for its text.
+    """
+    devices = devices_of(result.outcomes)
+    lines = ["# Stability", "", HOW_TO_READ.format(command=command), "## Stress cases", ""]
+    lines += _header(
+        ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]
+        + [f"error, {device}" for device in devices]
+        + ["verdict"]
+    )
+    for case in CASES:
+        same = [outcome for outcome in result.outcomes if outcome.case == case.name]
+        if same:
+            first = same[0]
+            errors = {device: [o.error for o in same if o.device == device] for device in devices}
+            lines.append(
+                _row(
+                    [case.name, case.fails, first.detected, first.done, first.did, allowed_by(first)]
+                    + [_number(max(found)) if found else "not run" for found in errors.values()]
+                    + [verdict_of(same)]
+                )
+            )
+    devices = devices_of(result.occlusion)
+    lines += ["", "## Ambient occlusion of known shapes", "", OCCLUSION_TEXT]
+    lines += _header(
+        ["shape", "closed form", "spacing", "Gaussians", "smooth", "tiled", "discretisation"]
+        + [f"estimate, largest z, true z², {device}" for device in devices]
+        + ["verdict"]
+    )
+    for shape in SHAPES:
+        for spacing in dict.fromkeys(o.spacing for o in result.occlusion if o.shape == shape.name):
+            tiles = [o for o in result.occlusion if (o.shape, o.spacing) == (shape.name, spacing)]
+            smooth = (tiles[0].closed_form, tiles[0].quadrature, tiles[0].discretisation)
+            lines.append(
+                _row(
+                    [shape.name, shape.formula, f"{spacing:g}", f"{tiles[0].gaussians:,}"]
+                    + [f"{value:.4f}" for value in smooth]
+                    + [_estimates([o for o in tiles if o.device == device]) for device in devices]
+                    + ["ok" if all(o.passed for o in tiles) else "**beyond 3 standard errors**"]
+                )
+            )
+    return "\n".join(lines) + "\n"
+
+
+def write_page(path: Path, result: StabilityResult, command: str) -> None:
+    """Write the page whole or not at all.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(markdown(result, command), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error
+
+
+def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:
+    """Return the estimate that is farthest from its truth, for a table."""
+    if not outcomes:
+        return "not run"
+    worst = max(outcomes, key=lambda outcome: outcome.largest_z)
+    return f"{worst.estimate:.4f}, {worst.largest_z:.2f}, {worst.chi_square:.2f}"
+
+
+def _number(value: float) -> str:
+    """Return an error for a table."""
+    return "0" if value == 0.0 else f"{value:.1e}"
+
+
+def _header(titles: Sequence[str]) -> list[str]:
+    return [_row(titles), "|" + "---|" * len(titles)]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
