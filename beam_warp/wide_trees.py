@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import warp as wp
 
 from beam_warp.kernels.constants import LARGEST_FLOAT
@@ -20,11 +22,13 @@ from beam_warp.kernels.tree_collapse import (
     WideLayout,
     launch_bound_nodes,
     launch_fill_leaves,
-    launch_open_children,
-    launch_place_children,
+    launch_open_level,
 )
 from beam_warp.kernels.wide_tree import LARGEST_DEPTH, LEAF_ROWS, NODE_ROWS, WideTree
 from beam_warp.packed_gaussians import PackedGaussians
+
+WIDTH = 4
+"""Children of a node."""
 
 REACH = 8
 """Places of the Morton order in which a cluster looks for its neighbour, to either side.
@@ -138,30 +142,35 @@ def _merge(packed: PackedGaussians, items: wp.array, count: int, reach: int) -> 
 def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method: Method, device: Any) -> BuiltTree:
     """Open binary nodes to four children, level by level; boxes come with `refit`."""
     layout, tree = WideLayout(), WideTree()
-    layout.items = wp.empty(max(count, 1), dtype=int, device=device)
-    children = wp.empty(max(count, 1), dtype=wp.vec4i, device=device)
-    layout.children = children
-    levels: list[tuple[int, int]] = []
-    begin, here, leaves = 0, 1, 0
-    if count == 0:
-        children.zero_()
-        levels, begin = [(0, 1)], 1
-        here = 0
-    queue = wp.full(max(count, 1), root, dtype=int, device=device)
-    following = wp.empty(max(count, 1), dtype=int, device=device)
-    opened = wp.empty(max(count, 1), dtype=wp.vec4i, device=device)
-    counts, sums = (wp.empty(max(count, 1), dtype=wp.vec2i, device=device) for _ in range(2))
-    while here:
-        levels.append((begin, here))
-        launch_open_children(binary, count, method != "fast", queue, here, opened, counts, device)
-        wp.utils.array_scan(counts[:here], sums[:here], inclusive=True)
-        begins = (begin, begin + here, leaves)
-        launch_place_children(opened, counts, sums, here, items, begins, following, layout, device)
-        inner, ended = (int(k) for k in sums[here - 1 : here].numpy()[0])
-        queue, following = following, queue
-        begin, here, leaves = begin + here, inner, leaves + ended
-    layout.lower = wp.empty(begin, dtype=wp.vec3, device=device)
-    layout.upper = wp.empty(begin, dtype=wp.vec3, device=device)
-    tree.nodes = wp.empty(begin * NODE_ROWS, dtype=wp.vec4i, device=device)
-    tree.leaves = wp.empty(max(count, 1) * LEAF_ROWS, dtype=wp.vec4, device=device)
-    return BuiltTree(tree, method, count, tuple(levels), layout)
+    room = max(count, 1)  # a tree has fewer nodes than leaves, and at least its root
+    layout.items = wp.empty(room, dtype=int, device=device)
+    layout.children = wp.zeros(room, dtype=wp.vec4i, device=device)
+    sizes = np.zeros(LARGEST_DEPTH + 3, np.int32)
+    sizes[0] = 1
+    if count:
+        # The host learns how many nodes a level has, and when there are none, only now and then: asking takes longer
+        # than a level. Until then a launch is as wide as the level can be.
+        level_sizes = wp.array(sizes, dtype=int, device=device)
+        queue, following = wp.full(room, root, dtype=int, device=device), wp.empty(room, dtype=int, device=device)
+        ask_at = math.ceil(math.log(room, WIDTH)) + 3
+        for level in range(LARGEST_DEPTH + 1):
+            bound = min(WIDTH**level, room)
+            if device.is_cpu or level >= ask_at:
+                sizes = level_sizes.numpy()
+                bound = int(sizes[level])
+                ask_at = level + 3
+                if bound == 0:
+                    break
+            launch_open_level(
+                binary, items, count, method != "fast", level, queue, bound, level_sizes, following, layout, device
+            )
+            queue, following = following, queue
+        sizes = level_sizes.numpy()
+    used = sizes[: LARGEST_DEPTH + 2]
+    used = used[used > 0].tolist()
+    begins = np.concatenate([[0], np.cumsum(used)]).tolist()
+    layout.lower = wp.empty(begins[-1], dtype=wp.vec3, device=device)
+    layout.upper = wp.empty(begins[-1], dtype=wp.vec3, device=device)
+    tree.nodes = wp.empty(begins[-1] * NODE_ROWS, dtype=wp.vec4i, device=device)
+    tree.leaves = wp.empty(room * LEAF_ROWS, dtype=wp.vec4, device=device)
+    return BuiltTree(tree, method, count, tuple(zip(begins[:-1], used, strict=True)), layout)

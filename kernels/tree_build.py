@@ -4,8 +4,8 @@ Source: Meister and Bittner 2018, "Parallel Locally-Ordered Clustering" (PLOC): 
 within a window of the Morton order, with which it makes the smallest box; pairs that chose each other merge. Ties are
 settled by i xor j, so that equal boxes pair up (0 with 1, 2 with 3 …) instead of forming a chain.
 
-Leaves are numbered by their place in the Morton order, 0 … M - 1; inner nodes follow. Every number comes from a scan,
-none from an atomic counter: the tree is the same on every run.
+Leaves are numbered by their place in the Morton order, 0 … M - 1; inner nodes follow. Numbers come from scans, not from
+atomic counters: the tree is the same on every run.
 """
 
 import warp as wp

@@ -37,99 +37,105 @@ def widest_axis(lower: wp.vec3, upper: wp.vec3) -> int:
 
 
 @wp.kernel
-def open_children_kernel(
+def open_level_kernel(
     first: int,
     tree: BinaryTree,
+    items: wp.array[int],
     leaf_count: int,
     by_area: int,
+    level: int,
     queue: wp.array[int],
-    out_children: wp.array[wp.vec4i],
-    out_counts: wp.array[wp.vec2i],
-):
-    """Up to four descendants of a binary node, inner ones first; and how many are (inner, leaves).
-
-    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet.
-    """
-    i = first + wp.tid()
-    found = wp.vec4i(queue[i], -1, -1, -1)
-    count = int(1)
-    for _ in range(3):
-        largest = float(-1.0)
-        which = int(-1)
-        for k in range(count):
-            node = found[k]
-            if node >= leaf_count:
-                size = float(tree.size[node])
-                if by_area == 1:
-                    size = half_area(tree.lower[node], tree.upper[node])
-                if size > largest:
-                    largest = size
-                    which = k
-        if which >= 0:
-            node = found[which]
-            found[which] = tree.left[node]
-            found[count] = tree.right[node]
-            count += 1
-    if by_area == 1:  # in ascending order along the widest axis; codes are in order anyway
-        axis = widest_axis(tree.lower[queue[i]], tree.upper[queue[i]])
-        for last in range(count - 1):
-            for k in range(count - 1 - last):
-                a = found[k]
-                b = found[k + 1]
-                if tree.lower[a][axis] + tree.upper[a][axis] > tree.lower[b][axis] + tree.upper[b][axis]:
-                    found[k] = b
-                    found[k + 1] = a
-    ordered = wp.vec4i(-1, -1, -1, -1)
-    inner = int(0)
-    for k in range(count):
-        if found[k] >= leaf_count:
-            ordered[inner] = found[k]
-            inner += 1
-    place = inner
-    for k in range(count):
-        if found[k] < leaf_count:
-            ordered[place] = found[k]
-            place += 1
-    out_children[i] = ordered
-    out_counts[i] = wp.vec2i(inner, count - inner)
-
-
-@wp.kernel
-def place_children_kernel(
-    first: int,
-    opened: wp.array[wp.vec4i],
-    counts: wp.array[wp.vec2i],
-    sums: wp.array[wp.vec2i],
-    items: wp.array[int],
-    level_begin: int,
-    next_level_begin: int,
-    leaf_begin: int,
+    level_sizes: wp.array[int],
     out_queue: wp.array[int],
     out_layout: WideLayout,
 ):
-    """``sums``: inclusive sums of ``counts``; ``items``: Gaussian of each binary leaf."""
+    """Open each queued binary node to up to four children, and queue the inner ones for the next level.
+
+    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet. ``items`` holds the
+    Gaussian of each binary leaf, ``level_sizes`` the nodes of each level, and the leaves so far behind them. Numbers
+    come from counters and so from the order of threads; what a ray meets, and in which order, does not.
+    """
     i = first + wp.tid()
-    inner = counts[i][0]
-    leaves = counts[i][1]
-    first_inner = sums[i][0] - inner
-    first_leaf = leaf_begin + sums[i][1] - leaves
-    out_layout.children[level_begin + i] = wp.vec4i(next_level_begin + first_inner, first_leaf, inner, inner + leaves)
-    for k in range(inner):
-        out_queue[first_inner + k] = opened[i][k]
-    for k in range(leaves):
-        out_layout.items[first_leaf + k] = items[opened[i][inner + k]]
+    if i < level_sizes[level]:
+        found = wp.vec4i(queue[i], -1, -1, -1)
+        count = int(1)
+        for _ in range(3):
+            largest = float(-1.0)
+            which = int(-1)
+            for k in range(count):
+                node = found[k]
+                if node >= leaf_count:
+                    size = float(tree.size[node])
+                    if by_area == 1:
+                        size = half_area(tree.lower[node], tree.upper[node])
+                    if size > largest:
+                        largest = size
+                        which = k
+            if which >= 0:
+                node = found[which]
+                found[which] = tree.left[node]
+                found[count] = tree.right[node]
+                count += 1
+        if by_area == 1:  # in ascending order along the widest axis; codes are in order anyway
+            axis = widest_axis(tree.lower[queue[i]], tree.upper[queue[i]])
+            for last in range(count - 1):
+                for k in range(count - 1 - last):
+                    a = found[k]
+                    b = found[k + 1]
+                    if tree.lower[a][axis] + tree.upper[a][axis] > tree.lower[b][axis] + tree.upper[b][axis]:
+                        found[k] = b
+                        found[k + 1] = a
+        inner = int(0)
+        for k in range(count):
+            if found[k] >= leaf_count:
+                inner += 1
+        begin = int(0)
+        for above in range(level):
+            begin += level_sizes[above]
+        next_begin = begin + level_sizes[level]
+        first_inner = wp.atomic_add(level_sizes, level + 1, inner)
+        first_leaf = wp.atomic_add(level_sizes, level_sizes.shape[0] - 1, count - inner)
+        out_layout.children[begin + i] = wp.vec4i(next_begin + first_inner, first_leaf, inner, count)
+        for k in range(count):
+            if found[k] >= leaf_count:
+                out_queue[first_inner] = found[k]
+                first_inner += 1
+            else:
+                out_layout.items[first_leaf] = items[found[k]]
+                first_leaf += 1
 
 
 @wp.kernel
 def fill_leaves_kernel(first: int, gaussians: Gaussians, layout: WideLayout, out_tree: WideTree):
+    """Write a leaf: the whitening M as the triangular U with U^T U = M^T M, which has six entries instead of nine.
+
+    Responses depend on |M x| alone, so that any such factor serves. Cholesky's, in double precision: scales within a
+    Gaussian differ by up to 1e4, their squares by 1e8.
+    """
     leaf = first + wp.tid()
     item = layout.items[leaf]
+    center = gaussians.center_opacity[item]
+    a = gaussians.whitening_0[item]
+    b = gaussians.whitening_1[item]
+    c = gaussians.whitening_2[item]
+    gram = wp.mat33d()
+    for i in range(3):
+        for j in range(3):
+            gram[i, j] = (
+                wp.float64(a[i]) * wp.float64(a[j])
+                + wp.float64(b[i]) * wp.float64(b[j])
+                + wp.float64(c[i]) * wp.float64(c[j])
+            )
+    xx = wp.sqrt(gram[0, 0])
+    xy = gram[0, 1] / xx
+    xz = gram[0, 2] / xx
+    yy = wp.sqrt(gram[1, 1] - xy * xy)
+    yz = (gram[1, 2] - xy * xz) / yy
+    zz = wp.sqrt(gram[2, 2] - xz * xz - yz * yz)
     row = leaf * LEAF_ROWS
-    m_1 = gaussians.whitening_1[item]
-    out_tree.leaves[row] = gaussians.center_opacity[item]
-    out_tree.leaves[row + 1] = gaussians.whitening_0[item]
-    out_tree.leaves[row + 2] = wp.vec4(m_1[0], m_1[1], m_1[2], wp.cast(item, float))
-    out_tree.leaves[row + 3] = gaussians.whitening_2[item]
+    out_tree.leaves[row] = center
+    out_tree.leaves[row + 1] = wp.vec4(float(xx), float(xy), float(xz), float(yy))
+    out_tree.leaves[row + 2] = wp.vec4(float(yz), float(zz), a[3], wp.cast(item, float))
 
 
 @wp.func
@@ -205,23 +211,14 @@ def bound_nodes_kernel(
     out_tree.nodes[row + 2] = wp.vec4i(low_words[2], high_words[0], high_words[1], high_words[2])
 
 
-def launch_open_children(tree, leaf_count, by_area, queue, count, out_children, out_counts, device):
-    """Open every queued binary node to up to four children."""
+def launch_open_level(
+    tree, items, leaf_count, by_area, level, queue, bound, level_sizes, out_queue, out_layout, device
+):
+    """Open a level of at most ``bound`` nodes."""
     launch(
-        open_children_kernel,
-        count,
-        inputs=[tree, leaf_count, int(by_area), queue],
-        outputs=[out_children, out_counts],
-        device=device,
-    )
-
-
-def launch_place_children(opened, counts, sums, count, items, begins, out_queue, out_layout, device):
-    """Number the children; ``begins`` is where this level, the next one and its leaves begin."""
-    launch(
-        place_children_kernel,
-        count,
-        inputs=[opened, counts, sums, items, *begins],
+        open_level_kernel,
+        bound,
+        inputs=[tree, items, leaf_count, int(by_area), level, queue, level_sizes],
         outputs=[out_queue, out_layout],
         device=device,
     )

@@ -10,7 +10,7 @@ from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.surface_layer import SurfaceLayer, add_to_layer
 from beam_warp.kernels.trace_settings import TraceSettings
-from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, load_leaf, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -125,9 +125,9 @@ def wide_tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3
         inner = hits.inner
         leaf = hits.leaf
         while leaf != 0:
-            row = (hits.first_leaf + lowest_bit(leaf)) * 4 + 2
+            index = load_leaf(tree, hits.first_leaf + lowest_bit(leaf)).index
             leaf = leaf & (leaf - 1)
-            layer = add_to_layer(layer, gaussians, wp.cast(tree.leaves[row][3], int), p, n)
+            layer = add_to_layer(layer, gaussians, index, p, n)
         if inner == 0 and depth > 0:
             depth -= 1
             first_node = stack[depth] >> 4

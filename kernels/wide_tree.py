@@ -14,7 +14,7 @@ from beam_warp.kernels.row_loads import load_row, load_words
 from beam_warp.kernels.trace_settings import TraceSettings
 
 NODE_ROWS = wp.constant(3)
-LEAF_ROWS = wp.constant(4)
+LEAF_ROWS = wp.constant(3)
 LARGEST_DEPTH = 31
 Stack = wp.types.vector(length=32, dtype=wp.int32)
 """One entry a level. A vector, because Warp's local arrays carry a header that every access would read."""
@@ -31,8 +31,8 @@ class WideTree:
     A node is three rows of four words: corner x, y, z (float bits), and the exponents of the steps in three bytes with,
     in the fourth, from bit 24 three bits of the number of inner children, one of the axis along which they are in
     order, three of the number of children, and the axis' second bit; first node, first leaf, and lower x and y of the
-    children; lower z and upper x, y, z. A leaf is four rows: centre and opacity, row 0 of the whitening and the squared
-    support radius, row 1 and the Gaussian's number (int bits), row 2.
+    children; lower z and upper x, y, z. A leaf is three rows: centre and opacity; the six entries of the triangular
+    whitening, row by row; the squared support radius and the Gaussian's number (int bits).
     """
 
     nodes: wp.array[wp.vec4i]
@@ -187,39 +187,64 @@ def meet_node(tree: WideTree, node: int, origin: wp.vec3, inverse: wp.vec3, t_mi
 
 
 @wp.struct
-class CanonicalRay:
-    """A ray in the space where a leaf's Gaussian is the unit sphere, begun at its point closest to the centre."""
+class Leaf:
+    """A leaf's Gaussian."""
 
-    q: wp.vec3  # whitened closest point
-    d: wp.vec3  # whitened direction, not of unit length
-    dd: float  # d.d
-    cc: float  # |q x d|^2: dd times the squared distance to the centre
+    center: wp.vec3
+    opacity: float
+    whitening_x: wp.vec3  # rows of the triangular whitening: from the first, the second and the third column on
+    whitening_y: wp.vec2
+    whitening_z: float
+    radius_squared: float
+    index: int
+
+
+@wp.func
+def load_leaf(tree: WideTree, leaf: int) -> Leaf:
+    row_0 = load_row(tree.leaves, leaf * LEAF_ROWS)
+    row_1 = load_row(tree.leaves, leaf * LEAF_ROWS + 1)
+    row_2 = load_row(tree.leaves, leaf * LEAF_ROWS + 2)
+    result = Leaf()
+    result.center = wp.vec3(row_0[0], row_0[1], row_0[2])
+    result.opacity = row_0[3]
+    result.whitening_x = wp.vec3(row_1[0], row_1[1], row_1[2])
+    result.whitening_y = wp.vec2(row_1[3], row_2[0])
+    result.whitening_z = row_2[1]
+    result.radius_squared = row_2[2]
+    result.index = wp.cast(row_2[3], int)
+    return result
+
+
+@wp.func
+def whiten(leaf: Leaf, v: wp.vec3) -> wp.vec3:
+    return wp.vec3(
+        leaf.whitening_x[0] * v[0] + leaf.whitening_x[1] * v[1] + leaf.whitening_x[2] * v[2],
+        leaf.whitening_y[0] * v[1] + leaf.whitening_y[1] * v[2],
+        leaf.whitening_z * v[2],
+    )
+
+
+@wp.struct
+class CanonicalRay:
+    """A ray in the space where a leaf's Gaussian is the unit sphere, by way of its point closest to the centre."""
+
+    dd: float  # squared length of the whitened direction
+    cc: float  # dd times the squared distance to the centre
     t_dd: float  # dd times t of the largest response
 
 
 @wp.func
-def canonical_ray(
-    center: wp.vec4, m_0: wp.vec4, m_1: wp.vec4, m_2: wp.vec4, origin: wp.vec3, direction: wp.vec3
-) -> CanonicalRay:
+def canonical_ray(leaf: Leaf, origin: wp.vec3, direction: wp.vec3) -> CanonicalRay:
     """Arithmetic of `ray_peak`, without its divisions."""
-    ray = CanonicalRay()
-    p = origin - wp.vec3(center[0], center[1], center[2])
+    p = origin - leaf.center
     t_closest = -wp.dot(p, direction)
-    p = p + direction * t_closest
-    ray.q = wp.vec3(
-        m_0[0] * p[0] + m_0[1] * p[1] + m_0[2] * p[2],
-        m_1[0] * p[0] + m_1[1] * p[1] + m_1[2] * p[2],
-        m_2[0] * p[0] + m_2[1] * p[1] + m_2[2] * p[2],
-    )
-    ray.d = wp.vec3(
-        m_0[0] * direction[0] + m_0[1] * direction[1] + m_0[2] * direction[2],
-        m_1[0] * direction[0] + m_1[1] * direction[1] + m_1[2] * direction[2],
-        m_2[0] * direction[0] + m_2[1] * direction[1] + m_2[2] * direction[2],
-    )
-    ray.dd = wp.dot(ray.d, ray.d)
-    c = wp.cross(ray.q, ray.d)
+    q = whiten(leaf, p + direction * t_closest)
+    d = whiten(leaf, direction)
+    c = wp.cross(q, d)
+    ray = CanonicalRay()
+    ray.dd = wp.dot(d, d)
     ray.cc = wp.dot(c, c)
-    ray.t_dd = t_closest * ray.dd - wp.dot(ray.q, ray.d)
+    ray.t_dd = t_closest * ray.dd - wp.dot(q, d)
     return ray
 
 
@@ -234,16 +259,12 @@ class LeafAlpha:
 @wp.func
 def meet_leaf_by_default(tree: WideTree, leaf: int, origin: wp.vec3, direction: wp.vec3, t_max: float) -> LeafAlpha:
     """Peak in front, no culling, degree 2: what almost every ray asks for, a tenth faster than `meet_leaf`."""
-    row = leaf * LEAF_ROWS
-    center = load_row(tree.leaves, row)
-    m_0 = load_row(tree.leaves, row + 1)
-    m_1 = load_row(tree.leaves, row + 2)
-    m_2 = load_row(tree.leaves, row + 3)
-    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
+    gaussian = load_leaf(tree, leaf)
+    ray = canonical_ray(gaussian, origin, direction)
     result = LeafAlpha()
-    if ray.cc < m_0[3] * ray.dd and ray.t_dd > 0.0 and ray.t_dd < t_max * ray.dd:
-        result.alpha = wp.min(ALPHA_MAX, center[3] * wp.exp(-0.5 * ray.cc / ray.dd))
-        result.index = wp.cast(m_1[3], int)
+    if ray.cc < gaussian.radius_squared * ray.dd and ray.t_dd > 0.0 and ray.t_dd < t_max * ray.dd:
+        result.alpha = wp.min(ALPHA_MAX, gaussian.opacity * wp.exp(-0.5 * ray.cc / ray.dd))
+        result.index = gaussian.index
     return result
 
 
@@ -267,23 +288,19 @@ def meet_leaf(
     t_max: float,
 ) -> LeafPeak:
     """The same as `ray_peak` and `counts`, from the leaf's own rows."""
-    row = leaf * LEAF_ROWS
-    center = load_row(tree.leaves, row)
-    m_0 = load_row(tree.leaves, row + 1)
-    m_1 = load_row(tree.leaves, row + 2)
-    m_2 = load_row(tree.leaves, row + 3)
-    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
+    gaussian = load_leaf(tree, leaf)
+    ray = canonical_ray(gaussian, origin, direction)
     peak = LeafPeak()
-    if ray.cc < m_0[3] * ray.dd:
+    if ray.cc < gaussian.radius_squared * ray.dd:
         distance_squared = ray.cc / ray.dd
         peak.t = ray.t_dd / ray.dd
-        peak.index = wp.cast(m_1[3], int)
+        peak.index = gaussian.index
         start = peak.t
         if settings.entry_in_front == 1:
-            start -= wp.sqrt((m_0[3] - distance_squared) / ray.dd)
+            start -= wp.sqrt((gaussian.radius_squared - distance_squared) / ray.dd)
         met = start > 0.0 and peak.t < t_max
         if met and settings.cull == 1:
             met = wp.dot(gaussians.normals[peak.index], direction) <= 0.0
         if met:
-            peak.alpha = wp.min(ALPHA_MAX, center[3] * response(gaussians.degree, distance_squared))
+            peak.alpha = wp.min(ALPHA_MAX, gaussian.opacity * response(gaussians.degree, distance_squared))
     return peak
