@@ -3,11 +3,11 @@
     python benchmarks/estimators.py [--scene figure] [--device cuda:0] [--out result.json] [--plot errors.png]
 
 Scenes, tiled with Gaussians: "ball", a sphere resting on a floor before a wall, with points on all three; "figure",
-the embedded human figure of `beam demo`, with points where a camera sees it. Skies: made here, 128 x 256 texels whose brightest
-is 51, 1,600 and 20,000 times their mean; `--environment FILE` adds one of your own. Every error is the root mean
-square over points, channels and seeds against 16,384 rays (occlusion: cosine, Owen; irradiance: product, ratio, Owen),
-relative to the irradiance there, or to a twentieth of its mean where it is less. In brackets: what another program
-measured before, with triangles, on another figure, under captured skies of the same peaks.
+the embedded human figure of `beam demo`, with points where a camera that looks towards the sun sees it. Skies: made
+here, 128 x 256 texels whose brightest is 51, 1,600 and 20,000 times their mean; `--environment FILE` adds one of your
+own. Every error is the root mean square over points, channels and seeds against 16,384 rays (occlusion: cosine, Owen;
+irradiance: product, ratio, Owen), relative to the irradiance there, or to a twentieth of its mean where it is less. In
+brackets: what another program measured before, with triangles, on another figure, under captured skies of these peaks.
 """
 
 from __future__ import annotations
