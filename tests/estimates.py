@@ -9,6 +9,10 @@ SIGNIFICANCE = 1e-4
 LARGEST_Z = stats.norm.isf(SIGNIFICANCE / 2)
 
 
+def rms(errors):
+    return np.sqrt(np.mean(np.asarray(errors, dtype=np.float64) ** 2))
+
+
 def by_point(values):
     """Mean over all axes but the first: channels of a point see the same rays and count once."""
     return np.asarray(values, dtype=np.float64).reshape(len(values), -1).mean(axis=1)

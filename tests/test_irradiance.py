@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
-from estimates import LARGEST_Z, SIGNIFICANCE, require_honest, require_zero_mean
+from estimates import LARGEST_Z, SIGNIFICANCE, require_honest, require_zero_mean, rms
 from scipy import stats
 from shapes import cloud_of, disc_points, random_cloud, tiles
 
@@ -162,28 +162,12 @@ class TestUnbiased:
         """16 times the rays: a quarter of the error for independent samples, less for the others."""
         scene, points, normals = cluttered(device)
         light, truth = gentle_light(device)
-        few, many = (
-            np.sqrt(
-                np.mean(
-                    (
-                        irradiance(
-                            scene,
-                            points,
-                            normals,
-                            light,
-                            sample_count=count,
-                            density=density,
-                            sampler=sampler,
-                            ratio=False,
-                            offset=0.05,
-                        ).value
-                        - truth
-                    )
-                    ** 2
-                )
-            )
-            for count in (16, 256)
-        )
+
+        def error(count):
+            options = {"sample_count": count, "density": density, "sampler": sampler, "ratio": False, "offset": 0.05}
+            return rms(irradiance(scene, points, normals, light, **options).value - truth)
+
+        few, many = error(16), error(256)
         # 200 points: a root mean square is known to 4 % if errors are normal, and to 10 % for heavier tails
         if sampler == "iid":
             assert 4.0 * 0.7 < few / many < 4.0 / 0.7

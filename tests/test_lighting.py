@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from estimates import require_honest, require_zero_mean
+from estimates import require_honest, require_zero_mean, rms
 from shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles
 
 from beam_warp import Scene, ambient_occlusion
@@ -137,20 +137,13 @@ class TestErrors:
     def test_error_falls_with_the_count(self, device, sampler):
         """16 times the rays: a quarter of the error for independent samples, less for the others."""
         scene, points, n, truth = cluttered(device)
-        few, many = (
-            np.sqrt(
-                np.mean(
-                    (
-                        ambient_occlusion(scene, points, n, sample_count=k, offset=0.1, sampler=sampler).visibility
-                        - truth
-                    )
-                    ** 2
-                )
-            )
-            for k in (16, 256)
-        )
+
+        def error(count):
+            result = ambient_occlusion(scene, points, n, sample_count=count, offset=0.1, sampler=sampler)
+            return rms(result.visibility - truth)
+
         # 300 points know a root mean square to 1 / sqrt(600) if errors are normal, and to three times that if not
-        gain = few / many
+        gain = error(16) / error(256)
         assert 4.0 / 1.6 < gain < 4.0 * 1.6 if sampler == "iid" else gain > 4.0
 
 

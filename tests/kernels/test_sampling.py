@@ -26,6 +26,7 @@ from beam_warp.kernels.sampling import (
     owen_sobol_y,
     sobol_second_dimension,
     square_to_cosine_hemisphere,
+    square_to_cosine_hemisphere_pdf,
     stratum,
     stream_of,
     unit_float,
@@ -77,6 +78,12 @@ def cosine_round_trip_kernel(squares: wp.array[wp.vec2], out: wp.array[wp.vec2],
     direction = square_to_cosine_hemisphere(squares[i][0], squares[i][1])
     out_direction[i] = direction
     out[i] = cosine_hemisphere_to_square(direction)
+
+
+@wp.kernel
+def cosine_pdf_kernel(directions: wp.array[wp.vec3], out: wp.array[float]):
+    i = wp.tid()
+    out[i] = square_to_cosine_hemisphere_pdf(directions[i])
 
 
 @wp.kernel
@@ -263,6 +270,23 @@ def test_cosine_map_inverts_and_has_its_density(device, rng):
     phi = np.arctan2(d[:, 1], d[:, 0]) / (2.0 * np.pi) + 0.5
     counts = np.histogram2d(d[:, 2] ** 2, phi, bins=10, range=[[0, 1], [0, 1]])[0]
     assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE
+
+
+def test_cosine_density_integrates_to_one(device):
+    """By midpoints of a fine lat-long grid, which the equator does not cut: exact to their second order."""
+    sphere = EnvironmentMap.constant((1.0, 1.0, 1.0), height=256)
+    directions = sphere.directions().reshape(-1, 3).astype(np.float32)
+    out = wp.empty(len(directions), dtype=float, device=device)
+    wp.launch(
+        cosine_pdf_kernel,
+        len(directions),
+        inputs=[wp.array(directions, dtype=wp.vec3, device=device)],
+        outputs=[out],
+        device=device,
+    )
+    density = out.numpy().astype(np.float64)
+    assert (density * sphere.solid_angles().ravel()).sum() == pytest.approx(1.0, abs=(np.pi / 256) ** 2)
+    assert not density[directions[:, 2] < 0.0].any()
 
 
 def sunny_sky(height=64):
