@@ -1,14 +1,18 @@
-"""An environment prepared on a device for drawing directions by environment times cosine."""
+"""An environment prepared on a device: for drawing directions by it, or by it times cosine, and for its irradiance."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from beam_warp.devices import upload
 from beam_warp.environments import EnvironmentMap
+from beam_warp.kernels.environment_sampling import EnvironmentDistribution
+from beam_warp.kernels.irradiance import LightMoments
 from beam_warp.kernels.product_sampling import EnvironmentBlocks
 
 BLOCK_ROWS, BLOCK_COLUMNS = 16, 32
@@ -16,12 +20,49 @@ LARGEST_HEIGHT = 512
 """Taller maps are reduced to this height, energy kept: a texel is then 0.35 degrees, two thirds of the sun."""
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance weights."""
+"""Rec.709 luminance weights: texels are drawn by what the eye sees of them."""
+
+MOMENT_ROWS = 64
+"""Rows of the grid behind `light_moments`: cells at the horizon lose at most (pi / 64)^2 / 12 = 2e-4 of even light."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampledEnvironment:
+    """An environment on a device, ready for every density; make it once, use it for many points.
+
+    Attributes:
+        device: Warp device that holds it.
+        distribution: For drawing by the environment alone.
+        blocks: For drawing by the environment times the cosine.
+        moments: For the irradiance that would arrive if nothing were in the way.
+    """
+
+    device: Any
+    distribution: EnvironmentDistribution
+    blocks: EnvironmentBlocks
+    moments: LightMoments
+
+    @classmethod
+    def from_environment(cls, environment: EnvironmentMap, device: Any) -> SampledEnvironment:
+        """Prepare an environment; all parts see the same texels, those of `fitted`."""
+        environment = fitted(environment)
+        return cls(
+            device,
+            environment_distribution(environment, device),
+            environment_blocks(environment, device),
+            light_moments(environment, device),
+        )
 
 
 def suited_height(height: int) -> int:
     """Return the largest number of texel rows, at most ``LARGEST_HEIGHT``, that blocks divide evenly; 32 at least."""
     return max(2 * BLOCK_ROWS, min(height, LARGEST_HEIGHT) // BLOCK_ROWS * BLOCK_ROWS)
+
+
+def fitted(environment: EnvironmentMap) -> EnvironmentMap:
+    """Return the environment on a grid that blocks divide, energy kept; itself if they do already."""
+    height = suited_height(environment.height)
+    return environment if height == environment.height else environment.resized(height, 2 * height)
 
 
 def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentBlocks:
@@ -31,10 +72,8 @@ def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentB
         environment: Resampled, energy kept, if blocks do not divide its size.
         device: Warp device.
     """
-    height = suited_height(environment.radiance.shape[0])
-    if height != environment.radiance.shape[0]:
-        environment = environment.resized(height, 2 * height)
-    width = 2 * height
+    environment = fitted(environment)
+    height, width = environment.height, environment.width
     rows, columns = height // BLOCK_ROWS, width // BLOCK_COLUMNS
     radiance = environment.radiance.astype(np.float64)
     luminance = radiance @ LUMINANCE
@@ -70,3 +109,56 @@ def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentB
     blocks.row_cdf = upload(row_cdf.astype(np.float32), float, device)
     blocks.column_cdf = upload(column_cdf.astype(np.float32), float, device)
     return blocks
+
+
+def environment_distribution(environment: EnvironmentMap, device: Any) -> EnvironmentDistribution:
+    """Accumulate what drawing directions by luminance times solid angle needs; a black map is drawn uniformly."""
+    angles = environment.solid_angles()
+    luminance = environment.radiance.astype(np.float64) @ LUMINANCE
+    power = luminance * angles
+    if not power.sum() > 0.0:
+        luminance, power = np.ones_like(luminance), angles
+    rows = power.sum(axis=1)
+    # A row without light is never drawn; its columns are given uniform edges so that they rise all the same.
+    columns = np.where(rows[:, None] > 0.0, power, angles)
+    distribution = EnvironmentDistribution()
+    distribution.radiance = upload(environment.radiance, wp.vec3, device)
+    distribution.row_edges = upload(_edges(rows[None])[0], float, device)
+    distribution.column_edges = upload(_edges(columns), float, device)
+    distribution.density = upload((luminance / power.sum()).astype(np.float32), float, device)
+    return distribution
+
+
+def _edges(weights: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return cumulative shares of each row from exactly 0 to exactly 1."""
+    edges = np.zeros((weights.shape[0], weights.shape[1] + 1))
+    np.cumsum(weights, axis=1, out=edges[:, 1:])
+    return (edges / edges[:, -1:]).astype(np.float32)
+
+
+def light_moments(environment: EnvironmentMap, device: Any) -> LightMoments:
+    """Sum radiance times the first moment of its texel, in closed form, over the cells of a grid.
+
+    E(n) = sum over cells of max(0, n . moment) is the unshadowed irradiance of a normal: exact for every cell on one
+    side of the normal's horizon, and a sun keeps its place whatever its cell.
+    """
+    height, width = environment.height, environment.width
+    theta = np.linspace(0.0, np.pi, height + 1)
+    phi = np.pi - (np.arange(width) + 0.5) * (2.0 * np.pi / width)
+    # integrals of (cos phi sin theta, cos theta) sin theta over a texel whose middle is at phi = 0, for each row
+    sideways = np.diff(theta / 2.0 - np.sin(2.0 * theta) / 4.0) * (2.0 * np.sin(np.pi / width))
+    upward = np.diff(np.sin(theta) ** 2 / 2.0) * (2.0 * np.pi / width)
+    moment = np.stack(
+        np.broadcast_arrays(sideways[:, None] * np.cos(phi), sideways[:, None] * np.sin(phi), upward[:, None]), axis=-1
+    )
+    weighted = environment.radiance.astype(np.float64)[..., None] * moment[:, :, None, :]  # (H, W, channel, axis)
+    for axis, cells in ((0, MOMENT_ROWS), (1, 2 * MOMENT_ROWS)):
+        size = weighted.shape[axis]
+        if size > cells:
+            weighted = np.add.reduceat(weighted, np.arange(cells) * size // cells, axis=axis)
+    cells = weighted.reshape(-1, 3, 3)
+    cells = cells[np.abs(cells).sum(axis=(1, 2)) > 0.0].astype(np.float32)
+    moments = LightMoments()
+    for channel, name in enumerate(("red", "green", "blue")):
+        setattr(moments, name, upload(cells[:, channel], wp.vec3, device))
+    return moments

@@ -16,6 +16,7 @@ from beam_warp.kernels.ambient_occlusion import (
     launch_reduce_visibility,
     launch_trace_occlusion,
 )
+from beam_warp.sampling import Sampler, sample_set
 from beam_warp.scene import Scene
 from beam_warp.tracing import EXACT, TraceOptions
 
@@ -61,14 +62,6 @@ def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float
     return wp.array(height + LIFT_IN_THICKNESSES * thickness, dtype=float, device=scene.device)
 
 
-def stratum_bits(sample_count: int) -> wp.vec2i:
-    """Return the grid of strata, as bits of columns and rows, that ``sample_count`` points fill; (-1, -1) for none."""
-    bits = sample_count.bit_length() - 1
-    if sample_count != 1 << bits or bits == 0:
-        return wp.vec2i(-1, -1)
-    return wp.vec2i(bits // 2, bits - bits // 2)
-
-
 def ambient_occlusion(
     scene: Scene,
     points: Any,
@@ -80,11 +73,12 @@ def ambient_occlusion(
     seed: int = 0,
     frame: int = 0,
     progress: Progress | None = None,
+    sampler: Sampler = "owen",
 ) -> AmbientOcclusion:
     """Estimate how open the hemisphere above each surface point is.
 
-    A(x) = 1/pi * integral over the hemisphere of V(x, w) (n.w) dw. Directions are cosine-weighted by an
-    Owen-scrambled Sobol' set of its own for each point, so the estimate is the mean of V.
+    A(x) = 1/pi * integral over the hemisphere of V(x, w) (n.w) dw. Directions are cosine-weighted by a sample set of
+    its own for each point, so the estimate is the mean of V.
 
     Args:
         scene: Occluders; the work runs on its device.
@@ -97,6 +91,8 @@ def ambient_occlusion(
         seed: Same seed, same device, same bits.
         frame: Number of the frame; frames have independent noise, the same frame always the same.
         progress: Called now and then with (points done, points in all).
+        sampler: Sample sets: ``"owen"`` (Owen-scrambled Sobol'), ``"stratified"`` (a jittered grid, the squarest of
+            ``sample_count`` cells; one column of them if that is a prime) or ``"iid"`` (independent).
 
     Returns:
         Visibility and its standard error; NumPy, or warp arrays if one came in.
@@ -105,9 +101,9 @@ def ambient_occlusion(
         InvalidArrayError: A shape, type, non-finite or non-unit value breaks the contract above.
         InvalidOptionError: An option is out of range.
 
-    Source: BEAM Eq. 6; sample set Burley 2020.
+    Source: BEAM Eq. 6; Owen's sets by hashing, Burley 2020; jittered grids, Cook 1986.
     """
-    count = require_count("sample_count", sample_count, 1, 1 << 20)
+    samples = sample_set(sampler, sample_count)
     require_count("seed", seed, 0, 2**32 - 1)
     require_count("frame", frame, 0, 2**32 - 1)
     if isinstance(offset, str) and offset != "auto":
@@ -120,9 +116,8 @@ def ambient_occlusion(
     if len(at):
         settings = options.settings(scene)
         offsets = ray_offsets(scene, at, up, offset)
-        bits = stratum_bits(count)
-        step = max(1, RAYS_AT_ONCE // count)
-        samples = wp.empty(min(step, len(at)) * count, dtype=float, device=scene.device)
+        step = max(1, RAYS_AT_ONCE // samples.count)
+        traced = wp.empty(min(step, len(at)) * samples.count, dtype=float, device=scene.device)
         for start in range(0, len(at), step):
             part = slice(start, min(start + step, len(at)))
             launch_trace_occlusion(
@@ -134,12 +129,11 @@ def ambient_occlusion(
                 seed,
                 frame,
                 start,
-                count,
-                bits,
                 samples,
+                traced,
                 scene.device,
             )
-            launch_reduce_visibility(samples, count, bits[0] >= 0, mean[part], error[part], scene.device)
+            launch_reduce_visibility(traced, samples, mean[part], error[part], scene.device)
             if progress is not None:
                 progress(part.stop, len(at))
     return AmbientOcclusion(download_like(mean, points, normals), download_like(error, points, normals))

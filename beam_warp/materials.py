@@ -34,7 +34,8 @@ from beam_warp.kernels.residues import (
     launch_trace_bounce,
     launch_trace_light,
 )
-from beam_warp.lighting import Progress, ambient_occlusion, ray_offsets, stratum_bits
+from beam_warp.lighting import Progress, ambient_occlusion, ray_offsets
+from beam_warp.sampling import sample_set
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfaceNormals
@@ -283,8 +284,7 @@ def measure_materials(
             cumulative,
             (options.seed, frame),
             start,
-            samples,
-            stratum_bits(samples),
+            sample_set("owen", samples),
             rays,
         )
         bounce = wp.zeros(size, dtype=wp.vec3, device=device)

@@ -18,18 +18,15 @@ from beam_warp.checks import (
     require_same_length,
 )
 from beam_warp.devices import resolve_device, upload
+from beam_warp.environment_sampling import environment_distribution
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
 from beam_warp.ggx import specular_albedo_table
-from beam_warp.kernels.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.mesh_channels import MeshChannels, launch_trace_channels
 from beam_warp.kernels.mesh_path import launch_trace_outgoing, launch_trace_pixels
 from beam_warp.kernels.mesh_surface import MeshSurface
 from beam_warp.kernels.pixel_sampling import PixelRays
 from beam_warp.material_mesh import MaterialMesh
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance weights: texels are drawn by what the eye sees of them."""
 
 MOST_SAMPLES = 2**20
 MOST_BOUNCES = 64
@@ -248,31 +245,6 @@ def outgoing_radiance(
         out,
     )
     return out.numpy()
-
-
-def environment_distribution(environment: EnvironmentMap, device: Any) -> EnvironmentDistribution:
-    """Accumulate what drawing directions by luminance times solid angle needs; a black map is drawn uniformly."""
-    angles = environment.solid_angles()
-    luminance = environment.radiance.astype(np.float64) @ LUMINANCE
-    power = luminance * angles
-    if not power.sum() > 0.0:
-        luminance, power = np.ones_like(luminance), angles
-    rows = power.sum(axis=1)
-    # A row without light is never drawn; its columns are given uniform edges so that they rise all the same.
-    columns = np.where(rows[:, None] > 0.0, power, angles)
-    distribution = EnvironmentDistribution()
-    distribution.radiance = upload(environment.radiance, wp.vec3, device)
-    distribution.row_edges = upload(_edges(rows[None])[0], float, device)
-    distribution.column_edges = upload(_edges(columns), float, device)
-    distribution.density = upload((luminance / power.sum()).astype(np.float32), float, device)
-    return distribution
-
-
-def _edges(weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return cumulative shares of each row from exactly 0 to exactly 1."""
-    edges = np.zeros((weights.shape[0], weights.shape[1] + 1))
-    np.cumsum(weights, axis=1, out=edges[:, 1:])
-    return (edges / edges[:, -1:]).astype(np.float32)
 
 
 def _pixel_rays(camera: Camera) -> PixelRays:

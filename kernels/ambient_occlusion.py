@@ -8,18 +8,20 @@ from beam_warp.kernels.constants import LARGEST_FLOAT
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.occluders import surface_layer, transmittance
 from beam_warp.kernels.sampling import (
+    SampleSet,
+    draw_square,
     hash_combine,
-    owen_sobol_x,
-    owen_sobol_y,
     square_to_cosine_hemisphere,
-    stratum,
     stream_of,
     tangent_frame,
-    unit_float,
 )
+from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
 from beam_warp.kernels.trace_settings import TraceSettings
 
 wp.set_module_options({"enable_backward": False})
+
+LARGEST_DEVIATION = wp.constant(0.5)
+"""Standard deviation of a number in [0, 1] that is either end as often: none has a larger one."""
 
 
 @wp.kernel
@@ -46,25 +48,20 @@ def trace_occlusion_kernel(
     seed: wp.uint32,
     frame: wp.uint32,
     first_point: int,
-    sample_count: int,
-    stratum_bits: wp.vec2i,
+    samples: SampleSet,
     out_visibility: wp.array[float],
 ):
-    """One cosine-distributed ray a thread; the result goes to the ray's stratum, or to its number if there are none."""
+    """One cosine-distributed ray a thread; the result goes to the ray's slot."""
     ray = first + wp.tid()
-    point = ray / sample_count
-    sample = ray % sample_count
+    point = ray / samples.count
+    index = ray % samples.count
     n = normals[point]
     stream = stream_of(seed, frame, wp.uint32(first_point + point))
-    x = owen_sobol_x(sample, stream)
-    y = owen_sobol_y(sample, stream)
-    direction = tangent_frame(n) * square_to_cosine_hemisphere(unit_float(x), unit_float(y))
+    drawn = draw_square(samples, index, stream)
+    direction = tangent_frame(n) * square_to_cosine_hemisphere(drawn.u, drawn.v)
     origin = points[point] - occluders.origin + n * offsets[point]
-    slot = sample
-    if stratum_bits[0] >= 0:
-        slot = stratum(x, y, stratum_bits[0], stratum_bits[1])
-    out_visibility[point * sample_count + slot] = transmittance(
-        occluders, settings, origin, direction, LARGEST_FLOAT, hash_combine(stream, wp.uint32(sample + 16))
+    out_visibility[point * samples.count + drawn.slot] = transmittance(
+        occluders, settings, origin, direction, LARGEST_FLOAT, hash_combine(stream, wp.uint32(index + 16))
     )
 
 
@@ -72,36 +69,23 @@ def trace_occlusion_kernel(
 def reduce_visibility_kernel(
     first: int,
     visibility: wp.array[float],
-    sample_count: int,
-    stratified: int,
+    samples: SampleSet,
     out_mean: wp.array[float],
     out_error: wp.array[float],
 ):
-    """Mean and standard error of each point's samples.
-
-    Stratified samples: neighbouring strata a, b estimate each other's spread, (V_a - V_b)^2, the collapsed-strata
-    estimator (Cochran 1977, §5A.12); differences between the strata only make it larger, so it errs on the safe side.
-    Otherwise the textbook variance of the mean.
-    """
+    """Mean and standard error of each point's samples; of one sample nothing is known but that it lies in [0, 1]."""
     point = first + wp.tid()
-    start = point * sample_count
+    start = point * samples.count
     total = float(0.0)
-    for k in range(sample_count):
+    spread = Spread()
+    spread.paired = wp.where(samples.columns > 0, 1, 0)
+    for k in range(samples.count):
         total += visibility[start + k]
-    mean = total / float(sample_count)
-    spread = float(0.0)
-    if stratified == 1:
-        for k in range(sample_count / 2):
-            d = visibility[start + 2 * k] - visibility[start + 2 * k + 1]
-            spread += d * d
-        spread = wp.sqrt(spread) / float(sample_count)
-    elif sample_count > 1:
-        for k in range(sample_count):
-            d = visibility[start + k] - mean
-            spread += d * d
-        spread = wp.sqrt(spread / (float(sample_count) * float(sample_count - 1)))
-    out_mean[point] = mean
-    out_error[point] = spread
+        spread = add_term(spread, visibility[start + k])
+    out_mean[point] = total / float(samples.count)
+    out_error[point] = LARGEST_DEVIATION
+    if samples.count > 1:
+        out_error[point] = wp.sqrt(variance_of_sum(spread)) / float(samples.count)
 
 
 def launch_local_surface(occluders, points, normals, out_surface, device):
@@ -125,15 +109,14 @@ def launch_trace_occlusion(
     seed,
     frame,
     first_point,
-    sample_count,
-    stratum_bits,
+    samples,
     out_visibility,
     device,
 ):
-    """Trace ``sample_count`` rays from each point."""
+    """Trace ``samples.count`` rays from each point."""
     launch(
         trace_occlusion_kernel,
-        len(points) * sample_count,
+        len(points) * samples.count,
         inputs=[
             occluders,
             settings,
@@ -143,8 +126,7 @@ def launch_trace_occlusion(
             wp.uint32(seed),
             wp.uint32(frame),
             first_point,
-            sample_count,
-            stratum_bits,
+            samples,
         ],
         outputs=[out_visibility],
         device=device,
@@ -152,12 +134,12 @@ def launch_trace_occlusion(
     )
 
 
-def launch_reduce_visibility(visibility, sample_count, stratified, out_mean, out_error, device):
+def launch_reduce_visibility(visibility, samples, out_mean, out_error, device):
     """Reduce each point's samples to mean and error."""
     launch(
         reduce_visibility_kernel,
         len(out_mean),
-        inputs=[visibility, sample_count, int(stratified)],
+        inputs=[visibility, samples],
         outputs=[out_mean, out_error],
         device=device,
     )

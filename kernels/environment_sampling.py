@@ -23,9 +23,19 @@ class EnvironmentDistribution:
 
 @wp.struct
 class EnvironmentSample:
+    """A drawn direction, the radiance from there and its density [1/sr]; all zero where nothing can be drawn."""
+
     direction: wp.vec3
     radiance: wp.vec3
     pdf: float
+
+
+@wp.func
+def radiance_over_pdf(sample: EnvironmentSample) -> wp.vec3:
+    result = wp.vec3()
+    if sample.pdf > 0.0:
+        result = sample.radiance / sample.pdf
+    return result
 
 
 @wp.func

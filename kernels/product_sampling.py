@@ -8,6 +8,8 @@ Product of environment and cosine: Clarberg et al. 2005; hierarchy of cumulative
 
 import warp as wp
 
+from beam_warp.kernels.environment_sampling import EnvironmentSample
+from beam_warp.kernels.latlong import direction_to_latlong
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -82,14 +84,6 @@ def accumulate_block_weights_kernel(
         out_cumulative[i, block] = total
 
 
-@wp.struct
-class EnvironmentSample:
-    """A drawn direction with the radiance from there divided by its density; all zero where nothing can be drawn."""
-
-    direction: wp.vec3
-    radiance_over_pdf: wp.vec3
-
-
 @wp.func
 def square_to_product(
     blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, u: float, v: float
@@ -146,23 +140,74 @@ def square_to_product(
     phi = (0.5 - (float(x) + v_texel) / float(width)) * 2.0 * PI
     sample.direction = wp.vec3(radius * wp.cos(phi), radius * wp.sin(phi), z)
     # pdf = P(block) luminance / block_power: solid angles cancel.
-    probability = (block_end - block_begin) / total
-    sample.radiance_over_pdf = blocks.radiance[y, x] * (blocks.block_power[block] / (luminance * probability))
+    sample.radiance = blocks.radiance[y, x]
+    sample.pdf = (block_end - block_begin) / total * (luminance / blocks.block_power[block])
     return sample
 
 
 @wp.func
-def product_pdf(blocks: EnvironmentBlocks, total: float, normal: wp.vec3, row: int, column: int) -> float:
-    """Density [1/sr] of drawing a direction in texel (row, column); ``total`` is the sum of the point's weights."""
+def texel_of(blocks: EnvironmentBlocks, direction: wp.vec3) -> wp.vec2i:
+    """Row and column of the texel that holds a direction."""
+    uv = direction_to_latlong(direction)
+    height = blocks.radiance.shape[0]
+    width = blocks.radiance.shape[1]
+    return wp.vec2i(
+        wp.clamp(int(uv[1] * float(height)), 0, height - 1), wp.clamp(int(uv[0] * float(width)), 0, width - 1)
+    )
+
+
+@wp.func
+def block_of(blocks: EnvironmentBlocks, texel: wp.vec2i) -> int:
     rows = blocks.radiance.shape[0] / BLOCK_ROWS
     columns = blocks.radiance.shape[1] / BLOCK_COLUMNS
-    block = (row / rows) * BLOCK_COLUMNS + column / columns
+    return (texel[0] / rows) * BLOCK_COLUMNS + texel[1] / columns
+
+
+@wp.func
+def square_to_product_pdf(
+    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, direction: wp.vec3
+) -> float:
+    """Density of a direction [1/sr]."""
+    texel = texel_of(blocks, direction)
+    block = block_of(blocks, texel)
+    total = cumulative[point, BLOCK_COUNT - 1]
     density = float(0.0)
     if total > 0.0 and blocks.block_power[block] > 0.0:
-        density = (
-            block_weight(blocks, block, normal) / total * blocks.luminance[row, column] / blocks.block_power[block]
-        )
+        share = (cumulative[point, block] - entry_before(cumulative, point, 0, block)) / total
+        density = share * (blocks.luminance[texel[0], texel[1]] / blocks.block_power[block])
     return density
+
+
+@wp.func
+def product_to_square(
+    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, direction: wp.vec3
+) -> wp.vec2:
+    """The point of the unit square that `square_to_product` takes to ``direction``, if its density there is not 0."""
+    texel = texel_of(blocks, direction)
+    block = block_of(blocks, texel)
+    row = texel[0]
+    height = blocks.radiance.shape[0]
+    width = blocks.radiance.shape[1]
+    rows = height / BLOCK_ROWS
+    columns = width / BLOCK_COLUMNS
+
+    # Within the texel, then within the block, then among the blocks: the steps of the map from its end.
+    upper = wp.cos(float(row) / float(height) * PI)
+    lower = wp.cos(float(row + 1) / float(height) * PI)
+    u = wp.clamp((direction[2] - upper) / (lower - upper), 0.0, 1.0)
+    v = wp.clamp(direction_to_latlong(direction)[0] * float(width) - float(texel[1]), 0.0, 1.0)
+    u_begin = entry_before(blocks.row_cdf, block, 0, row % rows)
+    u = u_begin + u * (blocks.row_cdf[block, row % rows] - u_begin)
+    v_begin = entry_before(blocks.column_cdf, row, texel[1] - texel[1] % columns, texel[1] % columns)
+    v = v_begin + v * (blocks.column_cdf[row, texel[1]] - v_begin)
+
+    block_row = block / BLOCK_COLUMNS
+    row_begin = entry_before(cumulative, point, 0, block_row * BLOCK_COLUMNS)
+    row_end = cumulative[point, block_row * BLOCK_COLUMNS + BLOCK_COLUMNS - 1]
+    block_begin = entry_before(cumulative, point, 0, block)
+    u = (row_begin + u * (row_end - row_begin)) / cumulative[point, BLOCK_COUNT - 1]
+    v = (block_begin + v * (cumulative[point, block] - block_begin) - row_begin) / (row_end - row_begin)
+    return wp.vec2(u, v)
 
 
 def launch_accumulate_block_weights(blocks, normals, out_cumulative, device):

@@ -10,16 +10,18 @@ import warp as wp
 
 from beam_warp.kernels.brdf import specular_albedo, specular_brdf
 from beam_warp.kernels.constants import LARGEST_FLOAT
+from beam_warp.kernels.environment_sampling import radiance_over_pdf
 from beam_warp.kernels.latlong import latlong_bilinear
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.occluders import sampled_hit, transmittance
 from beam_warp.kernels.product_sampling import EnvironmentBlocks, square_to_product
 from beam_warp.kernels.sampling import (
+    SampleSet,
+    draw_square,
     hash_combine,
     owen_sobol_x,
     owen_sobol_y,
     square_to_cosine_hemisphere,
-    stratum,
     stream_of,
     tangent_frame,
     unit_float,
@@ -83,28 +85,23 @@ def trace_light_kernel(
     seed: wp.uint32,
     frame: wp.uint32,
     first_point: int,
-    sample_count: int,
-    stratum_bits: wp.vec2i,
+    samples: SampleSet,
     out_rays: LightRays,
 ):
     ray = first + wp.tid()
-    point = ray / sample_count
-    sample = ray % sample_count
+    point = ray / samples.count
+    index = ray % samples.count
     stream = hash_combine(stream_of(seed, frame, wp.uint32(first_point + point)), LIGHT_STREAM)
-    x = owen_sobol_x(sample, stream)
-    y = owen_sobol_y(sample, stream)
-    drawn = square_to_product(blocks, cumulative, point, unit_float(x), unit_float(y))
-    slot = sample
-    if stratum_bits[0] >= 0:
-        slot = stratum(x, y, stratum_bits[0], stratum_bits[1])
-    slot += point * sample_count
+    at = draw_square(samples, index, stream)
+    drawn = square_to_product(blocks, cumulative, point, at.u, at.v)
+    slot = point * samples.count + at.slot
     n = points.normals[point]
     v = float(0.0)
     if wp.dot(n, drawn.direction) > 0.0:
         origin = points.positions[point] - occluders.origin + n * points.offsets[point]
-        v = transmittance(occluders, settings, origin, drawn.direction, LARGEST_FLOAT, stream + wp.uint32(sample))
+        v = transmittance(occluders, settings, origin, drawn.direction, LARGEST_FLOAT, stream + wp.uint32(index))
     out_rays.directions[slot] = drawn.direction
-    out_rays.radiance_over_pdf[slot] = drawn.radiance_over_pdf
+    out_rays.radiance_over_pdf[slot] = radiance_over_pdf(drawn)
     out_rays.visibility[slot] = v
 
 
@@ -221,13 +218,11 @@ def fit_color_kernel(
     out_fit.relative_error[point] = relative_error
 
 
-def launch_trace_light(
-    scene, settings, points, blocks, cumulative, stream, first_point, sample_count, stratum_bits, out_rays
-):
+def launch_trace_light(scene, settings, points, blocks, cumulative, stream, first_point, samples, out_rays):
     """Draw and trace the rays towards the environment; ``stream`` is (seed, frame)."""
     launch(
         trace_light_kernel,
-        len(points.positions) * sample_count,
+        len(points.positions) * samples.count,
         inputs=[
             scene.occluders,
             settings,
@@ -237,8 +232,7 @@ def launch_trace_light(
             wp.uint32(stream[0]),
             wp.uint32(stream[1]),
             first_point,
-            sample_count,
-            stratum_bits,
+            samples,
         ],
         outputs=[out_rays],
         device=scene.device,

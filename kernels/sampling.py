@@ -116,6 +116,67 @@ def stratum(x: wp.uint32, y: wp.uint32, x_bits: int, y_bits: int) -> int:
     return column * (1 << y_bits) + row
 
 
+OWEN = wp.constant(0)
+STRATIFIED = wp.constant(1)
+INDEPENDENT = wp.constant(2)
+
+
+@wp.struct
+class SampleSet:
+    """What sets of points in the unit square look like; built in beam_warp.sampling."""
+
+    kind: int  # OWEN, STRATIFIED or INDEPENDENT
+    count: int  # points a set
+    columns: int  # strata side by side; 0 where there are none
+    rows: int  # strata one above the other
+    column_bits: int  # log2 of both, for OWEN
+    row_bits: int
+
+
+@wp.struct
+class SquareSample:
+    """A point of a set."""
+
+    u: float
+    v: float
+    slot: int  # its place in the order of strata, where neighbours share an edge; its number where there are none
+
+
+@wp.func
+def in_cell(cell: int, count: int, jitter: float) -> float:
+    """Where ``jitter`` in [0, 1) lies when ``cell`` of ``count`` is all there is; rounding never reaches 1."""
+    return wp.min((float(cell) + jitter) / float(count), 0.99999994)
+
+
+@wp.func
+def draw_square(samples: SampleSet, index: int, stream: wp.uint32) -> SquareSample:
+    """Point number ``index`` of the set of one stream.
+
+    OWEN: an Owen-scrambled Sobol' set. STRATIFIED: one uniform point in each cell of the grid, columns walked up and
+    down in turn. INDEPENDENT: hashes of (stream, index).
+    """
+    sample = SquareSample()
+    sample.slot = index
+    if samples.kind == OWEN:
+        x = owen_sobol_x(index, stream)
+        y = owen_sobol_y(index, stream)
+        sample.u = unit_float(x)
+        sample.v = unit_float(y)
+        if samples.columns > 0:
+            sample.slot = stratum(x, y, samples.column_bits, samples.row_bits)
+    else:
+        sample.u = unit_float(hash_combine(hash_combine(stream, wp.uint32(1)), wp.uint32(index)))
+        sample.v = unit_float(hash_combine(hash_combine(stream, wp.uint32(2)), wp.uint32(index)))
+        if samples.kind == STRATIFIED:
+            column = index / samples.rows
+            row = index % samples.rows
+            if column % 2 == 1:
+                row = samples.rows - 1 - row
+            sample.u = in_cell(column, samples.columns, sample.u)
+            sample.v = in_cell(row, samples.rows, sample.v)
+    return sample
+
+
 @wp.func
 def tangent_frame(n: wp.vec3) -> wp.mat33:
     """Columns: two tangents and ``n``; no branch at the poles (Duff et al. 2017)."""

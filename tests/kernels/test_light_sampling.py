@@ -6,6 +6,7 @@ import warp as wp
 from scipy import stats
 
 from beam_warp.devices import upload
+from beam_warp.environment_sampling import environment_distribution
 from beam_warp.environments import EnvironmentMap
 from beam_warp.kernels.environment_sampling import (
     EnvironmentDistribution,
@@ -18,7 +19,6 @@ from beam_warp.kernels.ggx_sampling import (
     square_to_visible_reflection_pdf,
     visible_reflection_to_square,
 )
-from beam_warp.mesh_path_tracing import environment_distribution
 
 SIGNIFICANCE = 1e-4
 

@@ -1,0 +1,300 @@
+"""Light that reaches points from an environment: drawing directions towards it, tracing them, and what they add up to.
+
+Drawing and tracing are apart, so that the kernel that traverses the hierarchy carries no registers of the others.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.constants import LARGEST_FLOAT
+from beam_warp.kernels.environment_sampling import (
+    EnvironmentDistribution,
+    EnvironmentSample,
+    environment_radiance,
+    radiance_over_pdf,
+    square_to_environment,
+    square_to_environment_pdf,
+)
+from beam_warp.kernels.launching import launch
+from beam_warp.kernels.occluders import transmittance
+from beam_warp.kernels.product_sampling import EnvironmentBlocks, square_to_product
+from beam_warp.kernels.sampling import (
+    SampleSet,
+    draw_square,
+    hash_combine,
+    square_to_cosine_hemisphere,
+    square_to_cosine_hemisphere_pdf,
+    stream_of,
+    tangent_frame,
+)
+from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
+from beam_warp.kernels.trace_settings import TraceSettings
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(3.14159265358979323846)
+LIGHT_STREAM = wp.constant(wp.uint32(0x49525241))
+
+COSINE = wp.constant(0)
+ENVIRONMENT = wp.constant(1)
+PRODUCT = wp.constant(2)
+
+
+@wp.struct
+class LightMoments:
+    """First moments of an environment's radiance over cells of the sphere [W/m^2], by channel; dark cells left out."""
+
+    red: wp.array[wp.vec3]
+    green: wp.array[wp.vec3]
+    blue: wp.array[wp.vec3]
+
+
+@wp.struct
+class Receivers:
+    """Points that light falls on."""
+
+    positions: wp.array[wp.vec3]
+    normals: wp.array[wp.vec3]
+    offsets: wp.array[float]
+
+
+@wp.struct
+class Technique:
+    """Samples of each point that one density draws."""
+
+    density: int  # COSINE, ENVIRONMENT or PRODUCT
+    samples: SampleSet
+    begin: int  # place of its first sample among those of a point
+    sample_count: int  # of a point, by all techniques
+    cosine_share: float  # part of a point's samples that COSINE draws
+    environment_share: float  # part that ENVIRONMENT draws
+
+
+@wp.struct
+class DrawnLight:
+    """Directions, ``sample_count`` a point, and radiance times cosine over pi times density: 0 where no ray is due."""
+
+    directions: wp.array[wp.vec3]
+    weights: wp.array[wp.vec3]
+
+
+@wp.kernel
+def sum_unshadowed_kernel(
+    first: int, moments: LightMoments, normals: wp.array[wp.vec3], out_irradiance: wp.array[wp.vec3]
+):
+    """Irradiance over pi with nothing in the way. Threads of a warp read the same cell at the same time."""
+    point = first + wp.tid()
+    n = normals[point]
+    red = float(0.0)
+    green = float(0.0)
+    blue = float(0.0)
+    for cell in range(moments.red.shape[0]):
+        red += wp.max(wp.dot(n, moments.red[cell]), 0.0)
+        green += wp.max(wp.dot(n, moments.green[cell]), 0.0)
+        blue += wp.max(wp.dot(n, moments.blue[cell]), 0.0)
+    out_irradiance[point] = wp.vec3(red, green, blue) / PI
+
+
+@wp.func
+def mixture_pdf(technique: Technique, n_dot_l: float, environment_pdf: float) -> float:
+    """Density of a point's samples by cosine and environment together: dividing by it is the balance heuristic.
+
+    Each density d has then the weight share_d pdf_d / sum of share_k pdf_k; the weights sum to one (Veach 1997, 9.2).
+    """
+    cosine_pdf = square_to_cosine_hemisphere_pdf(wp.vec3(0.0, 0.0, n_dot_l))
+    return technique.cosine_share * cosine_pdf + technique.environment_share * environment_pdf
+
+
+@wp.func
+def draw_light(
+    technique: Technique,
+    distribution: EnvironmentDistribution,
+    blocks: EnvironmentBlocks,
+    cumulative: wp.array2d[float],
+    point: int,
+    normal: wp.vec3,
+    u: float,
+    v: float,
+) -> EnvironmentSample:
+    """A direction by the technique's density, with the density of all techniques together."""
+    drawn = EnvironmentSample()
+    if technique.density == PRODUCT:
+        drawn = square_to_product(blocks, cumulative, point, u, v)
+    elif technique.density == ENVIRONMENT:
+        # The texel's own radiance and density: its direction, rounded at an edge, may lie in the texel next door.
+        drawn = square_to_environment(distribution, u, v)
+        drawn.pdf = mixture_pdf(technique, wp.dot(normal, drawn.direction), drawn.pdf)
+    else:
+        drawn.direction = tangent_frame(normal) * square_to_cosine_hemisphere(u, v)
+        drawn.radiance = environment_radiance(distribution, drawn.direction)
+        drawn.pdf = mixture_pdf(
+            technique, wp.dot(normal, drawn.direction), square_to_environment_pdf(distribution, drawn.direction)
+        )
+    return drawn
+
+
+@wp.kernel
+def draw_light_kernel(
+    first: int,
+    technique: Technique,
+    distribution: EnvironmentDistribution,
+    blocks: EnvironmentBlocks,
+    cumulative: wp.array2d[float],
+    normals: wp.array[wp.vec3],
+    seed: wp.uint32,
+    frame: wp.uint32,
+    first_point: int,
+    out_light: DrawnLight,
+):
+    """One direction a thread; the samples of a point are neighbours."""
+    i = first + wp.tid()
+    point = i / technique.samples.count
+    index = i % technique.samples.count
+    normal = normals[point]
+    stream = stream_of(seed, frame, wp.uint32(first_point + point))
+    stream = hash_combine(stream, LIGHT_STREAM + wp.uint32(technique.density))
+    at = draw_square(technique.samples, index, stream)
+    drawn = draw_light(technique, distribution, blocks, cumulative, point, normal, at.u, at.v)
+    slot = point * technique.sample_count + technique.begin + at.slot
+    out_light.directions[slot] = drawn.direction
+    out_light.weights[slot] = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
+
+
+@wp.kernel
+def trace_light_kernel(
+    first: int,
+    occluders: Any,
+    settings: TraceSettings,
+    receivers: Receivers,
+    light: DrawnLight,
+    sample_count: int,
+    seed: wp.uint32,
+    frame: wp.uint32,
+    first_point: int,
+    out_visibility: wp.array[float],
+):
+    """One ray a thread, in the order of strata; directions without light are not traced."""
+    i = first + wp.tid()
+    point = i / sample_count
+    weight = light.weights[i]
+    v = float(0.0)
+    if weight[0] + weight[1] + weight[2] > 0.0:
+        stream = stream_of(seed, frame, wp.uint32(first_point + point))
+        stream = hash_combine(hash_combine(stream, LIGHT_STREAM), wp.uint32(i % sample_count))
+        origin = receivers.positions[point] - occluders.origin + receivers.normals[point] * receivers.offsets[point]
+        v = transmittance(occluders, settings, origin, light.directions[i], LARGEST_FLOAT, stream)
+    out_visibility[i] = v
+
+
+@wp.kernel
+def reduce_light_kernel(
+    first: int,
+    light: DrawnLight,
+    visibility: wp.array[float],
+    counts: wp.vec2i,
+    paired: wp.vec2i,
+    ratio: int,
+    unshadowed: wp.array[wp.vec3],
+    out_value: wp.array[wp.vec3],
+    out_error: wp.array[wp.vec3],
+):
+    """Irradiance over pi and its standard error, by channel, from the samples of up to two techniques.
+
+    Plain: the mean of V f. Ratio: unshadowed * sum V f / sum f (Heitz et al. 2018), whose error is that of the
+    linearised terms (V - ratio) f. Where no sample found light, the ratio is anything in [0, 1].
+    """
+    point = first + wp.tid()
+    count = counts[0] + counts[1]
+    start = point * count
+    free = wp.vec3()
+    seen = wp.vec3()
+    for k in range(start, start + count):
+        free += light.weights[k]
+        seen += light.weights[k] * visibility[k]
+    value = wp.vec3()
+    error = wp.vec3()
+    for c in range(3):
+        scale = 1.0 / float(count)
+        center = float(0.0)
+        if ratio == 1:
+            scale = 0.0
+            if free[c] > 0.0:
+                scale = unshadowed[point][c] / free[c]
+                center = seen[c] / free[c]
+        here = Spread()
+        there = Spread()
+        here.paired = paired[0]
+        there.paired = paired[1]
+        for k in range(start, start + counts[0]):
+            here = add_term(here, light.weights[k][c] * (visibility[k] - center))
+        for k in range(start + counts[0], start + count):
+            there = add_term(there, light.weights[k][c] * (visibility[k] - center))
+        value[c] = scale * seen[c]
+        error[c] = scale * wp.sqrt(variance_of_sum(here) + variance_of_sum(there))
+        if ratio == 1 and not (free[c] > 0.0):
+            value[c] = 0.5 * unshadowed[point][c]
+            error[c] = 0.5 * unshadowed[point][c]
+    out_value[point] = value
+    out_error[point] = error
+
+
+def launch_sum_unshadowed(moments, normals, out_irradiance, device):
+    """Sum the irradiance over pi of every normal, with nothing in the way."""
+    launch(sum_unshadowed_kernel, len(normals), inputs=[moments, normals], outputs=[out_irradiance], device=device)
+
+
+def launch_draw_light(technique, environment, cumulative, normals, stream, first_point, out_light, device):
+    """Draw one technique's directions; ``stream`` is (seed, frame)."""
+    launch(
+        draw_light_kernel,
+        len(normals) * technique.samples.count,
+        inputs=[
+            technique,
+            environment.distribution,
+            environment.blocks,
+            cumulative,
+            normals,
+            wp.uint32(stream[0]),
+            wp.uint32(stream[1]),
+            first_point,
+        ],
+        outputs=[out_light],
+        device=device,
+        block_dim=128,
+    )
+
+
+def launch_trace_light(
+    occluders, settings, receivers, light, sample_count, stream, first_point, out_visibility, device
+):
+    """Trace the drawn directions; ``stream`` is (seed, frame)."""
+    launch(
+        trace_light_kernel,
+        len(receivers.positions) * sample_count,
+        inputs=[
+            occluders,
+            settings,
+            receivers,
+            light,
+            sample_count,
+            wp.uint32(stream[0]),
+            wp.uint32(stream[1]),
+            first_point,
+        ],
+        outputs=[out_visibility],
+        device=device,
+        block_dim=64,
+    )
+
+
+def launch_reduce_light(light, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device):
+    """Add up each point's samples."""
+    launch(
+        reduce_light_kernel,
+        len(out_value),
+        inputs=[light, visibility, counts, paired, int(ratio), unshadowed],
+        outputs=[out_value, out_error],
+        device=device,
+        block_dim=64,
+    )
