@@ -43,7 +43,9 @@ def encoded(table: Table, name: str, values: Sequence[str], rows: Sequence[Row])
         return {None: values[0]}
     axis = table.subject.axis(name)
     present = {row.settings.get(name) for row in rows}
-    return {level: values[k % len(values)] for k, level in enumerate(axis.levels) if level in present} or {None: values[0]}
+    return {level: values[k % len(values)] for k, level in enumerate(axis.levels) if level in present} or {
+        None: values[0]
+    }
 
 
 def lines_of(table: Table, rows: Sequence[Row]) -> list[list[Row]]:
@@ -89,7 +91,13 @@ def write_image(table: Table, path: Path) -> None:
     longest = max((len(table.frontier(metric)) for metric in curves), default=0)
     list_height = 0.55 + 0.215 * (longest + 1)
     notes = note_lines(table, curves + effects)
-    heights = [0.75, 5.2 if curves else 0.0, list_height if curves else 0.0, 2.0 if effects else 0.0, 0.3 + 0.185 * len(notes)]
+    heights = [
+        0.75,
+        5.2 if curves else 0.0,
+        list_height if curves else 0.0,
+        2.0 if effects else 0.0,
+        0.3 + 0.185 * len(notes),
+    ]
     total = sum(heights)
     figure = Figure(figsize=(WIDTH, total), facecolor="white")
     FigureCanvasAgg(figure)
@@ -218,7 +226,9 @@ def draw_frontier(axes: Any, table: Table, metric: Metric) -> None:
     costs = [row.cost.value for row in frontier]
     errors = [row.errors[metric.name].value for row in frontier]
     axes.step(costs, errors, where="post", color="#FFC20A", linewidth=6.0, alpha=0.45, zorder=0, solid_capstyle="round")
-    axes.plot(costs, errors, "o", markersize=10.5, markerfacecolor="none", markeredgecolor="black", linewidth=0, zorder=5)
+    axes.plot(
+        costs, errors, "o", markersize=10.5, markerfacecolor="none", markeredgecolor="black", linewidth=0, zorder=5
+    )
     for number, (cost, error) in enumerate(zip(costs, errors, strict=True), start=1):
         axes.annotate(
             str(number),

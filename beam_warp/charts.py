@@ -294,7 +294,9 @@ def read_table(path: Path) -> Table:
     except UnicodeDecodeError as error:
         raise _malformed(path, 1, "it is not text") from error
     except OSError as error:
-        raise MissingFileError(f"table must be a readable file, got {path} ({error.strerror}). Check the path.") from error
+        raise MissingFileError(
+            f"table must be a readable file, got {path} ({error.strerror}). Check the path."
+        ) from error
     lines = text[: text.rfind("\n") + 1].splitlines()
     if len(lines) < 2 or not lines[0].startswith(f"# {FORMAT} "):
         raise _malformed(path, 1, f"its first line does not begin with '# {FORMAT}'")
@@ -369,7 +371,9 @@ def _cells(subject: Subject, row: Row) -> list[str]:
         set(row.errors) - {metric.name for metric in subject.metrics}
     )
     if unknown:
-        raise InvalidOptionError(f"row must have the axes and metrics of its study, got {sorted(unknown)}. Declare them.")
+        raise InvalidOptionError(
+            f"row must have the axes and metrics of its study, got {sorted(unknown)}. Declare them."
+        )
     intervals = [row.cost, *(row.errors.get(metric.name) for metric in subject.metrics)]
     numbers = ["" if v is None else repr(float(n)) for v in intervals for n in (_numbers(v) if v else (0.0,) * 3)]
     return [*_key(subject, row.settings), *numbers]

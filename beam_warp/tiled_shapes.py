@@ -31,7 +31,9 @@ class Surface:
     spacing: float
 
 
-def rectangle(middle: NDArray[np.float64], side: NDArray[np.float64], up: NDArray[np.float64], spacing: float) -> Surface:
+def rectangle(
+    middle: NDArray[np.float64], side: NDArray[np.float64], up: NDArray[np.float64], spacing: float
+) -> Surface:
     """Return a grid over a rectangle whose half-sides are two orthogonal vectors; its normal is side × up."""
     widths = [np.linalg.norm(side), np.linalg.norm(up)]
     counts = [max(1, round(2.0 * width / spacing)) for width in widths]

@@ -51,6 +51,11 @@ RANKS = {
     "beam_warp.reporting": 10,
     "beam_warp.pipeline": 11,
     "beam_warp.demo": 12,
+    "beam_warp.tiled_shapes": 3,
+    "beam_warp.charts": 6,
+    "beam_warp.chart_image": 7,
+    "beam_warp.chart_page": 8,
+    "beam_warp.tracing_study": 9,
     "beam_warp.cli": 13,
     "beam_warp": 14,
 }
@@ -71,6 +76,10 @@ WITHOUT_WARP = (
     "demo_figure",
     "demo_environments",
     "evaluation",
+    "tiled_shapes",
+    "charts",
+    "chart_image",
+    "chart_page",
     "schema",
     "converters",
 )
