@@ -18,9 +18,10 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 MARKERS = ("o", "^", "s", "D", "v", "P", "X")
 LINES = ("-", "--", ":", "-.")
 GREY = "#555555"
+GOLD = "#FFC20A"
 WIDTH = 12.0
 RESOLUTION = 130
-PANELS_A_ROW = 2
+NUMBER_SIZE = 9.0
 
 
 def require_package(name: str) -> Any:
@@ -62,6 +63,11 @@ def lines_of(table: Table, rows: Sequence[Row]) -> list[list[Row]]:
 def varying_axes(table: Table, rows: Sequence[Row]) -> list[Axis]:
     """Return the axes that take more than one level in rows."""
     return [axis for axis in table.subject.axes if len({row.settings.get(axis.name) for row in rows}) > 1]
+
+
+def with_unit(title: str, unit: str) -> str:
+    """Return a title followed by its unit, if it has one."""
+    return f"{title} [{unit}]" if unit else title
 
 
 def significant(value: float) -> str:
@@ -165,13 +171,8 @@ def draw_curves(axes: Any, table: Table, metric: Metric) -> None:
     colors = encoded(table, metric.color, COLORS, rows)
     markers = encoded(table, metric.marker, MARKERS, rows)
     strokes = encoded(table, metric.line, LINES, rows)
-    shown = {metric.color, metric.marker, metric.line, subject.ladder, ""}
     for group in lines_of(table, rows):
         settings = group[0].settings
-        # What no colour, marker or line tells apart is drawn faintly where it is not the default.
-        ordinary = all(
-            settings.get(axis.name) in (None, axis.levels[0]) for axis in subject.axes if axis.name not in shown
-        )
         color = colors[settings.get(metric.color)]
         errors = [row.errors[metric.name] for row in group]
         axes.errorbar(
@@ -188,26 +189,28 @@ def draw_curves(axes: Any, table: Table, metric: Metric) -> None:
             linewidth=1.0,
             markersize=4.5,
             elinewidth=0.7,
-            alpha=0.85 if ordinary else 0.3,
+            alpha=0.3 if table.is_apart(group[0], metric) else 0.85,
         )
+    if rows:
+        axes.set_xscale("log")
+        axes.set_yscale("log")
     draw_frontier(axes, table, metric)
     if metric.floor > 0.0 and rows and min(row.errors[metric.name].value for row in rows) < 30.0 * metric.floor:
         axes.axhline(metric.floor, color=GREY, linewidth=0.8, linestyle=(0, (1, 2)))
         axes.annotate(
             "error of the reference",
-            (0.01, metric.floor),
+            (0.99, metric.floor),
             xycoords=("axes fraction", "data"),
             xytext=(0, 2),
             textcoords="offset points",
+            ha="right",
             fontsize=8,
             color=GREY,
         )
-    if rows:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
     lost = len(table.rows_of(metric)) - len(rows)
-    axes.set_xlabel(subject.cost + (f"   ({lost} settings without error are not drawn)" if lost else ""), fontsize=10)
-    axes.set_ylabel(metric.title + (f" [{metric.unit}]" if metric.unit else ""), fontsize=10)
+    without = f"   ({lost} settings without error are not drawn)" if lost else ""
+    axes.set_xlabel(with_unit(subject.cost, subject.cost_unit) + without, fontsize=10)
+    axes.set_ylabel(with_unit(metric.title, metric.unit), fontsize=10)
     axes.set_title(metric.title, fontsize=11, loc="left", fontweight="bold")
     axes.tick_params(labelsize=9)
     axes.grid(True, which="major", color="#dddddd", linewidth=0.7)
@@ -225,19 +228,25 @@ def draw_frontier(axes: Any, table: Table, metric: Metric) -> None:
         return
     costs = [row.cost.value for row in frontier]
     errors = [row.errors[metric.name].value for row in frontier]
-    axes.step(costs, errors, where="post", color="#FFC20A", linewidth=6.0, alpha=0.45, zorder=0, solid_capstyle="round")
+    axes.step(costs, errors, where="post", color=GOLD, linewidth=6.0, alpha=0.45, zorder=0, solid_capstyle="round")
     axes.plot(
         costs, errors, "o", markersize=10.5, markerfacecolor="none", markeredgecolor="black", linewidth=0, zorder=5
     )
-    for number, (cost, error) in enumerate(zip(costs, errors, strict=True), start=1):
+    places = axes.transData.transform(list(zip(costs, errors, strict=True))) * (72.0 / axes.figure.dpi)
+    below = -math.inf, -math.inf
+    for number, (cost, error, place) in enumerate(zip(costs, errors, places, strict=True), start=1):
+        # Below and left, where nothing is; above and right where the last number is too near
+        crowded = math.dist(place, below) < 1.3 * NUMBER_SIZE
+        if not crowded:
+            below = tuple(place)
         axes.annotate(
             str(number),
             (cost, error),
-            xytext=(-7, -7),
+            xytext=(6, 6) if crowded else (-6, -6),
             textcoords="offset points",
-            ha="right",
-            va="top",
-            fontsize=9,
+            ha="left" if crowded else "right",
+            va="bottom" if crowded else "top",
+            fontsize=NUMBER_SIZE,
             fontweight="bold",
             zorder=6,
         )
@@ -261,8 +270,12 @@ def draw_legend(axes: Any, table: Table, metric: Metric, colors: Any, markers: A
             else:
                 style = {"color": GREY, "linestyle": value}
             handles.append(Line2D([], [], label=axis.label(level), **style))
-    handles.append(Line2D([], [], color="#FFC20A", linewidth=6.0, alpha=0.6, label="Pareto frontier"))
-    axes.legend(handles=handles, fontsize=8.5, loc="upper right", framealpha=0.9, labelspacing=0.25, borderpad=0.4)
+    handles.append(Line2D([], [], color=GOLD, linewidth=6.0, alpha=0.6, label="Pareto frontier"))
+    if any(table.is_apart(row, metric) for row in table.rows_of(metric)):
+        title = subject.axis(metric.apart).title.lower()
+        handles.append(Line2D([], [], color=colors[next(iter(colors))], alpha=0.3, label=f"faint: other {title}s"))
+    # Curves fall from upper left to lower right, and nothing lies below the frontier
+    axes.legend(handles=handles, fontsize=8.5, loc="lower left", framealpha=0.9, labelspacing=0.25, borderpad=0.4)
 
 
 def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) -> None:
@@ -271,9 +284,15 @@ def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) ->
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(longest + 1.0, -0.5)
     frontier = table.frontier(metric)
-    varied = {axis.name for axis in varying_axes(table, table.rows_of(metric))}
+    rivals = [row for row in table.rows_of(metric) if not table.is_apart(row, metric)]
+    varied = {axis.name for axis in varying_axes(table, rivals)}
     columns = [axis for axis in table.subject.axes if axis.name in varied]
-    header = ["", *(axis.title for axis in columns), "Time [s]" if "[s]" in table.subject.cost else "Cost", "Error"]
+    header = [
+        "",
+        *(axis.title for axis in columns),
+        with_unit("Cost", table.subject.cost_unit),
+        with_unit("Error", metric.unit),
+    ]
     lines = [
         [
             str(number),

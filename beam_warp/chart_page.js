@@ -29,6 +29,10 @@ function significant(value) {
   return size >= 1e-3 && size < 1e5 ? String(Number(value.toPrecision(3))) : value.toExponential(2);
 }
 
+function withUnit(title, unit) {
+  return unit ? `${title} [${unit}]` : title;
+}
+
 function shownRows(metric) {
   return data.rows.filter(
     (row) =>
@@ -75,7 +79,8 @@ function hoverOf(row, metric) {
     .map((axis) => `${escaped(axis.title)}: <b>${escaped(row.settings[axis.name])}</b>`);
   return [
     ...settings,
-    `cost: <b>${significant(row.cost[0])}</b> (${significant(row.cost[1])} to ${significant(row.cost[2])})`,
+    `${withUnit("cost", subject.cost_unit)}: <b>${significant(row.cost[0])}</b> ` +
+      `(${significant(row.cost[1])} to ${significant(row.cost[2])})`,
     `error: <b>${significant(error[0])}</b> (${significant(error[1])} to ${significant(error[2])})`,
   ].join("<br>");
 }
@@ -100,13 +105,18 @@ function drawCurves(metric, plot, list) {
   const rows = shownRows(metric).filter((row) => row.cost[0] > 0 && row.errors[metric.name][0] > 0);
   const by = colorBy[metric.name] ?? metric.color;
   const errorOf = (row) => row.errors[metric.name];
-  const frontier = frontierOf(rows, metric);
+  const apart = metric.apart ? axisOf[metric.apart] : null;
+  // Settings with another truth do not compete: the frontier is about the first level that is shown.
+  const first = apart ? apart.levels.find((level) => rows.some((row) => row.settings[apart.name] === level)) : null;
+  const isRival = (row) => !apart || row.settings[apart.name] === first;
+  const frontier = frontierOf(rows.filter(isRival), metric);
   const traces = [
     {
       x: frontier.map((row) => row.cost[0]),
       y: frontier.map((row) => errorOf(row)[0]),
-      mode: "lines",
+      mode: "lines+markers",
       line: { shape: "hv", width: 9, color: "rgba(255,194,10,0.5)" },
+      marker: { size: 15, color: "rgba(0,0,0,0)", line: { width: 1.2, color: "black" } },
       name: "Pareto frontier",
       hoverinfo: "skip",
     },
@@ -123,6 +133,7 @@ function drawCurves(metric, plot, list) {
       mode: "lines+markers",
       line: { color, width: 1.2, dash: styleOf(metric.line, DASHES, group[0]) },
       marker: { color, size: 8, symbol: group.map((row) => styleOf(metric.marker, SYMBOLS, row)) },
+      opacity: isRival(group[0]) ? 1 : 0.35,
       showlegend: false,
     });
   }
@@ -131,11 +142,27 @@ function drawCurves(metric, plot, list) {
     const color = COLORS[axisOf[by].levels.indexOf(level) % COLORS.length];
     traces.push({ x: [null], y: [null], mode: "lines", line: { color, width: 4 }, name: labelOf(axisOf[by], level) });
   }
+  for (const [name, styles, part] of [
+    [metric.marker, SYMBOLS, "marker"],
+    [metric.line, DASHES, "line"],
+  ]) {
+    const levels = name ? axisOf[name].levels.filter((level) => rows.some((row) => row.settings[name] === level)) : [];
+    for (const level of levels.length > 1 ? levels : []) {
+      const style = styles[axisOf[name].levels.indexOf(level) % styles.length];
+      traces.push({
+        x: [null],
+        y: [null],
+        mode: part === "line" ? "lines" : "markers",
+        [part]: part === "line" ? { color: "#555", dash: style } : { color: "#555", size: 8, symbol: style },
+        name: `${axisOf[name].title.toLowerCase()} ${labelOf(axisOf[name], level)}`,
+      });
+    }
+  }
   const layout = {
-    xaxis: { type: "log", title: { text: subject.cost }, dtick: 1, gridcolor: "#ddd", minor: { showgrid: true } },
+    xaxis: { type: "log", title: { text: withUnit(subject.cost, subject.cost_unit) }, dtick: 1, gridcolor: "#ddd", minor: { showgrid: true } },
     yaxis: {
       type: "log",
-      title: { text: metric.title + (metric.unit ? ` [${metric.unit}]` : "") },
+      title: { text: withUnit(metric.title, metric.unit) },
       dtick: 1,
       exponentformat: "power",
       gridcolor: "#ddd",
@@ -161,13 +188,13 @@ function drawCurves(metric, plot, list) {
               y0: metric.floor,
               y1: metric.floor,
               line: { color: "#555", width: 1, dash: "dot" },
-              label: { text: "error of the reference", textposition: "start", font: { size: 11, color: "#555" } },
+              label: { text: "error of the reference", textposition: "end", font: { size: 11, color: "#555" } },
             },
           ]
         : [],
-    legend: { x: 1, xanchor: "right", y: 1, bgcolor: "rgba(255,255,255,0.85)" },
+    legend: { x: 0, y: 0, bgcolor: "rgba(255,255,255,0.85)", font: { size: 11 } },
     margin: { l: 70, r: 15, t: 10, b: 50 },
-    height: 460,
+    height: 520,
     hoverlabel: { align: "left" },
     plot_bgcolor: "white",
   };
@@ -177,9 +204,10 @@ function drawCurves(metric, plot, list) {
 
 function listFrontier(frontier, metric, list) {
   list.replaceChildren();
-  const axes = subject.axes.filter((axis) => data.rows.some((row) => metric.name in row.errors && axis.name in row.settings));
+  const own = data.rows.filter((row) => metric.name in row.errors);
+  const axes = subject.axes.filter((axis) => new Set(own.map((row) => row.settings[axis.name])).size > 1);
   const head = element("tr", "", element("thead", "", list));
-  for (const title of ["", ...axes.map((axis) => axis.title), subject.cost, "Error"]) element("th", title, head);
+  for (const title of ["", ...axes.map((axis) => axis.title), withUnit("Cost", subject.cost_unit), withUnit("Error", metric.unit)]) element("th", title, head);
   const body = element("tbody", "", list);
   frontier.forEach((row, index) => {
     const line = element("tr", "", body);
@@ -207,7 +235,7 @@ function drawEffect(metric, plot) {
     hovertemplate: "%{x:.3g}<extra></extra>",
   };
   const layout = {
-    xaxis: { title: { text: metric.title + (metric.unit ? ` [${metric.unit}]` : "") }, rangemode: "tozero" },
+    xaxis: { title: { text: withUnit(metric.title, metric.unit) }, rangemode: "tozero" },
     yaxis: { type: "category", autorange: "reversed", automargin: true, title: { text: axis.title } },
     margin: { l: 70, r: 15, t: 10, b: 50 },
     height: 120 + 34 * first.length,

@@ -34,6 +34,12 @@ FORMAT = "beam-chart 1"
 CONFIDENCE = 0.95
 RESAMPLES = 1000
 
+SHAKY = 1.3
+"""Ratio of costs of the same setting within one run above which a chart warns its reader."""
+
+PROBE_EVERY = 16
+"""Settings between two measurements of the same one: whether the machine kept its pace."""
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -71,6 +77,8 @@ class Metric:
         line: Axis that line styles distinguish.
         by: Set for an error that belongs to the levels of this axis alone, whatever a setting costs, such as a bias:
             it is drawn against those levels, and has no frontier.
+        apart: Axis whose levels have truths of their own: only settings with its first level compete for the frontier,
+            and the others are drawn faintly. Empty for none.
         floor: Error of the reference itself; smaller errors cannot be told apart. 0 if there is none.
         sentence: How to read it.
     """
@@ -82,6 +90,7 @@ class Metric:
     marker: str = ""
     line: str = ""
     by: str = ""
+    apart: str = ""
     floor: float = 0.0
     sentence: str = ""
 
@@ -135,7 +144,8 @@ class Subject:
         title: One line for the top of the chart.
         axes: Factors, in the order in which labels name them.
         metrics: Errors.
-        cost: What the settings cost, as people read it, with its unit in brackets.
+        cost: What the settings cost, as people read it.
+        cost_unit: Its unit.
         ladder: Axis whose steps are joined by lines.
         notes: Title → text: scene, device, versions, references, what was left out.
         planned: Number of settings in the plan.
@@ -146,6 +156,7 @@ class Subject:
     axes: tuple[Axis, ...]
     metrics: tuple[Metric, ...]
     cost: str
+    cost_unit: str
     ladder: str
     notes: Mapping[str, str] = field(default_factory=dict)
     planned: int = 0
@@ -155,10 +166,9 @@ class Subject:
         return next(axis for axis in self.axes if axis.name == name)
 
     def label(self, settings: Settings) -> str:
-        """Return settings in words: the axes that have a choice, the ladder first."""
+        """Return settings in words: the axes that have a choice."""
         shown = [axis for axis in self.axes if axis.name in settings and len(axis.levels) > 1]
-        shown.sort(key=lambda axis: axis.name != self.ladder)
-        return ", ".join(axis.label(settings[axis.name]) for axis in shown)
+        return ", ".join(f"{axis.name} {settings[axis.name]}" for axis in shown)
 
 
 @dataclass(frozen=True)
@@ -186,12 +196,16 @@ class Table:
     rows: tuple[Row, ...]
 
     def frontier(self, metric: Metric) -> list[Row]:
-        """Return the rows that no other beats in both cost and error, cheapest first."""
-        rows = self.rows_of(metric)
+        """Return the rows that no other with the same truth beats in both cost and error, cheapest first."""
+        rows = [row for row in self.rows_of(metric) if not self.is_apart(row, metric)]
         if not rows or metric.by:
             return []
         kept = pareto_frontier([row.cost.value for row in rows], [row.errors[metric.name].value for row in rows])
         return [rows[index] for index in kept]
+
+    def is_apart(self, row: Row, metric: Metric) -> bool:
+        """Return whether a row's truth is another than the one that the frontier is about."""
+        return bool(metric.apart) and row.settings[metric.apart] != self.subject.axis(metric.apart).levels[0]
 
     def rows_of(self, metric: Metric) -> list[Row]:
         """Return the rows that have this error."""
@@ -221,8 +235,9 @@ def run_study(
 ) -> tuple[Table, list[Settings]]:
     """Measure a study's plan into ``folder/NAME.csv``.
 
-    Rows are kept in ``NAME.partial.csv`` as they come, and the file is renamed when the plan is done. A run that was
-    stopped continues from there if it is started again with the same subject; another subject starts anew.
+    Rows are kept in ``NAME.partial.csv`` as they come, and become ``NAME.csv`` when the plan is done. A run that was
+    stopped continues from there if it is started again with the same subject; another subject starts anew. The first
+    setting is measured again now and then; how far its cost varied is noted as "Pace".
 
     Args:
         study: What to measure.
@@ -245,7 +260,7 @@ def run_study(
         rows = _start_partial(subject, partial)
         done = {_key(subject, row.settings) for row in rows}
         left = [settings for settings in study.plan if _key(subject, settings) not in done]
-        total, measured, skipped = sum(map(study.work, left)), 0, []
+        total, measured, skipped, probes = sum(map(study.work, left)), 0, [], []
         started = time.perf_counter()
         for settings in left:
             work = study.work(settings)
@@ -260,10 +275,29 @@ def run_study(
             measured += work
             if progress is not None:
                 progress("measure", measured, total)
-        partial.replace(final)
+            if not probes:
+                probes.append(row.cost.value)
+            elif len(rows) % PROBE_EVERY == 0 or settings is left[-1]:
+                probes.append(study.measure(left[0]).cost.value)
+        table = Table(_with_pace(subject, probes), tuple(rows))
+        write_table(table, final)
+        partial.unlink()
     except OSError as error:
+        if isinstance(error, OutputError):
+            raise
         raise OutputError(f"{partial} must be writable, got {error.strerror}. Free space or choose another.") from error
-    return Table(subject, tuple(rows)), skipped
+    return table, skipped
+
+
+def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
+    """Return the subject with a note on how the cost of one setting, measured again and again, varied."""
+    if len(probes) < 2:
+        return subject
+    slow, fast = max(probes) / float(np.median(probes)), min(probes) / float(np.median(probes))
+    pace = f"one setting, measured {len(probes)} times during the run, cost {fast:.2f} to {slow:.2f} of its median"
+    if slow > SHAKY * fast:
+        pace += ": the machine was busy, so small differences in cost mean nothing; measure again on a quiet one"
+    return replace(subject, notes={**subject.notes, "Pace": pace})
 
 
 def table_paths(folder: Path, subject: Subject) -> tuple[Path, Path]:
@@ -334,17 +368,12 @@ def _start_partial(subject: Subject, partial: Path) -> list[Row]:
     if partial.exists():
         try:
             earlier = read_table(partial)
-            # Floors are measured, so that they may differ in the last digits between runs on CUDA
-            if _identity(earlier.subject) == _identity(subject):
+            if earlier.subject == subject:
                 rows = list(earlier.rows)
         except AssetFormatError:
             rows = []
     write_table(Table(subject, tuple(rows)), partial)
     return rows
-
-
-def _identity(subject: Subject) -> Subject:
-    return replace(subject, metrics=tuple(replace(metric, floor=0.0) for metric in subject.metrics), planned=0)
 
 
 def _key(subject: Subject, settings: Settings) -> tuple[str, ...]:

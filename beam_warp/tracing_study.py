@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -97,8 +99,7 @@ class TracingPlan:
         ):
             for value in getattr(self, name):
                 require_choice(name, value, choices)
-        for offset in self.offsets:
-            parse_offset(offset)
+        object.__setattr__(self, "offsets", tuple(map(offset_label, self.offsets)))
         for count in self.rays:
             # Fewest that every estimator takes: half of the rays of mis come from either density, and pair up
             require_count("rays", count, 4, 1 << 16)
@@ -138,7 +139,7 @@ class TracingPlan:
 
 
 def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], float]:
-    """Return the kind of an offset and its number: ``auto``, ``0.02`` (metres), ``2t`` (local thicknesses).
+    """Return the kind of an offset and its number: ``auto``, ``0.02`` or ``0.02 m``, ``2t`` (local thicknesses).
 
     Raises:
         InvalidOptionError: It is none of these, or not a number of at least 0.
@@ -146,7 +147,7 @@ def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], f
     if text == "auto":
         return "auto", 0.0
     try:
-        number = float(text.removesuffix("t"))
+        number = float(text.removesuffix("t" if text.endswith("t") else "m"))
     except ValueError:
         number = -1.0
     if not (0.0 <= number < 1e6):
@@ -154,6 +155,12 @@ def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], f
             f"offsets must be auto, metres such as 0.02, or thicknesses such as 2t, got {text!r}. Choose one of them."
         )
     return ("thicknesses" if text.endswith("t") else "metres"), number
+
+
+def offset_label(text: str) -> str:
+    """Return an offset as charts name it, one name for each: ``auto``, ``0.02 m``, ``2t``."""
+    kind, number = parse_offset(text)
+    return {"auto": "auto", "metres": f"{number:g} m", "thicknesses": f"{number:g}t"}[kind]
 
 
 def _crossed(axes: dict[str, tuple[Any, ...]], crossing: str, groups: Sequence[set[str]]) -> list[Settings]:
@@ -197,7 +204,7 @@ def tracing_study(
     bench = _Bench(cloud, environment, plan, device, progress)
     subject = Subject(
         name="tracing",
-        title=f"Visibility by rays: error against time for {name}, {len(cloud):,} Gaussians, on {bench.device_name}",
+        title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {bench.device_name}",
         axes=(
             Axis("rays", "Rays per point", plan.rays, "rays"),
             Axis("backend", "Backend", plan.backends, "", "wide: own 4-wide tree. warp: wp.Bvh."),
@@ -215,7 +222,13 @@ def tracing_study(
                 "",
                 "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
             ),
-            Axis("density", "Density", plan.densities, "", "What directions of irradiance are drawn from."),
+            Axis(
+                "density",
+                "Density",
+                plan.densities,
+                "",
+                "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
+            ),
             Axis(
                 "ratio",
                 "Ratio",
@@ -228,7 +241,8 @@ def tracing_study(
                 "Offset",
                 plan.offsets,
                 "",
-                "Lift of ray origins: auto; a number is metres; t is standard deviations of the local thickness.",
+                "Lift of ray origins: metres, or t, standard deviations of the local thickness; "
+                f"auto is {LIFT_IN_THICKNESSES:g}t.",
             ),
         ),
         metrics=(
@@ -238,6 +252,7 @@ def tracing_study(
                 color="sampler",
                 marker="acceptance",
                 line="backend",
+                apart="offset",
                 floor=bench.occlusion_floor,
                 sentence=f"Against {plan.reference_rays:,} rays from the same offset: noise, which more rays remove.",
             ),
@@ -252,7 +267,7 @@ def tracing_study(
             ),
             Metric(
                 "offset_bias",
-                f"Ambient occlusion: RMS shift against offset {bench.finest}",
+                f"RMS shift of ambient occlusion by the offset, against {bench.finest}",
                 by="offset",
                 sentence=(
                     f"How far each offset's own truth lies from that of the finest, {bench.finest}; rays do not "
@@ -260,7 +275,8 @@ def tracing_study(
                 ),
             ),
         ),
-        cost=f"Time for all {len(cloud):,} Gaussians [s]",
+        cost=f"Time for all {len(cloud):,} Gaussians",
+        cost_unit="s",
         ladder="rays",
         notes=bench.notes(environment_name),
     )
@@ -273,6 +289,17 @@ def _alternating(plan: TracingPlan) -> list[Settings]:
     lists = plan.occlusion_settings(), plan.irradiance_settings()
     longest = max(map(len, lists))
     return [settings[k] for k in range(longest) for settings in lists if k < len(settings)]
+
+
+def processor_name() -> str:
+    """Return the CPU as its maker calls it, as far as the system tells."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except (OSError, UnicodeDecodeError):
+        pass  # no such file outside Linux
+    return platform.processor() or platform.machine() or "CPU"
 
 
 class _Bench:
@@ -455,7 +482,10 @@ class _Bench:
     @property
     def device_name(self) -> str:
         """The device in words."""
-        return self.device.name if self.device.is_cuda else f"CPU ({self.device.name}, {thread_count()} threads)"
+        if self.device.is_cuda:
+            return self.device.name
+        count = thread_count()
+        return f"{processor_name()} ({count} thread{'s' if count > 1 else ''})"
 
     def notes(self, environment_name: str) -> dict[str, str]:
         """Return what a reader of the chart needs to know."""
