@@ -264,13 +264,14 @@ def draw_legend(axes: Any, table: Table, metric: Metric, colors: Any, markers: A
         handles.append(Line2D([], [], linewidth=0, label=f"{axis.title}:"))
         for level, value in meaning.items():
             if meaning is colors:
-                style = {"color": value, "linewidth": 3.0}
+                style = {"color": value, "linewidth": 3.0, "solid_capstyle": "butt"}
             elif meaning is markers:
                 style = {"color": GREY, "marker": value, "linewidth": 0}
             else:
                 style = {"color": GREY, "linestyle": value}
             handles.append(Line2D([], [], label=axis.label(level), **style))
-    handles.append(Line2D([], [], color=GOLD, linewidth=6.0, alpha=0.6, label="Pareto frontier"))
+    step = {"color": GOLD, "linewidth": 6.0, "alpha": 0.6, "solid_capstyle": "butt"}
+    handles.append(Line2D([], [], label="Pareto frontier", **step))
     if any(table.is_apart(row, metric) for row in table.rows_of(metric)):
         title = subject.axis(metric.apart).title.lower()
         handles.append(Line2D([], [], color=colors[next(iter(colors))], alpha=0.3, label=f"faint: other {title}s"))

@@ -34,6 +34,9 @@ FORMAT = "beam-chart 1"
 CONFIDENCE = 0.95
 RESAMPLES = 1000
 
+PACE = "Pace"
+"""Title of the note on how steady the machine was."""
+
 SHAKY = 1.3
 """Ratio of costs of the same setting within one run above which a chart warns its reader."""
 
@@ -149,6 +152,9 @@ class Subject:
         ladder: Axis whose steps are joined by lines.
         notes: Title → text: scene, device, versions, references, what was left out.
         planned: Number of settings in the plan.
+
+    Raises:
+        InvalidOptionError: Two columns have one name, or an axis is named that there is none of.
     """
 
     name: str
@@ -160,6 +166,16 @@ class Subject:
     ladder: str
     notes: Mapping[str, str] = field(default_factory=dict)
     planned: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that names are unique and lead somewhere."""
+        names = [axis.name for axis in self.axes] + ["cost"] + [metric.name for metric in self.metrics]
+        if len(set(names)) < len(names):
+            raise InvalidOptionError(f"names of axes and metrics must be unique, got {names}. Rename one of them.")
+        named = {self.ladder}.union(*({m.color, m.marker, m.line, m.by, m.apart} - {""} for m in self.metrics))
+        unknown = named - {axis.name for axis in self.axes}
+        if unknown:
+            raise InvalidOptionError(f"named axes must be among {names}, got {sorted(unknown)}. Declare them.")
 
     def axis(self, name: str) -> Axis:
         """Return an axis by name."""
@@ -235,9 +251,9 @@ def run_study(
 ) -> tuple[Table, list[Settings]]:
     """Measure a study's plan into ``folder/NAME.csv``.
 
-    Rows are kept in ``NAME.partial.csv`` as they come, and become ``NAME.csv`` when the plan is done. A run that was
-    stopped continues from there if it is started again with the same subject; another subject starts anew. The first
-    setting is measured again now and then; how far its cost varied is noted as "Pace".
+    Rows are kept in ``NAME.partial.csv`` as they come, and become ``NAME.csv`` in the end. A run that was stopped, or
+    that a budget cut short, continues if it is started again with the same subject; another subject starts anew. The
+    first setting is measured again now and then; how far its cost varied is noted as "Pace".
 
     Args:
         study: What to measure.
@@ -257,7 +273,8 @@ def run_study(
     final, partial = table_paths(folder, subject)
     require_writable(final)
     try:
-        rows = _start_partial(subject, partial)
+        rows = _earlier_rows(subject, partial) or _earlier_rows(subject, final)
+        write_table(Table(subject, tuple(rows)), partial)
         done = {_key(subject, row.settings) for row in rows}
         left = [settings for settings in study.plan if _key(subject, settings) not in done]
         total, measured, skipped, probes = sum(map(study.work, left)), 0, [], []
@@ -297,7 +314,7 @@ def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
     pace = f"one setting, measured {len(probes)} times during the run, cost {fast:.2f} to {slow:.2f} of its median"
     if slow > SHAKY * fast:
         pace += ": the machine was busy, so small differences in cost mean nothing; measure again on a quiet one"
-    return replace(subject, notes={**subject.notes, "Pace": pace})
+    return replace(subject, notes={**subject.notes, PACE: pace})
 
 
 def table_paths(folder: Path, subject: Subject) -> tuple[Path, Path]:
@@ -357,23 +374,20 @@ def _subject_of(value: dict[str, Any]) -> Subject:
     """Return the subject of its JSON form."""
     axes = tuple(Axis(**{**axis, "levels": tuple(axis["levels"])}) for axis in value.pop("axes"))
     metrics = tuple(Metric(**metric) for metric in value.pop("metrics"))
-    subject = Subject(axes=axes, metrics=metrics, **value)
-    subject.axis(subject.ladder)
-    return subject
+    return Subject(axes=axes, metrics=metrics, **value)
 
 
-def _start_partial(subject: Subject, partial: Path) -> list[Row]:
-    """Return the rows of an earlier run of the same subject, and leave a file that ends after the last of them."""
-    rows: list[Row] = []
-    if partial.exists():
-        try:
-            earlier = read_table(partial)
-            if earlier.subject == subject:
-                rows = list(earlier.rows)
-        except AssetFormatError:
-            rows = []
-    write_table(Table(subject, tuple(rows)), partial)
-    return rows
+def _earlier_rows(subject: Subject, path: Path) -> list[Row]:
+    """Return the rows of a run of the same subject that did not reach its end; none if there is no such table."""
+    if not path.exists():
+        return []
+    try:
+        earlier = read_table(path)
+    except AssetFormatError:
+        return []
+    notes = {title: text for title, text in earlier.subject.notes.items() if title != PACE}
+    unfinished = len(earlier.rows) < subject.planned
+    return list(earlier.rows) if unfinished and replace(earlier.subject, notes=notes) == subject else []
 
 
 def _key(subject: Subject, settings: Settings) -> tuple[str, ...]:

@@ -4,182 +4,46 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from beam_warp._version import __version__
 from beam_warp.assets import GaussianCloud
 from beam_warp.charts import Axis, Interval, Metric, Row, Settings, Study, Subject
-from beam_warp.checks import require_choice, require_count
 from beam_warp.devices import resolve_device, upload
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.irradiance import DENSITIES, irradiance
-from beam_warp.kernels.ambient_occlusion import launch_local_surface
+from beam_warp.irradiance import irradiance
 from beam_warp.kernels.launching import thread_count
 from beam_warp.lighting import LIFT_IN_THICKNESSES, ambient_occlusion
 from beam_warp.reference import visibility_reference
-from beam_warp.sampling import SAMPLERS
-from beam_warp.scene import BACKENDS, Scene
-from beam_warp.surfaces import estimate_normals
-from beam_warp.tracing import ACCEPTANCES, TraceOptions, visibility
+from beam_warp.scene import Scene
+from beam_warp.tracing import TraceOptions, visibility
+from beam_warp.tracing_plan import DEFAULT_PLAN, TracingPlan
+from beam_warp.tracing_references import Progress, References, find_references
 
-RATIOS = ("ratio", "plain")
-
-POINTS = {"cpu": 128, "cuda": 4096}
-"""Points by kind of device. The interval of an error narrows with their root; 128 give about ± 10 %."""
-
-RAYS_PER_CALL = {"cpu": 1 << 15, "cuda": 1 << 23}
-"""A timed call traces at least so many rays, so that what is timed is rays and not launches."""
-
-REPEATS = 3
-
-REFERENCE_SEED = 1 << 31
-"""References draw other samples than every measurement, whose seeds count up from 0."""
+RAYS_PER_CALL = {False: 1 << 15, True: 1 << 23}
+"""A timed call on a CPU or on CUDA traces at least so many rays, so that what is timed is rays and not launches."""
 
 FLOAT64_GAUSSIANS = 50_000
 FLOAT64_RAYS = 256
 """Up to so many Gaussians, the tracer is also checked ray by ray against the float64 twin: a few seconds."""
 
-Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class TracingPlan:
-    """Which settings to measure, and how well.
-
-    Attributes:
-        backends: Hierarchies; the first of each of these lists is its default.
-        acceptances: How hits add up.
-        samplers: Sample sets.
-        offsets: Lifts of ray origins: ``auto``, metres such as ``0.02``, or multiples of the local thickness such as
-            ``2t``, from the local surface.
-        densities: What irradiance draws its directions from.
-        ratios: Irradiance as a ratio of estimates (``ratio``) or as one estimate (``plain``).
-        rays: Rays per point, rising.
-        crossing: ``star`` varies one or two factors around the defaults, ``full`` crosses all.
-        points: Points at which errors are measured; None takes `POINTS`.
-        reference_rays: Rays per point of the references.
-        repeats: Timed calls a setting, each with samples of its own.
-        seed: Chooses the points.
-
-    Raises:
-        InvalidOptionError: A value is none of its choices, out of range or given twice.
-    """
-
-    backends: tuple[str, ...] = BACKENDS
-    acceptances: tuple[str, ...] = ACCEPTANCES
-    samplers: tuple[str, ...] = SAMPLERS
-    offsets: tuple[str, ...] = ("auto", "2t", "8t", "0.02")
-    densities: tuple[str, ...] = ("product", "environment", "cosine", "mis")
-    ratios: tuple[str, ...] = RATIOS
-    rays: tuple[int, ...] = (4, 16, 64, 256, 1024)
-    crossing: Literal["star", "full"] = "star"
-    points: int | None = None
-    reference_rays: int = 16384
-    repeats: int = REPEATS
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check every option once."""
-        for name, choices in (
-            ("backends", BACKENDS),
-            ("acceptances", ACCEPTANCES),
-            ("samplers", SAMPLERS),
-            ("densities", DENSITIES),
-            ("ratios", RATIOS),
-        ):
-            for value in getattr(self, name):
-                require_choice(name, value, choices)
-        object.__setattr__(self, "offsets", tuple(map(offset_label, self.offsets)))
-        for count in self.rays:
-            # Fewest that every estimator takes: half of the rays of mis come from either density, and pair up
-            require_count("rays", count, 4, 1 << 16)
-        for name in ("backends", "acceptances", "samplers", "offsets", "densities", "ratios", "rays"):
-            values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
-        object.__setattr__(self, "rays", tuple(sorted(self.rays)))
-        require_choice("crossing", self.crossing, ("star", "full"))
-        if self.points is not None:
-            require_count("points", self.points, 2, 1 << 20)
-        require_count("reference_rays", self.reference_rays, 4, 1 << 20)
-        require_count("repeats", self.repeats, 1, 100)
-        require_count("seed", self.seed, 0, 2**31 - 1)
-
-    def occlusion_settings(self) -> list[Settings]:
-        """Return the settings of ambient occlusion without rays, the most telling first."""
-        axes = {
-            "backend": self.backends,
-            "acceptance": self.acceptances,
-            "sampler": self.samplers,
-            "offset": self.offsets,
-        }
-        return _crossed(axes, self.crossing, ({"backend", "acceptance"}, {"acceptance", "sampler"}, {"offset"}))
-
-    def irradiance_settings(self) -> list[Settings]:
-        """Return the settings of irradiance without rays; the offset stays at its default."""
-        axes = {
-            "backend": self.backends,
-            "acceptance": self.acceptances,
-            "sampler": self.samplers,
-            "offset": self.offsets[:1],
-            "density": self.densities,
-            "ratio": self.ratios,
-        }
-        return _crossed(axes, self.crossing, ({"density", "ratio"}, {"sampler"}, {"acceptance"}, {"backend"}))
-
-
-def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], float]:
-    """Return the kind of an offset and its number: ``auto``, ``0.02`` or ``0.02 m``, ``2t`` (local thicknesses).
-
-    Raises:
-        InvalidOptionError: It is none of these, or not a number of at least 0.
-    """
-    if text == "auto":
-        return "auto", 0.0
-    try:
-        number = float(text.removesuffix("t" if text.endswith("t") else "m"))
-    except ValueError:
-        number = -1.0
-    if not (0.0 <= number < 1e6):
-        raise InvalidOptionError(
-            f"offsets must be auto, metres such as 0.02, or thicknesses such as 2t, got {text!r}. Choose one of them."
-        )
-    return ("thicknesses" if text.endswith("t") else "metres"), number
-
-
-def offset_label(text: str) -> str:
-    """Return an offset as charts name it, one name for each: ``auto``, ``0.02 m``, ``2t``."""
-    kind, number = parse_offset(text)
-    return {"auto": "auto", "metres": f"{number:g} m", "thicknesses": f"{number:g}t"}[kind]
-
-
-def _crossed(axes: dict[str, tuple[Any, ...]], crossing: str, groups: Sequence[set[str]]) -> list[Settings]:
-    """Return settings: each group of factors crossed around the defaults, then, if full, everything that is left."""
-    found: dict[tuple[Any, ...], Settings] = {}
-    for group in [*groups, *([set(axes)] if crossing == "full" else [])]:
-        for levels in product(*(values if name in group else values[:1] for name, values in axes.items())):
-            found.setdefault(levels, dict(zip(axes, levels, strict=True)))
-    return list(found.values())
-
 
 def tracing_study(
     cloud: GaussianCloud,
     environment: EnvironmentMap,
-    plan: TracingPlan = TracingPlan(),
+    plan: TracingPlan = DEFAULT_PLAN,
     *,
     name: str = "Gaussians",
     environment_name: str = "environment",
     device: str | None = None,
+    references_file: Path | None = None,
+    reference_seconds: float = np.inf,
     progress: Progress | None = None,
 ) -> Study:
     """Prepare the tracing study: scenes, points, normals and references; measuring is left to `run_study`.
@@ -195,57 +59,165 @@ def tracing_study(
         name: What to call the Gaussians.
         environment_name: What to call the light.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+        references_file: Where references are kept for another run; None keeps none.
+        reference_seconds: Fewer points are taken where references would take longer.
         progress: Called with (stage, done, total) while references are traced.
 
     Raises:
-        InvalidArrayError: No Gaussian of the cloud can be seen.
+        InvalidArrayError: Fewer than two Gaussians can be seen.
         DeviceError: There is no such device.
+        OutputError: ``references_file`` cannot be written.
     """
-    bench = _Bench(cloud, environment, plan, device, progress)
+    target = resolve_device(device)
+    scenes = {
+        backend: Scene.from_gaussians(cloud, str(target), backend=backend)  # type: ignore[arg-type]
+        for backend in plan.backends
+    }
+    # References come from the tree that is not ours, whichever are measured
+    exact = scenes.get("warp") or Scene.from_gaussians(cloud, str(target), backend="warp")
+    references = find_references(
+        cloud, environment, plan, exact, file=references_file, seconds=reference_seconds, progress=progress
+    )
+    bench = _Bench(plan, references, scenes, SampledEnvironment.from_environment(environment, target), len(cloud))
     subject = Subject(
         name="tracing",
-        title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {bench.device_name}",
-        axes=(
-            Axis("rays", "Rays per point", plan.rays, "rays"),
-            Axis("backend", "Backend", plan.backends, "", "wide: own 4-wide tree. warp: wp.Bvh."),
-            Axis(
-                "acceptance",
-                "Acceptance",
-                plan.acceptances,
-                "",
-                "product: transmittances multiply, exact. bernoulli: every hit blocks by chance, unbiased.",
+        title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {device_name(target)}",
+        axes=tracing_axes(plan),
+        metrics=bench.metrics(environment_name),
+        cost=f"Time for all {len(cloud):,} Gaussians",
+        cost_unit="s",
+        ladder="rays",
+        notes={
+            "Points": f"{len(references.points):,} of {len(cloud):,} Gaussians, at random; normals "
+            f"{'as given' if cloud.normals is not None else 'estimated'}; mean ambient occlusion "
+            f"{references.occlusion[0].mean():.3f}",
+            "References": f"{plan.reference_rays:,} Owen-scrambled rays a point, product acceptance, wp.Bvh",
+            "Tracer against float64": check_against_float64(cloud, references, {**scenes, "warp": exact}, plan.seed),
+            "Light": environment_name,
+            "Mean lift by offset": ", ".join(
+                f"{offset}: {1e3 * references.lift_lengths(offset).mean():.3g} mm" for offset in plan.offsets
             ),
-            Axis(
-                "sampler",
-                "Sampler",
-                plan.samplers,
-                "",
-                "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
-            ),
-            Axis(
-                "density",
-                "Density",
-                plan.densities,
-                "",
-                "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
-            ),
-            Axis(
-                "ratio",
-                "Ratio",
-                plan.ratios,
-                "",
-                "ratio: exact unoccluded irradiance times a ratio of two estimates. plain: one estimate.",
-            ),
-            Axis(
-                "offset",
-                "Offset",
-                plan.offsets,
-                "",
-                "Lift of ray origins: metres, or t, standard deviations of the local thickness; "
-                f"auto is {LIFT_IN_THICKNESSES:g}t.",
-            ),
-        ),
-        metrics=(
+            "Time": f"median of {plan.repeats} calls of at least {RAYS_PER_CALL[target.is_cuda]:,} rays, bars from "
+            "smallest to largest; without compilation and preparing scene and light; scaled to all Gaussians",
+            "Error bars": "95 %, bootstrap over points",
+            "Plan": _plan_note(plan),
+            "Versions": f"beam-warp {__version__}, Warp {wp.__version__}",
+        },
+    )
+    # Both estimates in turn, so that a budget cuts both
+    lists = plan.occlusion_settings(), plan.irradiance_settings()
+    curves = [settings[k] for k in range(max(map(len, lists))) for settings in lists if k < len(settings)]
+    settings: list[Settings] = [{"rays": rays, **curve} for curve in curves for rays in plan.rays]
+    # One cheap setting of every offset comes right after the default curves: it brings that offset's bias
+    shifted = [each for each in settings if each["offset"] != plan.offsets[0] and each["rays"] == plan.rays[0]]
+    begin = len(plan.rays) * 2
+    ordered = settings[:begin] + shifted + [each for each in settings[begin:] if each not in shifted]
+    return Study(subject, ordered, bench.measure, bench.work)
+
+
+def tracing_axes(plan: TracingPlan) -> tuple[Axis, ...]:
+    """Return the factors of the study."""
+    sentences = {
+        "backend": "wide: own 4-wide tree. warp: wp.Bvh.",
+        "acceptance": "product: transmittances multiply, exact. bernoulli: every hit blocks by chance, unbiased.",
+        "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
+        "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
+        "ratio": "ratio: exact unshadowed irradiance times a ratio of two estimates. plain: one estimate.",
+        "offset": "Lift of ray origins: metres, or t, standard deviations of the local thickness; "
+        f"auto is {LIFT_IN_THICKNESSES:g}t.",
+    }
+    levels = {
+        "backend": plan.backends,
+        "acceptance": plan.acceptances,
+        "sampler": plan.samplers,
+        "density": plan.densities,
+        "ratio": plan.ratios,
+        "offset": plan.offsets,
+    }
+    return (
+        Axis("rays", "Rays per point", plan.rays, "rays"),
+        *(Axis(name, name.capitalize(), levels[name], "", sentences[name]) for name in levels),
+    )
+
+
+def _plan_note(plan: TracingPlan) -> str:
+    """Say which part of the full product the plan is."""
+    whole = replace(plan, crossing="full")
+    planned, full = (
+        len(plan.rays) * (len(each.occlusion_settings()) + len(each.irradiance_settings())) for each in (plan, whole)
+    )
+    if planned == full:
+        return f"the full product, {full:,} settings"
+    return (
+        f"{planned:,} of the full product's {full:,} settings: one or two factors at a time around the defaults, the "
+        "first level of each axis"
+    )
+
+
+def device_name(device: Any) -> str:
+    """Return a device in words: the GPU's name, or the processor's and how many threads are used."""
+    if device.is_cuda:
+        return device.name
+    name = platform.processor() or platform.machine() or "CPU"
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                name = line.partition(":")[2].strip()
+                break
+    except (OSError, UnicodeDecodeError):
+        pass  # no such file outside Linux
+    count = thread_count()
+    return f"{name} ({count} thread{'s' if count > 1 else ''})"
+
+
+def check_against_float64(cloud: GaussianCloud, references: References, scenes: dict[str, Scene], seed: int) -> str:
+    """Return in words how far single rays of each backend are off the float64 twin."""
+    if len(cloud) > FLOAT64_GAUSSIANS:
+        return f"not checked, more than {FLOAT64_GAUSSIANS:,} Gaussians"
+    report = scenes["warp"].report
+    if report.raised_scales or report.not_finite:
+        return f"not checked, {report.raised_scales + report.not_finite:,} Gaussians were mended for tracing"
+    generator = np.random.default_rng(seed)
+    rows = generator.integers(len(references.points), size=FLOAT64_RAYS)
+    normals = references.normals[rows]
+    directions = generator.normal(size=(FLOAT64_RAYS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions *= np.where(np.einsum("nk,nk->n", directions, normals) < 0.0, -1.0, 1.0)[:, None]
+    directions = directions.astype(np.float32)
+    origins = references.points[rows] + normals * references.lift_lengths("auto")[rows, None]
+    truth = visibility_reference(cloud, origins, directions)
+    worst = (
+        f"{name} {np.abs(visibility(scene, origins, directions) - truth).max():.1e}" for name, scene in scenes.items()
+    )
+    return f"largest error of {FLOAT64_RAYS} rays: {', '.join(worst)}"
+
+
+class _Bench:
+    """Everything that settings are measured on."""
+
+    def __init__(
+        self,
+        plan: TracingPlan,
+        references: References,
+        scenes: dict[str, Scene],
+        light: SampledEnvironment,
+        count: int,
+    ) -> None:
+        """Keep what is measured on; ``count`` is the number of Gaussians that times are scaled to."""
+        self.plan, self.references, self.scenes, self.light, self.count = plan, references, scenes, light, count
+        self.device = light.device
+        self.truth = dict(zip(plan.offsets, references.occlusion.astype(np.float64), strict=True))
+        self.finest = min(plan.offsets, key=lambda offset: float(references.lift_lengths(offset).mean()))
+        self.mean_light = max(float(references.light.mean(dtype=np.float64)), 1e-30)
+
+    def metrics(self, environment_name: str) -> tuple[Metric, ...]:
+        """Return the errors of the study."""
+
+        def root_mean_square(array: Any) -> float:
+            return float(np.sqrt(np.square(array, dtype=np.float64).mean()))
+
+        rays = f"{self.plan.reference_rays:,} rays"
+        return (
             Metric(
                 "occlusion_error",
                 "RMS error of ambient occlusion",
@@ -253,8 +225,8 @@ def tracing_study(
                 marker="acceptance",
                 line="backend",
                 apart="offset",
-                floor=bench.occlusion_floor,
-                sentence=f"Against {plan.reference_rays:,} rays from the same offset: noise, which more rays remove.",
+                floor=root_mean_square(self.references.occlusion_error),
+                sentence=f"Against {rays} from the same offset: noise, which more rays remove.",
             ),
             Metric(
                 "irradiance_error",
@@ -262,253 +234,67 @@ def tracing_study(
                 color="density",
                 marker="ratio",
                 line="acceptance",
-                floor=bench.irradiance_floor,
-                sentence=f"Against {plan.reference_rays:,} rays; light: {environment_name}.",
+                floor=root_mean_square(self.references.light_error) / self.mean_light,
+                sentence=f"Against {rays} from the same offset, over points and channels; light: {environment_name}.",
             ),
             Metric(
                 "offset_bias",
-                f"RMS shift of ambient occlusion by the offset, against {bench.finest}",
+                f"RMS shift of ambient occlusion by the offset, against {self.finest}",
                 by="offset",
-                sentence=(
-                    f"How far each offset's own truth lies from that of the finest, {bench.finest}; rays do not "
-                    "remove it. Too small an offset shades itself, too large a one leaks light: neither is the truth."
-                ),
+                sentence=f"How far each offset's own truth lies from that of the finest, {self.finest}; rays do not "
+                "remove it. Too small an offset shades itself, too large a one leaks light: neither is the truth.",
             ),
-        ),
-        cost=f"Time for all {len(cloud):,} Gaussians",
-        cost_unit="s",
-        ladder="rays",
-        notes=bench.notes(environment_name),
-    )
-    settings = [{"rays": rays, **curve} for curve in _alternating(plan) for rays in plan.rays]
-    return Study(subject, settings, bench.measure, bench.work)
-
-
-def _alternating(plan: TracingPlan) -> list[Settings]:
-    """Return both estimates' settings in turn, so that a budget cuts both."""
-    lists = plan.occlusion_settings(), plan.irradiance_settings()
-    longest = max(map(len, lists))
-    return [settings[k] for k in range(longest) for settings in lists if k < len(settings)]
-
-
-def processor_name() -> str:
-    """Return the CPU as its maker calls it, as far as the system tells."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except (OSError, UnicodeDecodeError):
-        pass  # no such file outside Linux
-    return platform.processor() or platform.machine() or "CPU"
-
-
-class _Bench:
-    """Everything that is measured on: scenes by backend, points, normals, lifts and references."""
-
-    def __init__(
-        self,
-        cloud: GaussianCloud,
-        environment: EnvironmentMap,
-        plan: TracingPlan,
-        device: str | None,
-        progress: Progress | None,
-    ) -> None:
-        """Build scenes, choose points, trace references."""
-        self.plan, self.count = plan, len(cloud)
-        self.progress: Progress = progress or (lambda stage, done, total: None)
-        self.device = resolve_device(device)
-        self.environment = SampledEnvironment.from_environment(environment, self.device)
-        self.kind = "cuda" if self.device.is_cuda else "cpu"
-        self.scenes = {
-            backend: Scene.from_gaussians(cloud, str(self.device), backend=backend)  # type: ignore[arg-type]
-            for backend in plan.backends
-        }
-        # References come from the tree that is not ours, whichever are measured
-        self.exact = self.scenes.get("warp") or Scene.from_gaussians(cloud, str(self.device), backend="warp")
-        seen = np.flatnonzero(cloud.opacities > 1.0 / 255.0)
-        if len(seen) < 2:
-            raise InvalidArrayError(
-                f"scene must hold at least 2 Gaussians of opacity above 1/255, got {len(seen)}. Give another file."
-            )
-        normals = cloud.normals
-        self.normals_from = "the file"
-        if normals is None:
-            self.normals_from = "estimate_normals"
-            normals = estimate_normals(
-                cloud, self.exact, progress=lambda done, total: self.progress("normals", done, total)
-            ).normals
-        number = min(plan.points or POINTS[self.kind], len(seen))
-        chosen = np.sort(np.random.default_rng(plan.seed).choice(seen, number, replace=False))
-        self.points, self.normals = cloud.positions[chosen], normals[chosen]
-        self.float64_check = self._check_against_float64(cloud)
-        self._trace_references()
-
-    def _check_against_float64(self, cloud: GaussianCloud) -> str:
-        """Return how far single rays of each backend are off the float64 twin."""
-        report = self.exact.report
-        if len(cloud) > FLOAT64_GAUSSIANS or report.raised_scales or report.not_finite:
-            return (
-                f"skipped: more than {FLOAT64_GAUSSIANS:,} Gaussians"
-                if len(cloud) > FLOAT64_GAUSSIANS
-                else (f"skipped: {report.raised_scales + report.not_finite:,} Gaussians were mended for tracing")
-            )
-        generator = np.random.default_rng(self.plan.seed)
-        rows = generator.integers(len(self.points), size=FLOAT64_RAYS)
-        directions = generator.normal(size=(FLOAT64_RAYS, 3))
-        directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-        directions *= np.where(np.einsum("nk,nk->n", directions, self.normals[rows]) < 0.0, -1.0, 1.0)[:, None]
-        origins = self.points[rows] + np.float32(0.05) * self.normals[rows]
-        truth = visibility_reference(cloud, origins, directions)
-        worst = {
-            backend: float(np.abs(visibility(scene, origins, directions) - truth).max())
-            for backend, scene in {**self.scenes, "warp": self.exact}.items()
-        }
-        return f"largest error of a ray, of {FLOAT64_RAYS}: " + ", ".join(
-            f"{backend} {value:.1e}" for backend, value in worst.items()
         )
-
-    def _trace_references(self) -> None:
-        """Trace every offset's occlusion and the default offset's irradiance with many rays."""
-        plan = self.plan
-        surface = wp.empty(len(self.points), dtype=wp.vec2, device=self.device)
-        up = upload(self.normals, wp.vec3, self.device)
-        launch_local_surface(self.exact.occluders, upload(self.points, wp.vec3, self.device), up, surface, self.device)
-        self.height, self.thickness = surface.numpy().T
-        stages = len(plan.offsets) + 1
-        total = stages * len(self.points) * plan.reference_rays
-        self.occlusion: dict[str, NDArray[np.float64]] = {}
-        errors = []
-        for stage, offset in enumerate(plan.offsets):
-
-            def report(done: int, of: int, before: int = stage) -> None:
-                self.progress("references [rays]", (before * of + done) * plan.reference_rays, total)
-
-            at, lift = self._lifted(offset)
-            found = ambient_occlusion(
-                self.exact,
-                at,
-                self.normals,
-                sample_count=plan.reference_rays,
-                offset=lift,
-                seed=REFERENCE_SEED,
-                progress=report,
-            )
-            self.occlusion[offset] = found.visibility.astype(np.float64)
-            errors.append(float(np.square(found.standard_error, dtype=np.float64).mean()))
-        self.occlusion_floor = float(np.sqrt(max(errors)))
-        self.finest = min(plan.offsets, key=lambda offset: float(self._lift_lengths(offset).mean()))
-        at, lift = self._lifted(plan.offsets[0])
-        light = irradiance(
-            self.exact,
-            at,
-            self.normals,
-            self.environment,
-            sample_count=plan.reference_rays,
-            offset=lift,
-            ratio=False,  # the ratio's small bias would be in every error
-            seed=REFERENCE_SEED,
-        )
-        self.light = light.value.astype(np.float64)
-        self.mean_light = max(float(self.light.mean()), 1e-30)
-        self.irradiance_floor = (
-            float(np.sqrt(np.square(light.standard_error, dtype=np.float64).mean())) / self.mean_light
-        )
-        self.progress("references [rays]", total, total)
-
-    def _lifted(self, offset: str) -> tuple[NDArray[np.float32], float | Literal["auto"]]:
-        """Return points and the offset to pass on: multiples of the thickness are applied to the points here."""
-        kind, number = parse_offset(offset)
-        if kind == "auto":
-            return self.points, "auto"
-        if kind == "metres":
-            return self.points, number
-        return (self.points + self.normals * self._lift_lengths(offset)[:, None]).astype(np.float32), 0.0
-
-    def _lift_lengths(self, offset: str) -> NDArray[np.float32]:
-        """Return how far above its Gaussian's centre each ray starts [m]."""
-        kind, number = parse_offset(offset)
-        if kind == "metres":
-            return np.full(len(self.points), number, np.float32)
-        return self.height + (LIFT_IN_THICKNESSES if kind == "auto" else number) * self.thickness
 
     def _copies(self, settings: Settings) -> int:
         """Return how often the points are repeated in a call; each copy has samples of its own."""
-        return max(1, -(-RAYS_PER_CALL[self.kind] // (len(self.points) * int(settings["rays"]))))
+        rays = len(self.references.points) * int(settings["rays"])
+        return max(1, -(-RAYS_PER_CALL[self.device.is_cuda] // rays))
 
     def work(self, settings: Settings) -> int:
         """Return the number of rays that a setting's measurement traces."""
-        return len(self.points) * int(settings["rays"]) * self._copies(settings) * self.plan.repeats
+        return len(self.references.points) * int(settings["rays"]) * self._copies(settings) * self.plan.repeats
 
     def measure(self, settings: Settings) -> Row:
-        """Time a setting, and compare what it gives with the reference."""
-        copies = self._copies(settings)
-        at, lift = self._lifted(str(settings["offset"]))
-        points, normals = (upload(np.tile(array, (copies, 1)), wp.vec3, self.device) for array in (at, self.normals))
+        """Time a setting, and compare what it gives with the references."""
+        copies, offset = self._copies(settings), str(settings["offset"])
+        at, lift = self.references.lifted(offset)
+        points, normals = (
+            upload(np.tile(array, (copies, 1)), wp.vec3, self.device) for array in (at, self.references.normals)
+        )
         scene = self.scenes[str(settings["backend"])]
-        common = {
-            "sample_count": int(settings["rays"]),
+        common: dict[str, Any] = {
+            "sample_count": settings["rays"],
             "sampler": settings["sampler"],
             "offset": lift,
             "options": TraceOptions(acceptance=settings["acceptance"]),  # type: ignore[arg-type]
         }
-        lit = "density" in settings
-        if lit:
+        is_light = "density" in settings
+        if is_light:
             common |= {"density": settings["density"], "ratio": settings["ratio"] == "ratio"}
+            truth = self.references.light.astype(np.float64) / self.mean_light
+        else:
+            truth = self.truth[offset][:, None]
 
         def estimate(at: wp.array, up: wp.array, seed: int) -> wp.array:
-            if lit:
-                return irradiance(scene, at, up, self.environment, seed=seed, **common).value
+            if is_light:
+                return irradiance(scene, at, up, self.light, seed=seed, **common).value
             return ambient_occlusion(scene, at, up, seed=seed, **common).visibility
 
         estimate(points[:1], normals[:1], 0)  # compiles what is not compiled yet
-        seconds, squares = [], np.zeros(len(self.points))
+        seconds, squares = [], np.zeros(len(at))
         for repeat in range(self.plan.repeats):
             wp.synchronize_device(self.device)
             started = time.perf_counter()
             result = estimate(points, normals, repeat)
             wp.synchronize_device(self.device)
             seconds.append((time.perf_counter() - started) / len(points) * self.count)
-            found = result.numpy().astype(np.float64).reshape(copies, len(self.points), -1)
-            truth = self.light / self.mean_light if lit else self.occlusion[str(settings["offset"])][:, None]
-            if lit:
-                found /= self.mean_light
+            found = result.numpy().astype(np.float64).reshape(copies, len(at), -1)
+            found /= self.mean_light if is_light else 1.0
             squares += np.square(found - truth).mean(axis=(0, 2)) / self.plan.repeats
-        errors = {"irradiance_error" if lit else "occlusion_error": Interval.of_root_mean_square(squares)}
-        if not lit:
-            shift = self.occlusion[str(settings["offset"])] - self.occlusion[self.finest]
-            errors["offset_bias"] = Interval.of_root_mean_square(np.square(shift))
+        errors = {"irradiance_error" if is_light else "occlusion_error": Interval.of_root_mean_square(squares)}
+        if not is_light:
+            errors["offset_bias"] = Interval.of_root_mean_square(
+                np.square(self.truth[offset] - self.truth[self.finest])
+            )
         return Row(settings, Interval.of_median(seconds), errors)
-
-    @property
-    def device_name(self) -> str:
-        """The device in words."""
-        if self.device.is_cuda:
-            return self.device.name
-        count = thread_count()
-        return f"{processor_name()} ({count} thread{'s' if count > 1 else ''})"
-
-    def notes(self, environment_name: str) -> dict[str, str]:
-        """Return what a reader of the chart needs to know."""
-        plan = self.plan
-        lifts = ", ".join(
-            f"{offset}: {1e3 * float(self._lift_lengths(offset).mean()):.3g} mm" for offset in plan.offsets
-        )
-        crossed = len(plan.occlusion_settings()) + len(plan.irradiance_settings())
-        whole = replace(plan, crossing="full")
-        full = len(whole.occlusion_settings()) + len(whole.irradiance_settings())
-        return {
-            "Points": f"{len(self.points):,} of {self.count:,}, at random; normals from {self.normals_from}; "
-            f"mean ambient occlusion {float(self.occlusion[plan.offsets[0]].mean()):.3f}",
-            "Reference": f"{plan.reference_rays:,} Owen-scrambled rays a point, product acceptance, wp.Bvh",
-            "Float64 check": self.float64_check,
-            "Light": environment_name,
-            "Mean lift": lifts,
-            "Time": f"median of {plan.repeats} calls of at least {RAYS_PER_CALL[self.kind]:,} rays, bars smallest to "
-            "largest; compilation excluded; scaled from the points to all Gaussians",
-            "Error bars": "95 %, bootstrap over points",
-            "Plan": f"{crossed * len(plan.rays):,} settings of {full * len(plan.rays):,} in the full product: one or "
-            "two factors at a time around the defaults (the first of each axis)"
-            if crossed < full
-            else "full product",
-            "Versions": f"beam-warp {__version__}, Warp {wp.__version__}",
-        }

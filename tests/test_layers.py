@@ -55,7 +55,9 @@ RANKS = {
     "beam_warp.charts": 6,
     "beam_warp.chart_image": 7,
     "beam_warp.chart_page": 8,
-    "beam_warp.tracing_study": 9,
+    "beam_warp.tracing_plan": 9,
+    "beam_warp.tracing_references": 10,
+    "beam_warp.tracing_study": 11,
     "beam_warp.cli": 13,
     "beam_warp": 14,
 }

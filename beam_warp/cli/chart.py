@@ -21,16 +21,20 @@ from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.tiled_shapes import still_life
 
-LEAST_PART = 0.25
-"""Measuring gets at least this part of the budget, however long the references took."""
+REFERENCE_PART = 0.35
+"""References may take this part of the budget; where they would take longer, fewer points are measured."""
+
+LEAST_PART = 0.4
+"""Measuring gets at least this part of the budget, however long normals and references took."""
 
 
 @dataclass(frozen=True)
 class Chart:
     """Measure error against time for every way to trace visibility, and mark the best ones.
 
-    Writes OUT/tracing.csv, OUT/tracing.png and OUT/tracing.html (one file, no network). A run that was stopped
-    continues when it is called again with the same options, and OUT/tracing.partial.csv can be drawn as it is.
+    Writes OUT/tracing.csv, OUT/tracing.png and OUT/tracing.html (one file, no network). A run that was stopped, or that
+    the budget cut short, goes on when it is called again with the same options; OUT/tracing.partial.csv can be drawn as
+    it is, with --from-csv. References are kept in OUT/tracing.references.npz for the next run on the same Gaussians.
 
     How to read it: each curve is one way to trace, with more rays to the right. Errors are against many rays from the
     same offset: noise, which falls with rays. The offset has a chart of its own: how far its truth lies from that of
@@ -124,7 +128,8 @@ def chart(args: Chart) -> int:
 def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
-    from beam_warp.tracing_study import TracingPlan, tracing_study
+    from beam_warp.tracing_plan import TracingPlan
+    from beam_warp.tracing_study import tracing_study
 
     plan = TracingPlan(
         backends=args.backends,
@@ -164,6 +169,8 @@ def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Setting
         name=name,
         environment_name=environment_name,
         device=args.device,
+        references_file=args.out / "tracing.references.npz",
+        reference_seconds=REFERENCE_PART * args.budget_seconds,
         progress=report,
     )
     left = max(args.budget_seconds - (time.perf_counter() - started), LEAST_PART * args.budget_seconds)
@@ -219,4 +226,4 @@ def _say(table: Table, skipped: list[Settings], image: Path, page: Path) -> None
     if skipped:
         names = "; ".join(subject.label(settings) for settings in skipped[:3])
         more = f"; and {len(skipped) - 3:,} more" if len(skipped) > 3 else ""
-        print(f"skipped for the budget: {names}{more}. Raise --budget-seconds to measure them.", file=sys.stderr)
+        print(f"skipped for the budget: {names}{more}. Call again to go on with them.", file=sys.stderr)
