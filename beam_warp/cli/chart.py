@@ -128,6 +128,7 @@ def chart(args: Chart) -> int:
 def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
+    from beam_warp.devices import resolve_device
     from beam_warp.tracing_plan import TracingPlan
     from beam_warp.tracing_study import tracing_study
 
@@ -160,6 +161,7 @@ def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Setting
                 f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
             )
         cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
+    resolve_device(args.device)  # an unknown device is refused before a folder is made
     _make_folder(args.out)
     started = time.perf_counter()
     study = tracing_study(
