@@ -25,6 +25,12 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 MOMENT_ROWS = 64
 """Rows of the grid behind `light_moments`: cells at the horizon lose at most (pi / 64)^2 / 12 = 2e-4 of even light."""
 
+FINE_ROWS = 512
+"""Least rows of the grid that bright cells are kept on."""
+
+BRIGHT_PART = 1.0 / 256.0
+"""Part of the light above which a cell counts as bright: there are fewer than 256 of them."""
+
 
 @dataclass(frozen=True, eq=False)
 class SampledEnvironment:
@@ -45,12 +51,12 @@ class SampledEnvironment:
     @classmethod
     def from_environment(cls, environment: EnvironmentMap, device: Any) -> SampledEnvironment:
         """Prepare an environment; all parts see the same texels, those of `fitted`."""
-        environment = fitted(environment)
+        environment, target = fitted(environment), wp.get_device(device)
         return cls(
-            device,
-            environment_distribution(environment, device),
-            environment_blocks(environment, device),
-            light_moments(environment, device),
+            target,
+            environment_distribution(environment, target),
+            environment_blocks(environment, target),
+            light_moments(environment, target),
         )
 
 
@@ -140,24 +146,35 @@ def light_moments(environment: EnvironmentMap, device: Any) -> LightMoments:
     """Sum radiance times the first moment of its texel, in closed form, over the cells of a grid.
 
     E(n) = sum over cells of max(0, n . moment) is the unshadowed irradiance of a normal: exact for every cell on one
-    side of the normal's horizon, and a sun keeps its place whatever its cell.
+    side of the normal's horizon. A cell with more than `BRIGHT_PART` of the light, such as a sun's, is kept in parts
+    as fine as `FINE_ROWS`, so that setting behind the horizon is not all or nothing.
     """
-    height, width = environment.height, environment.width
+    repeat = -(-FINE_ROWS // environment.height)
+    radiance = environment.radiance.astype(np.float64).repeat(repeat, axis=0).repeat(repeat, axis=1)
+    height, width = radiance.shape[:2]
     theta = np.linspace(0.0, np.pi, height + 1)
     phi = np.pi - (np.arange(width) + 0.5) * (2.0 * np.pi / width)
     # integrals of (cos phi sin theta, cos theta) sin theta over a texel whose middle is at phi = 0, for each row
     sideways = np.diff(theta / 2.0 - np.sin(2.0 * theta) / 4.0) * (2.0 * np.sin(np.pi / width))
     upward = np.diff(np.sin(theta) ** 2 / 2.0) * (2.0 * np.pi / width)
-    moment = np.stack(
-        np.broadcast_arrays(sideways[:, None] * np.cos(phi), sideways[:, None] * np.sin(phi), upward[:, None]), axis=-1
-    )
-    weighted = environment.radiance.astype(np.float64)[..., None] * moment[:, :, None, :]  # (H, W, channel, axis)
-    for axis, cells in ((0, MOMENT_ROWS), (1, 2 * MOMENT_ROWS)):
-        size = weighted.shape[axis]
-        if size > cells:
-            weighted = np.add.reduceat(weighted, np.arange(cells) * size // cells, axis=axis)
-    cells = weighted.reshape(-1, 3, 3)
-    cells = cells[np.abs(cells).sum(axis=(1, 2)) > 0.0].astype(np.float32)
+    across = np.broadcast_to(upward[:, None], (height, width))
+    moment = np.stack([sideways[:, None] * np.cos(phi), sideways[:, None] * np.sin(phi), across], axis=-1)
+    rows = np.arange(MOMENT_ROWS) * height // MOMENT_ROWS
+    columns = np.arange(2 * MOMENT_ROWS) * width // (2 * MOMENT_ROWS)
+    coarse = np.stack(
+        [
+            np.add.reduceat(np.add.reduceat(moment * radiance[..., channel, None], rows, axis=0), columns, axis=1)
+            for channel in range(3)
+        ],
+        axis=2,
+    )  # (64, 128, channel, axis)
+    power = np.linalg.norm(coarse, axis=3).sum(axis=2)
+    bright = power > BRIGHT_PART * power.sum()
+    parts = [coarse[~bright & (power > 0.0)]]
+    for row, column in np.argwhere(bright):
+        part = np.s_[rows[row] : [*rows, height][row + 1], columns[column] : [*columns, width][column + 1]]
+        parts.append((radiance[part][..., None] * moment[part][:, :, None, :]).reshape(-1, 3, 3))
+    cells = np.concatenate(parts).astype(np.float32)
     moments = LightMoments()
     for channel, name in enumerate(("red", "green", "blue")):
         setattr(moments, name, upload(cells[:, channel], wp.vec3, device))

@@ -1,5 +1,7 @@
 """Sample sets and maps: exact stratification, agreement with an independent Sobol', densities by chi-square."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -17,7 +19,9 @@ from beam_warp.kernels.product_sampling import (
     square_to_product_pdf,
 )
 from beam_warp.kernels.sampling import (
+    SampleSet,
     cosine_hemisphere_to_square,
+    draw_square,
     owen_sobol_x,
     owen_sobol_y,
     sobol_second_dimension,
@@ -26,6 +30,8 @@ from beam_warp.kernels.sampling import (
     stream_of,
     unit_float,
 )
+from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
+from beam_warp.sampling import SAMPLERS, sample_set, squarest_grid
 
 SIGNIFICANCE = 1e-4
 """Of each statistical test here; seeds are fixed, so a failure is a change of code, not bad luck."""
@@ -45,6 +51,24 @@ def owen_kernel(seed: wp.uint32, count: int, bits: wp.vec2i, out: wp.array2d[wp.
     y = owen_sobol_y(sample, stream)
     out[point, sample] = wp.vec2(unit_float(x), unit_float(y))
     out_stratum[point, sample] = stratum(x, y, bits[0], bits[1])
+
+
+@wp.kernel
+def draw_square_kernel(samples: SampleSet, out: wp.array2d[wp.vec2], out_slot: wp.array2d[int]):
+    point, index = wp.tid()
+    at = draw_square(samples, index, stream_of(wp.uint32(7), wp.uint32(0), wp.uint32(point)))
+    out[point, index] = wp.vec2(at.u, at.v)
+    out_slot[point, index] = at.slot
+
+
+@wp.kernel
+def spread_kernel(terms: wp.array2d[float], paired: int, out: wp.array[float]):
+    i = wp.tid()
+    spread = Spread()
+    spread.paired = paired
+    for k in range(terms.shape[1]):
+        spread = add_term(spread, terms[i, k])
+    out[i] = variance_of_sum(spread)
 
 
 @wp.kernel
@@ -93,6 +117,27 @@ def owen_points(device, points, count, seed=7):
     return out.numpy(), cells.numpy()
 
 
+def draw_sets(device, sampler, points, count):
+    out = wp.empty((points, count), dtype=wp.vec2, device=device)
+    slots = wp.empty((points, count), dtype=int, device=device)
+    wp.launch(
+        draw_square_kernel, (points, count), inputs=[sample_set(sampler, count)], outputs=[out, slots], device=device
+    )
+    return out.numpy().astype(np.float64), slots.numpy()
+
+
+def variance_of_sums(device, terms, paired):
+    out = wp.empty(len(terms), dtype=float, device=device)
+    wp.launch(
+        spread_kernel,
+        len(terms),
+        inputs=[wp.array(terms, dtype=float, device=device), int(paired)],
+        outputs=[out],
+        device=device,
+    )
+    return out.numpy()
+
+
 def test_second_dimension_is_sobols(device):
     out = wp.empty(256, dtype=wp.uint32, device=device)
     wp.launch(plain_sobol_kernel, 256, outputs=[out], device=device)
@@ -111,6 +156,74 @@ def test_each_stratum_holds_one_point(device, count):
     for a in range(bits + 1):
         cell = np.floor(points[..., 0] * 2**a) * 2 ** (bits - a) + np.floor(points[..., 1] * 2 ** (bits - a))
         assert (np.sort(cell, axis=1) == np.arange(count)).all()
+
+
+@pytest.mark.parametrize(
+    ("count", "grid"), [(1, (1, 1)), (12, (3, 4)), (49, (7, 7)), (50, (5, 10)), (64, (8, 8)), (61, (1, 61))]
+)
+def test_stratified_sets_fill_the_squarest_grid(device, count, grid):
+    assert squarest_grid(count) == grid
+    points, slots = draw_sets(device, "stratified", 40, count)
+    # a coordinate within float32 rounding of a cell's edge may read as the neighbour's
+    shifted = np.clip(points, 2.0**-23, None)
+    cell = np.floor(shifted * grid * (1.0 - 2.0**-23)).astype(int)
+    rows = np.where(cell[..., 0] % 2 == 0, cell[..., 1], grid[1] - 1 - cell[..., 1])
+    assert ((cell[..., 0] * grid[1] + rows == slots).mean(axis=1) > 0.999).all()
+    assert (np.sort(slots, axis=1) == np.arange(count)).all()
+    # one after the other in the order of slots, cells share an edge
+    steps = np.abs(np.diff(cell, axis=1)).sum(axis=2)
+    assert (steps == 1).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("count", [16, 30])
+def test_points_of_every_sampler_are_uniform(device, sampler, count):
+    """Each point of a set over many streams: uniform in the square, or, one of each stratum together."""
+    points, _ = draw_sets(device, sampler, 2000, count)
+    assert ((points >= 0.0) & (points < 1.0)).all()
+    one_each = points[np.arange(2000), np.arange(2000) % count]
+    for axis in range(2):
+        assert stats.kstest(one_each[:, axis], "uniform").pvalue > SIGNIFICANCE
+    counts = np.histogram2d(one_each[:, 0], one_each[:, 1], bins=6, range=[[0, 1], [0, 1]])[0]
+    assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE
+
+
+def test_independent_points_are_independent(device):
+    """Within a set, and of the same number in neighbouring sets: pairs of coordinates fill the square evenly."""
+    points, _ = draw_sets(device, "iid", 2000, 32)
+    pairs = {
+        "next x": (points[:, :-1, 0], points[:, 1:, 0]),
+        "next y": (points[:, :-1, 1], points[:, 1:, 1]),
+        "x, y": (points[..., 0], points[..., 1]),
+        "next set": (points[:-1, :, 0], points[1:, :, 0]),
+        "next set across": (points[:-1, :, 0], points[1:, :, 1]),
+    }
+    for name, (a, b) in pairs.items():
+        counts = np.histogram2d(a.ravel(), b.ravel(), bins=16, range=[[0, 1], [0, 1]])[0]
+        assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE, name
+
+
+class TestSpread:
+    def test_independent_terms(self, device, rng):
+        terms = rng.normal(5.0, 2.0, (100, 33)).astype(np.float32)
+        expected = 33 * terms.astype(np.float64).var(axis=1, ddof=1)
+        # Welford's recurrence: a few roundings of the squares a term
+        np.testing.assert_allclose(variance_of_sums(device, terms, False), expected, rtol=33 * 4 * 2.0**-24)
+
+    @pytest.mark.parametrize("count", [2, 3, 8, 9])
+    def test_collapsed_strata(self, device, rng, count):
+        """Groups of two, the last of three if the count is odd: m / (m - 1) times the squared deviations of each."""
+        terms = rng.normal(5.0, 2.0, (100, count)).astype(np.float32)
+        expected = np.zeros(100)
+        edges = [*range(0, count - 1 - count % 2, 2), count]
+        for begin, end in itertools.pairwise(edges):
+            group = terms[:, begin:end].astype(np.float64)
+            expected += (end - begin) * group.var(axis=1, ddof=1)
+        # squares of differences of numbers near 5: rounding 5 * 2^-24 against differences, and cancellation of three
+        np.testing.assert_allclose(variance_of_sums(device, terms, True), expected, rtol=1e-5, atol=1e-4)
+
+    def test_one_term_has_none(self, device):
+        assert variance_of_sums(device, np.ones((1, 1), np.float32), True)[0] == 0.0
 
 
 def test_points_are_uniform_over_streams(device):

@@ -1,0 +1,385 @@
+"""Which estimator reaches which error at how many rays: occlusion by sampler, irradiance by density, ratio and sampler.
+
+    python benchmarks/estimators.py [--scene figure] [--device cuda:0] [--out result.json] [--plot errors.png]
+
+Scenes, tiled with Gaussians: "ball", a sphere resting on a floor before a wall, with points on all three; "figure",
+the embedded human figure of `beam demo`, with points all over it. Skies: made here, 128 x 256 texels whose brightest
+is 51, 1,600 and 20,000 times their mean; `--environment FILE` adds one of your own. Every error is the root mean
+square over points, channels and seeds against 16,384 rays (occlusion: cosine, Owen; irradiance: product, ratio, Owen),
+relative to the irradiance there, or to a twentieth of its mean where it is less. In brackets: what another program
+measured before, with triangles, on another figure, under captured skies of the same peaks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp import GaussianCloud, Scene, ambient_occlusion
+from beam_warp.demo_figure import build_figure
+from beam_warp.environment_sampling import SampledEnvironment
+from beam_warp.environments import EnvironmentMap, texel_directions
+from beam_warp.irradiance import irradiance
+
+REFERENCE_RAYS = 16_384
+SEEDS = range(1, 5)
+CURVE_COUNTS = (4, 8, 16, 32, 64, 128, 256, 512, 1024)
+SKY_HEIGHT = 128
+PEAKS = {"courtyard": 51.0, "sunset": 1.6e3, "sunrise": 2e4}
+"""Brightest texel over mean of each sky."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """An estimator of the table, and its relative error as measured before under each sky of `PEAKS`."""
+
+    density: str
+    ratio: bool
+    sampler: str
+    count: int
+    before: tuple[float, float, float] | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.density}{' ratio' if self.ratio else ''} {self.sampler} {self.count}"
+
+
+ROWS = (
+    Row("cosine", False, "iid", 50, (0.449, 0.150, 0.162)),
+    Row("cosine", False, "iid", 1000, (0.103, 0.049, 0.232)),
+    Row("cosine", True, "iid", 50, (0.156, 0.076, 0.098)),
+    Row("cosine", False, "owen", 64),
+    Row("cosine", True, "owen", 64),
+    Row("environment", False, "iid", 50, (0.294, 0.299, 0.484)),
+    Row("environment", True, "owen", 64),
+    Row("mis", False, "iid", 50, (0.300, 0.169, 0.190)),
+    Row("mis", True, "owen", 64, (0.078, 0.055, 0.050)),
+    Row("product", False, "iid", 50, (0.111, 0.112, 0.173)),
+    Row("product", False, "stratified", 64),
+    Row("product", False, "owen", 64, (0.052, 0.056, 0.075)),
+    Row("product", True, "iid", 64),
+    Row("product", True, "stratified", 64),
+    Row("product", True, "owen", 64, (0.033, 0.038, 0.045)),
+)
+
+OCCLUSION_ROWS = (
+    ("iid", 50, 29.3),
+    ("stratified", 49, 33.4),
+    ("owen", 50, 34.6),
+    ("stratified", 64, None),
+    ("owen", 64, 36.3),
+    ("owen", 256, 45.2),
+    ("iid", 1000, 42.4),
+)
+"""Sampler, rays, and PSNR [dB] as measured before."""
+
+CURVES = (
+    ("cosine", False, "iid"),
+    ("cosine", True, "owen"),
+    ("environment", True, "owen"),
+    ("mis", True, "owen"),
+    ("product", False, "iid"),
+    ("product", False, "owen"),
+    ("product", True, "owen"),
+)
+
+
+def commit() -> str:
+    """The checkout's commit, or 'unknown' outside one."""
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
+        )
+    except OSError:
+        return "unknown"
+    return found.stdout.strip() or "unknown"
+
+
+def discs(points: NDArray, normals: NDArray, spacing: float) -> dict[str, NDArray]:
+    """One flat Gaussian a point, wide enough to close the surface."""
+    w = 1.0 + normals[:, 2]
+    turns = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), np.maximum(w, 1e-6)], axis=1)
+    turns[w < 1e-6] = (1.0, 0.0, 0.0, 0.0)
+    return {
+        "positions": points,
+        "orientations": turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        "scales": np.tile([0.65 * spacing, 0.65 * spacing, 0.065 * spacing], (len(points), 1)),
+        "opacities": np.full(len(points), 0.98),
+    }
+
+
+def sphere_set(count: int) -> NDArray:
+    """Spherical Fibonacci set."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * i
+    return np.stack([np.sqrt(1.0 - z * z) * np.cos(phi), np.sqrt(1.0 - z * z) * np.sin(phi), z], axis=1)
+
+
+def make_figure(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:
+    """The demo's figure in mid-step, one Gaussian a vertex."""
+    mesh = build_figure().at(0.125)
+    corners = mesh.vertices[mesh.faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    cloud = GaussianCloud(**discs(mesh.vertices, mesh.normals.astype(np.float64), math.sqrt(area / len(mesh.vertices))))
+    chosen = np.random.default_rng(1).choice(len(mesh.vertices), count, replace=False)
+    return Scene.from_gaussians(cloud, device), mesh.vertices[chosen], mesh.normals[chosen]
+
+
+def make_ball(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:
+    """A sphere of radius 0.5 m on a floor, a wall 1.2 m high at x = -1 m; half of the points lie on the floor."""
+    spacing = 0.05
+    side = np.arange(-2.0, 2.0, spacing)
+    grid = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    y, z = (a.ravel() for a in np.meshgrid(side, np.arange(spacing / 2, 1.2, spacing), indexing="ij"))
+    wall = np.stack([np.full(len(y), -1.0), y, z], axis=1)
+    ball = sphere_set(2500)
+    parts = [
+        discs(grid, np.tile([0.0, 0.0, 1.0], (len(grid), 1)), spacing),
+        discs(wall, np.tile([1.0, 0.0, 0.0], (len(wall), 1)), spacing),
+        discs(0.5 * ball + [0.0, 0.0, 0.5], ball, 0.5 * math.sqrt(4.0 * math.pi / len(ball))),
+    ]
+    scene = Scene.from_gaussians(GaussianCloud(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}), device)
+    rng = np.random.default_rng(1)
+    on_wall, on_ball = count // 6, count // 3
+    on_floor = count - on_wall - on_ball
+    radius, turn = np.sqrt(rng.uniform(0.15**2, 0.95**2, on_floor)), rng.uniform(0, 2 * np.pi, on_floor)
+    floor_points = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(on_floor)], axis=1)
+    out = rng.normal(size=(on_ball, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    wall_points = np.stack([np.full(on_wall, -1.0), *rng.uniform([-1, 0.1], [1, 1.1], (on_wall, 2)).T], axis=1)
+    points = np.concatenate([floor_points, 0.5 * out + [0.0, 0.0, 0.5], wall_points])
+    normals = np.concatenate([np.tile([0.0, 0.0, 1.0], (on_floor, 1)), out, np.tile([1.0, 0.0, 0.0], (on_wall, 1))])
+    return scene, points.astype(np.float32), normals.astype(np.float32)
+
+
+def make_sky(name: str) -> EnvironmentMap:
+    """A gradient over a darker ground with a lamp of a few degrees (courtyard) or a sun of one texel, at its peak."""
+    directions = texel_directions(SKY_HEIGHT, 2 * SKY_HEIGHT)
+    z = directions[..., 2]
+    warm, cool = np.array([1.0, 0.85, 0.7]), np.array([0.55, 0.75, 1.1])
+    blend = np.clip(z, 0.0, 1.0)[..., None] ** 0.5
+    radiance = np.where(z[..., None] > 0.0, warm * (1.0 - blend) + cool * blend, 0.15 * warm)
+    azimuth, elevation = np.radians([35.0, 30.0])
+    aim = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    towards = directions @ aim
+    if name == "courtyard":
+        radiance[z < np.sin(np.radians(25.0))] *= 0.25  # walls around: light comes from above and through one gap
+        hot = towards > np.cos(np.radians(6.0))
+    else:
+        hot = towards == towards.max()
+    # The largest channel of the hot texels is peak times the mean over texels and channels, which they are part of.
+    color = warm / warm.max()
+    part = hot.sum() / hot.size * color.mean() * PEAKS[name]
+    if part >= 1.0:
+        raise ValueError(f"{name}: {hot.sum()} texels of {PEAKS[name]} times the mean exceed it")
+    mean = radiance[~hot].sum() / radiance.size / (1.0 - part)
+    radiance[hot] = PEAKS[name] * mean * color
+    return EnvironmentMap(radiance.astype(np.float32))
+
+
+def relative_errors(values: NDArray, truth: NDArray) -> NDArray:
+    return (values - truth) / np.maximum(truth, 0.05 * truth.mean())
+
+
+def albedo_psnr(values: NDArray, truth: NDArray) -> float:
+    """PSNR [dB] of the base colour of a surface of 0.4 that is solved from its exact radiance and this irradiance."""
+    solved = np.clip(0.4 * truth / np.maximum(values, 1e-6), 0.0, 1.0)
+    return float(-10.0 * np.log10(((solved - 0.4) ** 2).mean()))
+
+
+def rms(errors: NDArray) -> float:
+    return float(np.sqrt((errors.astype(np.float64) ** 2).mean()))
+
+
+def measure_occlusion(scene: Scene, points: NDArray, normals: NDArray) -> dict:
+    truth = ambient_occlusion(scene, points, normals, sample_count=REFERENCE_RAYS, seed=99)
+
+    def error(sampler: str, count: int) -> float:
+        return rms(
+            np.stack(
+                [
+                    ambient_occlusion(scene, points, normals, sample_count=count, sampler=sampler, seed=s).visibility
+                    - truth.visibility
+                    for s in SEEDS
+                ]
+            )
+        )
+
+    # The variance of independent rays falls as one over their number: one measurement says how many another is worth.
+    one_ray = error("iid", 256) * math.sqrt(256)
+    rows = []
+    for sampler, count, before in OCCLUSION_ROWS:
+        found = error(sampler, count)
+        rows.append(
+            {
+                "sampler": sampler,
+                "rays": count,
+                "rmse": round(found, 5),
+                "psnr_db": round(-20.0 * math.log10(found), 2),
+                "worth_iid_rays": round((one_ray / found) ** 2),
+                "psnr_db_before": before,
+            }
+        )
+    curves = {
+        sampler: [round(error(sampler, count), 6) for count in CURVE_COUNTS]
+        for sampler in ("iid", "stratified", "owen")
+    }
+    return {
+        "mean": round(float(truth.visibility.mean()), 4),
+        "reference_standard_error": round(rms(truth.standard_error), 6),
+        "rows": rows,
+        "curves": curves,
+    }
+
+
+def measure_sky(
+    scene: Scene, points: NDArray, normals: NDArray, sky: EnvironmentMap, before: int | None, with_curves: bool
+) -> dict:
+    light = SampledEnvironment.from_environment(sky, scene.device)
+    truth = irradiance(scene, points, normals, light, sample_count=REFERENCE_RAYS, seed=99)
+    floor = np.maximum(truth.value, 0.05 * truth.value.mean())
+
+    def estimates(density: str, ratio: bool, sampler: str, count: int, seeds: range) -> NDArray:
+        options = {"sample_count": count, "sampler": sampler, "density": density, "ratio": ratio}
+        return np.stack([irradiance(scene, points, normals, light, seed=s, **options).value for s in seeds])
+
+    rows = []
+    for row in ROWS:
+        found = estimates(row.density, row.ratio, row.sampler, row.count, SEEDS)
+        rows.append(
+            {
+                "estimator": row.name,
+                "relative_rmse": round(rms(relative_errors(found, truth.value)), 4),
+                "rmse_over_mean": round(rms(found - truth.value) / float(truth.value.mean()), 4),
+                "albedo_psnr_db": round(albedo_psnr(found, truth.value), 2),
+                "relative_bias": round(float(relative_errors(found, truth.value).mean()), 5),
+                "relative_rmse_before": None if before is None or row.before is None else row.before[before],
+            }
+        )
+    curves = {
+        f"{density}{' ratio' if ratio else ''} {sampler}": [
+            round(rms(relative_errors(estimates(density, ratio, sampler, count, range(1, 3)), truth.value)), 5)
+            for count in CURVE_COUNTS
+        ]
+        for density, ratio, sampler in (CURVES if with_curves else ())
+    }
+    return {
+        "peak_over_mean": float(f"{sky.radiance.max() / sky.radiance.mean():.4g}"),
+        "reference_relative_standard_error": round(rms(truth.standard_error / floor), 5),
+        "rows": rows,
+        "curves": curves,
+    }
+
+
+def markdown(result: dict) -> str:
+    """The tables, each figure with the one measured before in brackets."""
+
+    def beside(value: float, before: float | None, form: str) -> str:
+        return f"{value:{form}}" + ("" if before is None else f" ({before:{form}})")
+
+    lines = ["| occlusion | PSNR, dB (as before) | worth iid rays |", "|---|---|---|"]
+    lines += [
+        f"| {r['sampler']} {r['rays']} | {beside(r['psnr_db'], r['psnr_db_before'], '.1f')} | {r['worth_iid_rays']} |"
+        for r in result["occlusion"]["rows"]
+    ]
+    skies = result["skies"]
+    heads = [f"{name}, peak {sky['peak_over_mean']:g}" for name, sky in skies.items()]
+    lines += ["", "| irradiance | " + " | ".join(heads) + " |", "|---" * (len(skies) + 1) + "|"]
+    for place, row in enumerate(ROWS):
+        cells = [
+            beside(sky["rows"][place]["relative_rmse"], sky["rows"][place]["relative_rmse_before"], ".3f")
+            for sky in skies.values()
+        ]
+        lines.append(f"| {row.name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def plot(result: dict, path: Path) -> None:
+    """Error against rays, both logarithmic: one panel for occlusion, one a sky."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    panels = {"occlusion": result["occlusion"]} | {k: v for k, v in result["skies"].items() if v["curves"]}
+    figure, axes = plt.subplots(1, len(panels), figsize=(4.4 * len(panels), 4.6), layout="constrained")
+    colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(n for p in panels.values() for n in p["curves"]))}
+    for axis, (name, panel) in zip(axes, panels.items(), strict=True):
+        for label, errors in panel["curves"].items():
+            axis.loglog(CURVE_COUNTS, errors, "o-", ms=3.5, label=label, color=colors[label])
+        first = next(iter(panel["curves"].values()))[0]
+        axis.loglog(CURVE_COUNTS, [first * math.sqrt(4 / c) for c in CURVE_COUNTS], "--", color="0.6", label="1/√rays")
+        peak = "" if name == "occlusion" else f", peak {panel['peak_over_mean']:g} × mean"
+        axis.set_title(name + peak)
+        axis.set_xlabel("rays a point")
+        axis.set_xticks(CURVE_COUNTS, [str(c) for c in CURVE_COUNTS], fontsize=8)
+        axis.minorticks_off()
+        axis.grid(True, which="both", alpha=0.25)
+        axis.legend(fontsize=7)
+    axes[0].set_ylabel("error (RMS; irradiance: relative)")
+    partial = path.with_suffix(".partial.png")
+    figure.savefig(partial, dpi=110)
+    plt.close(figure)
+    partial.replace(path)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", choices=("ball", "figure"), default="ball")
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--points", type=int, default=256)
+    parser.add_argument("--skies", nargs="*", choices=list(PEAKS), default=list(PEAKS))
+    parser.add_argument("--environment", type=Path, nargs="*", default=[], help="lat-long maps, reduced to 128 rows")
+    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--plot", type=Path)
+    arguments = parser.parse_args()
+    started = time.perf_counter()
+    make = make_ball if arguments.scene == "ball" else make_figure
+    scene, points, normals = make(arguments.device, arguments.points)
+    result = {
+        "benchmark": "estimators",
+        "scene": arguments.scene,
+        "gaussians": scene.report.traced,
+        "commit": arguments.commit,
+        "device": scene.device.name,
+        "warp": wp.__version__,
+        "points": len(points),
+        "seeds": len(SEEDS),
+        "reference_rays": REFERENCE_RAYS,
+        "curve_counts": CURVE_COUNTS,
+        "occlusion": measure_occlusion(scene, points, normals),
+        "skies": {
+            name: measure_sky(scene, points, normals, make_sky(name), list(PEAKS).index(name), True)
+            for name in arguments.skies
+        },
+    }
+    for path in arguments.environment:
+        sky = EnvironmentMap.read(path).resized(SKY_HEIGHT, 2 * SKY_HEIGHT)
+        result["skies"][path.name] = measure_sky(scene, points, normals, sky, None, False)
+    result["seconds"] = round(time.perf_counter() - started, 1)
+    text = json.dumps(result, indent=2) + "\n"
+    if arguments.out:
+        partial = arguments.out.with_suffix(".partial")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(arguments.out)
+    if arguments.plot:
+        plot(result, arguments.plot)
+    sys.stdout.write(text)
+    sys.stdout.write(markdown(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
