@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from beam_warp.converters import write as write
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
+    from beam_warp.gradients import visibility_gradients as visibility_gradients
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
     from beam_warp.materials import MaterialOptions as MaterialOptions
@@ -59,6 +60,7 @@ _HOMES = {
     "run": "pipeline",
     "validate": "schema.validator",
     "visibility": "tracing",
+    "visibility_gradients": "gradients",
     "write": "converters",
 }
 """Public name → the module that defines it."""

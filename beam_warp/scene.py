@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -10,64 +10,64 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
-from beam_warp.checks import require_choice
+from beam_warp.checks import require_array, require_choice, require_same_length
 from beam_warp.devices import resolve_device, upload
-from beam_warp.errors import InvalidOptionError
-from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, launch_pack_gaussians
-from beam_warp.kernels.gaussian import Gaussians
-from beam_warp.kernels.occluders import WarpTreeOccluders
-
-SMALLEST_RELATIVE_SCALE = 1e-7
-"""Scales are raised to this part of the scene's extent: below it float32 positions themselves are coarser."""
-
-SMALLEST_SCALE_RATIO = 1e-4
-"""Scales are raised to this part of their Gaussian's largest: the response error is about 6e-8 distance / scale."""
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
+from beam_warp.kernels.occluders import WarpTreeOccluders, WideTreeOccluders
+from beam_warp.packed_gaussians import PackedGaussians
+from beam_warp.wide_trees import build_wide_tree, refit
 
 NOTHING = GaussianCloud(
     positions=np.zeros((1, 3)), orientations=[[0.0, 0.0, 0.0, 1.0]], scales=np.ones((1, 3)), opacities=[0.0]
 )
+"""One Gaussian that no ray sees: with it kernels need no case for an empty scene."""
 
 BACKENDS = ("wide", "warp")
+BUILDS = ("quality", "fast")
+WARP_BUILDS = {"quality": "sah", "fast": "lbvh"}
+
+Backend = Literal["wide", "warp"]
+Build = Literal["quality", "fast"]
 
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What was done to the cloud so that it can be traced.
+    """What was done to the Gaussians so that they can be traced.
 
     Attributes:
         traced: Gaussians that take part.
         dropped: Gaussians left out because their opacity is at most 1/255: no ray can see them.
         raised_scales: Gaussians traced with a scale raised to the smallest that float32 can resolve.
         not_finite: Gaussians left out because of NaN, infinity, a negative scale or a zero quaternion.
+        depth: Levels of the wide tree; 0 for ``wp.Bvh``, which does not tell.
+        build: How the tree was built; ``"places"`` where the method asked for made it too deep to traverse.
     """
 
     traced: int
     dropped: int
     raised_scales: int
     not_finite: int = 0
+    depth: int = 0
+    build: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Scene:
-    """One device's copy of a cloud.
+    """One device's copy of a cloud; `from_gaussians` makes it, `move` moves it.
 
     Attributes:
-        device: Warp device that holds it.
         backend: Hierarchy that rays traverse.
         occluders: What kernels trace, relative to ``origin``.
-        origin: World position that the device's coordinates are relative to [m]: the middle of the cloud, so that
-            precision does not suffer far from the world's origin.
-        extent: Largest side of the centres' bounding box [m].
         report: What was left out or changed.
     """
 
-    device: Any
-    backend: str
+    backend: Backend
     occluders: Any
-    origin: NDArray[np.float32]
-    extent: float
     report: SceneReport
-    _keep: Any = None
+    _packed: PackedGaussians = field(repr=False)
+    _count: int = field(repr=False)
+    _tree: Any = field(repr=False, default=None)
 
     @classmethod
     def from_gaussians(
@@ -75,7 +75,8 @@ class Scene:
         cloud: GaussianCloud,
         device: str | None = None,
         *,
-        backend: Literal["wide", "warp"] = "warp",
+        backend: Backend = "wide",
+        build: Build = "quality",
         response_degree: Literal[2, 4] = 2,
     ) -> Scene:
         """Upload a cloud and build its hierarchy.
@@ -84,6 +85,8 @@ class Scene:
             cloud: Any number of Gaussians, none included.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
             backend: ``"wide"``, the own hierarchy of four children a node, or ``"warp"``, ``wp.Bvh``.
+            build: ``"quality"`` for many rays, ``"fast"`` for geometry that changes with every few. With ``wp.Bvh``:
+                the surface-area heuristic, on the host, or LBVH, which only CUDA has.
             response_degree: 2 for Gaussians, 4 for the faster falloff exp(-x^4 / 18) of 3DGRT, if trained with it.
 
         Raises:
@@ -92,57 +95,120 @@ class Scene:
         """
         target = resolve_device(device)
         require_choice("backend", backend, BACKENDS)
+        require_choice("build", build, BUILDS)
         if response_degree not in (2, 4):
             raise InvalidOptionError(f"response_degree must be 2 or 4, got {response_degree!r}. Choose one of them.")
-        seen = cloud.opacities > 1.0 / 255.0
-        positions = cloud.positions[seen]
-        lower, upper = (positions.min(0), positions.max(0)) if len(positions) else (np.zeros(3), np.zeros(3))
-        extent = float((upper - lower).max())
-        origin = ((lower.astype(np.float64) + upper) / 2.0).astype(np.float32)
-        # A single Gaussian or a pile of coincident ones has no extent of its own: its largest scale stands in.
-        smallest = SMALLEST_RELATIVE_SCALE * max(extent, float(cloud.scales[seen].max(initial=0.0)), 1e-12)
-        traceable, count = len(cloud), max(len(cloud), 1)
-        gaussians = Gaussians()
-        for name in ("center_opacity", "whitening_0", "whitening_1", "whitening_2"):
-            setattr(gaussians, name, wp.empty(count, dtype=wp.vec4, device=target))
-        gaussians.degree = response_degree
-        if cloud.normals is not None:
-            gaussians.normals = upload(cloud.normals, wp.vec3, target)
-        lowers = wp.empty(count, dtype=wp.vec3, device=target)
-        uppers = wp.empty(count, dtype=wp.vec3, device=target)
-        fates = wp.empty(count, dtype=int, device=target)
-        if not len(cloud):  # one Gaussian that nothing sees: kernels need no case for an empty scene
-            cloud = NOTHING
-        launch_pack_gaussians(
-            upload(cloud.positions, wp.vec3, target),
-            upload(cloud.orientations, wp.quat, target),
-            upload(cloud.scales, wp.vec3, target),
-            upload(cloud.opacities, float, target),
-            wp.vec3(*origin.tolist()),
-            smallest,
-            SMALLEST_SCALE_RATIO,
-            gaussians,
-            lowers,
-            uppers,
-            fates,
-            target,
-        )
-        occluders = WarpTreeOccluders()
-        occluders.gaussians = gaussians
-        occluders.origin = wp.vec3(*origin.tolist())
-        # LBVH builds in under a millisecond on CUDA; on the CPU the surface-area heuristic is the better tree.
-        bvh = wp.Bvh(lowers, uppers, constructor="lbvh" if target.is_cuda else "sah", leaf_size=1)
-        occluders.tree.bvh = bvh.id
-        number = np.bincount(fates.numpy()[:traceable], minlength=4)
-        report = SceneReport(
-            traced=int(number[TRACED] + number[RAISED]),
-            dropped=int(number[INVISIBLE]),
-            raised_scales=int(number[RAISED]),
-            not_finite=int(number[NOT_FINITE]),
-        )
-        return cls(target, backend, occluders, origin, extent, report, bvh)
+        packed = PackedGaussians.from_cloud(cloud if len(cloud) else NOTHING, response_degree, target)
+        occluders = WideTreeOccluders() if backend == "wide" else WarpTreeOccluders()
+        occluders.gaussians = packed.gaussians
+        occluders.origin = wp.vec3(*packed.origin.tolist())
+        scene = cls(backend, occluders, SceneReport(0, 0, 0), packed, len(cloud))
+        scene._build(build)
+        return scene
+
+    @property
+    def packed(self) -> PackedGaussians:
+        """The Gaussians on the device."""
+        return self._packed
+
+    @property
+    def device(self) -> Any:
+        """Warp device that holds the scene."""
+        return self._packed.device
+
+    @property
+    def origin(self) -> NDArray[np.float32]:
+        """World position that the device's coordinates are relative to [m].
+
+        The middle of the cloud, so that precision does not suffer far from the world's origin.
+        """
+        return self._packed.origin
+
+    @property
+    def extent(self) -> float:
+        """Largest side of the centres' bounding box when the scene was made [m]."""
+        return self._packed.extent
 
     @property
     def has_normals(self) -> bool:
         """Whether the cloud came with normals."""
-        return self.occluders.gaussians.normals.shape[0] > 0
+        normals = self.occluders.gaussians.normals
+        return normals is not None and len(normals) > 0
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians, those that are not traced included."""
+        return self._count
+
+    def move(
+        self,
+        positions: Any,
+        orientations: Any,
+        scales: Any,
+        *,
+        tree: Literal["refit", "fast", "quality"] = "refit",
+    ) -> None:
+        """Move the scene's Gaussians, in place; opacities stay.
+
+        Args:
+            positions: World positions [m], ``(N, 3)`` float32, NumPy or a warp array of vec3 on the scene's device.
+            orientations: Quaternions xyzw, ``(N, 4)``, NumPy or a warp array of quat.
+            scales: Standard deviations [m], ``(N, 3)``, NumPy or a warp array of vec3.
+            tree: ``"refit"`` keeps the hierarchy and gives it new boxes: fastest, and exact, but slower to trace the
+                farther neighbours drift apart. The others build it anew.
+
+        Rows that are not finite are left out, counted in ``report``; a row can come back with the next move, but a
+        refit does not bring back what was left out when the tree was built.
+
+        Raises:
+            InvalidArrayError: A shape or type breaks the contract above.
+        """
+        require_choice("tree", tree, ("refit", *BUILDS))
+        arrays = [
+            _device_rows(name, value, size, dtype, len(self), self.device)
+            for name, value, size, dtype in (
+                ("positions", positions, 3, wp.vec3),
+                ("orientations", orientations, 4, wp.quat),
+                ("scales", scales, 3, wp.vec3),
+            )
+        ]
+        self._packed.place(*arrays)
+        if tree != "refit":
+            self._build(tree)
+        elif self.backend == "warp":
+            self._tree.refit()
+        else:
+            refit(self._tree, self._packed)
+
+    def _build(self, build: Build) -> None:
+        """Build the hierarchy over the packed bounds, and report."""
+        packed = self._packed
+        number = np.bincount(packed.fates.numpy()[: len(self)], minlength=4)
+        traced = int(number[TRACED] + number[RAISED])
+        depth, method = 0, WARP_BUILDS[build]
+        if self.backend == "wide":
+            self._tree = build_wide_tree(packed, traced, build)
+            self.occluders.tree = self._tree.tree
+            depth, method = len(self._tree.levels), self._tree.method
+        else:
+            if not packed.device.is_cuda:
+                method = "sah"
+            self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
+            self.occluders.tree.bvh = self._tree.id
+        self.report = SceneReport(
+            traced, int(number[INVISIBLE]), int(number[RAISED]), int(number[NOT_FINITE]), depth, method
+        )
+
+
+def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
+    """Return rows on the device; arrays that are there already pass through unread."""
+    if isinstance(value, wp.array):
+        if value.dtype is not dtype or value.ndim != 1 or value.device != device:
+            raise InvalidArrayError(
+                f"{name} must be a one-dimensional warp array of {dtype.__name__} on {device}, got dtype "
+                f"{value.dtype.__name__}, {value.ndim} dimensions, on {value.device}. Convert it or pass NumPy."
+            )
+        rows = value
+    else:
+        rows = upload(require_array(name, value, (None, size)), dtype, device)
+    require_same_length(name, rows, "the scene", count)
+    return rows

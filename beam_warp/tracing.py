@@ -13,7 +13,7 @@ from beam_warp.checks import require_array, require_choice, require_count, requi
 from beam_warp.devices import download_like, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.constants import LARGEST_FLOAT, TRANSMITTANCE_STOP
-from beam_warp.kernels.trace import launch_trace_visibility
+from beam_warp.kernels.trace import Rays, launch_trace_rays
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.scene import Scene
 
@@ -102,17 +102,19 @@ def visibility(
 
     Source: BEAM Eq. 7; Moenne-Loccoz et al. 2024 (3DGRT) for the response and its cap.
     """
-    starts = upload_vectors("origins", origins, scene.device)
-    ways = upload_vectors("directions", directions, scene.device, unit_length=True)
-    require_same_length("directions", ways, "origins", len(starts))
-    reaches = _reaches(t_max, len(starts), scene.device)
-    require_count("seed", seed, 0, 2**32 - 1)
-    result = wp.empty(len(starts), dtype=float, device=scene.device)
-    launch_trace_visibility(scene.occluders, options.settings(scene), starts, ways, reaches, seed, result, scene.device)
+    rays = Rays()
+    rays.origins = upload_vectors("origins", origins, scene.device)
+    rays.directions = upload_vectors("directions", directions, scene.device, unit_length=True)
+    require_same_length("directions", rays.directions, "origins", len(rays.origins))
+    rays.reaches = ray_reaches(t_max, len(rays.origins), scene.device)
+    rays.base = scene.occluders.origin
+    rays.stream = require_count("seed", seed, 0, 2**32 - 1)
+    result = wp.empty(len(rays.origins), dtype=float, device=scene.device)
+    launch_trace_rays(scene.occluders, options.settings(scene), rays, result, scene.device)
     return download_like(result, origins, directions)
 
 
-def _reaches(t_max: Any, count: int, device: Any) -> wp.array:
+def ray_reaches(t_max: Any, count: int, device: Any) -> wp.array:
     """Return ``t_max`` on the device, one number or one a ray; infinity becomes the largest float."""
     if isinstance(t_max, wp.array):
         require_same_length("t_max", t_max, "origins", count)

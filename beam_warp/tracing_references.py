@@ -95,7 +95,7 @@ def find_references(
         cloud: Gaussians; their normals are used if they have some.
         environment: Light of the irradiance.
         plan: Offsets, rays of the references, number of points.
-        scene: The same Gaussians, in the tree that references come from.
+        scene: The same Gaussians, uploaded; references are traced with its tree.
         file: Where references are kept; None keeps none.
         seconds: Fewer points are taken where the planned number would take longer; at least one block.
         progress: Called with (stage, done, total).

@@ -29,6 +29,7 @@ def pack_gaussians_kernel(
     out_lower: wp.array[wp.vec3],
     out_upper: wp.array[wp.vec3],
     out_fate: wp.array[int],
+    out_takes_part: wp.array[int],
 ):
     """Pack one Gaussian; what cannot be traced gets radius -1 and a point for bounds, and ``out_fate`` says why."""
     i = first + wp.tid()
@@ -82,6 +83,7 @@ def pack_gaussians_kernel(
     out_lower[i] = center - half
     out_upper[i] = center + half
     out_fate[i] = fate
+    out_takes_part[i] = wp.where(fate == TRACED or fate == RAISED, 1, 0)
 
 
 def launch_pack_gaussians(
@@ -96,6 +98,7 @@ def launch_pack_gaussians(
     lower,
     upper,
     fates,
+    takes_part,
     device,
 ):
     """Pack every Gaussian and its bounds; ``positions`` are world space, the outputs relative to ``origin``."""
@@ -103,6 +106,6 @@ def launch_pack_gaussians(
         pack_gaussians_kernel,
         len(positions),
         inputs=[positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio],
-        outputs=[gaussians, lower, upper, fates],
+        outputs=[gaussians, lower, upper, fates, takes_part],
         device=device,
     )

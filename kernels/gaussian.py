@@ -52,7 +52,7 @@ class RayPeak:
 
     alpha: float  # 0 outside the support
     t: float  # of the largest response on the ray's line
-    half_chord: float  # the line is inside the support for t - half_chord to t + half_chord
+    half_chord_squared: float  # the line is inside the support for half a chord before and behind t
 
 
 @wp.func
@@ -78,5 +78,5 @@ def ray_peak(gaussians: Gaussians, index: int, origin: wp.vec3, direction: wp.ve
     if cc < radius_squared * dd:
         distance_squared = cc / dd
         peak.alpha = wp.min(ALPHA_MAX, packed[3] * response(gaussians.degree, distance_squared))
-        peak.half_chord = wp.sqrt((radius_squared - distance_squared) / dd)
+        peak.half_chord_squared = (radius_squared - distance_squared) / dd
     return peak

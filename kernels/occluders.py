@@ -12,6 +12,8 @@ from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.surface_layer import SurfaceLayer, add_to_layer, height_and_thickness
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.kernels.warp_tree import WarpTree, warp_tree_sampled_hit, warp_tree_transmittance
+from beam_warp.kernels.wide_traversal import wide_tree_layer, wide_tree_sampled_hit, wide_tree_transmittance
+from beam_warp.kernels.wide_tree import WideTree
 
 
 @wp.struct
@@ -21,6 +23,15 @@ class WarpTreeOccluders:
     tree: WarpTree
     gaussians: Gaussians
     origin: wp.vec3  # world position that everything here is relative to
+
+
+@wp.struct
+class WideTreeOccluders:
+    """Gaussians under the own hierarchy."""
+
+    tree: WideTree
+    gaussians: Gaussians
+    origin: wp.vec3
 
 
 @wp.func
@@ -37,6 +48,19 @@ def tree_transmittance(
 
 
 @wp.func
+def tree_transmittance(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    stream: wp.uint32,
+) -> float:
+    return wide_tree_transmittance(tree, gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
 def tree_sampled_hit(
     tree: WarpTree,
     gaussians: Gaussians,
@@ -50,6 +74,19 @@ def tree_sampled_hit(
 
 
 @wp.func
+def tree_sampled_hit(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    stream: wp.uint32,
+) -> int:
+    return wide_tree_sampled_hit(tree, gaussians, settings, origin, direction, t_max, stream)
+
+
+@wp.func
 def tree_layer(tree: WarpTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
     layer = SurfaceLayer()
     query = wp.bvh_query_aabb(tree.bvh, p, p)
@@ -57,6 +94,11 @@ def tree_layer(tree: WarpTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> 
     while wp.bvh_query_next(query, index):
         layer = add_to_layer(layer, gaussians, index, p, n)
     return layer
+
+
+@wp.func
+def tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:  # noqa: F811
+    return wide_tree_layer(tree, gaussians, p, n)
 
 
 @wp.func

@@ -1,42 +1,155 @@
-"""Visibility of given rays: one ray a thread."""
+"""Visibility of given rays, the fast way: each thread works through several rays in one loop.
+
+A warp is done when its slowest lane is. Rays differ widely in work, so a lane that has finished its ray takes its next
+one at once, in the same loop as the traversal of others, instead of waiting for them (Aila and Laine 2009, with a fixed
+share of rays for each lane). Measured on an H200: 1.3 times the rate of one ray a thread; on a CPU core 1.2 times.
+"""
 
 from typing import Any
 
 import warp as wp
 
+from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.launching import launch
-from beam_warp.kernels.occluders import transmittance
-from beam_warp.kernels.sampling import stream_of
+from beam_warp.kernels.occluders import WideTreeOccluders, transmittance
+from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.trace_settings import TraceSettings
+from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
+RAYS_A_THREAD = 8
+"""Measured on an H200 among 1, 8, 16, 32 and 50; 8 and 16 are equal, more leaves lanes idle at the end."""
+
+THREADS_TO_FILL = 1 << 17
+"""Fewer threads than this do not fill a large GPU; small batches get fewer rays a thread."""
+
+
+@wp.struct
+class Rays:
+    """A batch of rays.
+
+    ``reaches`` holds one number, or one for each ray. Bernoulli acceptance draws from (``stream``, ray, Gaussian).
+    """
+
+    origins: wp.array[wp.vec3]
+    directions: wp.array[wp.vec3]
+    reaches: wp.array[float]
+    base: wp.vec3  # subtracted from the origins
+    stream: wp.uint32
+
 
 @wp.kernel
-def trace_visibility_kernel(
+def trace_rays_kernel(first: int, occluders: Any, settings: TraceSettings, rays: Rays, out_visibility: wp.array[float]):
+    """One ray a thread, through any occluders: the readable form."""
+    i = first + wp.tid()
+    t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
+    out_visibility[i] = transmittance(
+        occluders,
+        settings,
+        rays.origins[i] - rays.base,
+        rays.directions[i],
+        t_max,
+        hash_combine(rays.stream, wp.uint32(i)),
+    )
+
+
+@wp.kernel
+def trace_rays_wide_kernel(
     first: int,
-    occluders: Any,
+    tree: WideTree,
+    gaussians: Gaussians,
     settings: TraceSettings,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    reaches: wp.array[float],
-    seed: wp.uint32,
+    rays: Rays,
+    lanes: int,
+    share: int,
     out_visibility: wp.array[float],
 ):
-    """``reaches`` holds one number, or one for each ray."""
-    i = first + wp.tid()
-    t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
-    stream = stream_of(seed, wp.uint32(0), wp.uint32(i))
-    out_visibility[i] = transmittance(occluders, settings, origins[i] - occluders.origin, directions[i], t_max, stream)
+    """``share`` rays a thread; neighbouring lanes, ``lanes`` of them, take neighbouring rays."""
+    thread = first + wp.tid()
+    count = rays.origins.shape[0]
+    ray = (thread / lanes) * lanes * share + thread % lanes
+    end = wp.min(ray + lanes * share, count)
+    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    depth = int(0)
+    first_node = int(0)
+    inner = int(0)
+    origin = wp.vec3()
+    direction = wp.vec3()
+    inverse = wp.vec3()
+    t_max = float(0.0)
+    v = float(1.0)
+    ray -= lanes
+    working = int(1)
+    while working == 1:
+        if inner == 0:
+            if depth > 0:
+                depth -= 1
+                first_node = stack[depth] >> 4
+                inner = stack[depth] & 15
+            else:
+                ray += lanes
+                if ray < end:
+                    origin = rays.origins[ray] - rays.base
+                    direction = rays.directions[ray]
+                    inverse = reciprocal(direction)
+                    t_max = rays.reaches[wp.min(ray, rays.reaches.shape[0] - 1)]
+                    v = 1.0
+                    first_node = 0
+                    inner = 1
+                else:
+                    working = 0
+        if working == 1:
+            node = first_node + lowest_bit(inner)
+            inner = inner & (inner - 1)
+            if inner != 0:
+                stack[depth] = (first_node << 4) | inner
+                depth += 1
+            hits = meet_node(tree, node, origin, inverse, t_max)
+            first_node = hits.first_node
+            inner = hits.inner
+            leaf = hits.leaf
+            while leaf != 0:
+                peak = meet_leaf(
+                    tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max
+                )
+                leaf = leaf & (leaf - 1)
+                if peak.alpha > 0.0:
+                    if settings.bernoulli == 1:
+                        stream = hash_combine(rays.stream, wp.uint32(ray))
+                        if unit_float(hash_combine(stream, wp.uint32(peak.index))) < peak.alpha:
+                            v = 0.0
+                    else:
+                        v *= 1.0 - peak.alpha
+                    if v < settings.stop or v == 0.0:
+                        leaf = 0
+                        inner = 0
+                        depth = 0
+            if inner == 0 and depth == 0:
+                out_visibility[ray] = v
 
 
-def launch_trace_visibility(occluders, settings, origins, directions, reaches, seed, out_visibility, device):
-    """Trace one ray a thread."""
+def launch_trace_rays(occluders, settings, rays, out_visibility, device):
+    """Trace a batch of rays."""
+    count = len(rays.origins)
+    if not isinstance(occluders, WideTreeOccluders.cls):
+        launch(
+            trace_rays_kernel,
+            count,
+            inputs=[occluders, settings, rays],
+            outputs=[out_visibility],
+            device=device,
+            block_dim=64,  # divergent rays: small blocks
+        )
+        return
+    cuda = wp.get_device(device).is_cuda
+    lanes = 32 if cuda else 1
+    share = min(RAYS_A_THREAD, max(count // THREADS_TO_FILL, 1)) if cuda else RAYS_A_THREAD
     launch(
-        trace_visibility_kernel,
-        len(origins),
-        inputs=[occluders, settings, origins, directions, reaches, wp.uint32(seed)],
+        trace_rays_wide_kernel,
+        -(-count // (lanes * share)) * lanes,
+        inputs=[occluders.tree, occluders.gaussians, settings, rays, lanes, share],
         outputs=[out_visibility],
         device=device,
-        block_dim=64,  # measured best on an H200: divergent rays, small blocks
+        block_dim=64,
     )

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from beam_warp.kernels.constants import ALPHA_MIN
 from beam_warp.kernels.gaussian import Gaussians, RayPeak
 
 
@@ -23,8 +22,8 @@ def counts(
     """Whether a Gaussian acts on a ray. The peak lies before ``t_max`` and, by rule, it or the entry in front."""
     start = peak.t
     if settings.entry_in_front == 1:
-        start -= peak.half_chord
-    result = peak.alpha >= ALPHA_MIN and start > 0.0 and peak.t < t_max
+        start -= wp.sqrt(peak.half_chord_squared)
+    result = peak.alpha > 0.0 and start > 0.0 and peak.t < t_max
     if result and settings.cull == 1:
         result = wp.dot(gaussians.normals[index], direction) <= 0.0
     return result

@@ -9,6 +9,7 @@ from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.kernels import launching
 from beam_warp.reference import visibility_reference
+from beam_warp.tracing import TraceOptions
 
 # V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
 # distance over smallest scale (about 1e3 here), on alphas whose slope in the response is at most 1.
@@ -187,6 +188,18 @@ class TestScene:
         assert visibility(Scene.from_gaussians(cloud, device), *rays) == pytest.approx(
             visibility_reference(cloud, *rays), abs=1e-4
         )
+
+    @pytest.mark.parametrize("count", [0, 1, 7])
+    @pytest.mark.parametrize("backend", ["wide", "warp"])
+    def test_length_is_the_number_of_gaussians(self, device, rng, count, backend):
+        scene = Scene.from_gaussians(random_cloud(rng, 7).select(np.arange(count)), device, backend=backend)
+        assert len(scene) == count
+        assert scene.report.traced + scene.report.dropped + scene.report.not_finite == count
+
+    def test_culling_needs_normals(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 5), device)
+        with pytest.raises(InvalidOptionError, match="cull must be False for a scene without normals, got True"):
+            visibility(scene, *along_x(), options=TraceOptions(cull=True))
 
     def test_no_rays(self, device, rng):
         scene = Scene.from_gaussians(random_cloud(rng, 5), device)
