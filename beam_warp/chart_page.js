@@ -49,7 +49,7 @@ function frontierOf(rows, metric) {
   for (const row of sorted) {
     const last = kept[kept.length - 1];
     const error = row.errors[metric.name][0];
-    if (!last || error < last.errors[metric.name][0]) kept.push(row);
+    if (!last || error < (1 - data.tolerance) * last.errors[metric.name][0]) kept.push(row);
   }
   return kept;
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from beam_warp.chart_image import require_package
-from beam_warp.charts import Interval, Table
+from beam_warp.charts import TOLERANCE, Interval, Table
 from beam_warp.converters.staging import staged_outputs
 
 STYLE = """
@@ -66,4 +66,4 @@ def _data(table: Table) -> dict[str, Any]:
         }
         for row in table.rows
     ]
-    return {"subject": asdict(table.subject), "rows": rows}
+    return {"subject": asdict(table.subject), "rows": rows, "tolerance": TOLERANCE}

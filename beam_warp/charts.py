@@ -31,6 +31,9 @@ Settings = Mapping[str, Level]
 FORMAT = "beam-chart 1"
 """First words of a table's file; the number changes with the layout."""
 
+TOLERANCE = 0.02
+"""Errors nearer to each other than this part count as equal on a frontier; their intervals are wider by far."""
+
 CONFIDENCE = 0.95
 RESAMPLES = 1000
 
@@ -216,7 +219,8 @@ class Table:
         rows = [row for row in self.rows_of(metric) if not self.is_apart(row, metric)]
         if not rows or metric.by:
             return []
-        kept = pareto_frontier([row.cost.value for row in rows], [row.errors[metric.name].value for row in rows])
+        costs, errors = [row.cost.value for row in rows], [row.errors[metric.name].value for row in rows]
+        kept = pareto_frontier(costs, errors, TOLERANCE)
         return [rows[index] for index in kept]
 
     def is_apart(self, row: Row, metric: Metric) -> bool:
@@ -228,16 +232,18 @@ class Table:
         return [row for row in self.rows if metric.name in row.errors]
 
 
-def pareto_frontier(costs: ArrayLike, errors: ArrayLike) -> NDArray[np.int64]:
+def pareto_frontier(costs: ArrayLike, errors: ArrayLike, tolerance: float = 0.0) -> NDArray[np.int64]:
     """Return the indices of the pairs that no other pair beats, cheapest first.
 
-    One pair beats another if it is at most as large in both and smaller in one; equal pairs beat each other never.
+    One pair beats another if it is at most as large in both and smaller in one; equal pairs beat each other never. With
+    a tolerance, what costs more must bring an error that is smaller by more than this part of it.
     """
     cost, error = np.asarray(costs, np.float64), np.asarray(errors, np.float64)
     kept: list[int] = []
     for index in np.lexsort((error, cost)):
         last = kept[-1] if kept else None
-        if last is None or error[index] < error[last] or (error[index] == error[last] and cost[index] == cost[last]):
+        same = last is not None and error[index] == error[last] and cost[index] == cost[last]
+        if last is None or same or error[index] < (1.0 - tolerance) * error[last]:
             kept.append(int(index))
     return np.array(kept, np.int64)
 

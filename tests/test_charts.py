@@ -89,6 +89,14 @@ class TestFrontier:
         assert set(kept.tolist()) == expected
         assert [pairs[k] for k in kept] == sorted(pairs[k] for k in kept)
 
+    @given(st.lists(st.tuples(st.integers(0, 6), st.integers(1, 6)), max_size=30), st.floats(0.0, 0.5))
+    def test_with_a_tolerance_leaves_out_what_brings_little(self, pairs, tolerance):
+        kept = [pairs[k] for k in pareto_frontier([p[0] for p in pairs], [p[1] for p in pairs], tolerance)]
+        whole = [pairs[k] for k in pareto_frontier([p[0] for p in pairs], [p[1] for p in pairs])]
+        assert set(kept) <= set(whole)
+        for cost, error in whole:
+            assert any(other[0] <= cost and (1.0 - tolerance) * other[1] <= error for other in kept)
+
     def test_of_a_table_is_among_rows_with_one_truth(self):
         frontier = TABLE.frontier(SUBJECT.metrics[0])
         assert [(row.settings["steps"], row.settings["method"]) for row in frontier] == [

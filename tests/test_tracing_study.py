@@ -156,7 +156,7 @@ def test_error_is_the_estimators_own(device):
         ratios=("ratio",),
         rays=(16,),
         points=32,
-        reference_rays=16384,
+        reference_rays=4096,
         repeats=2,
     )
     cloud = still_life(800)
