@@ -23,6 +23,12 @@ WIDTH = 12.0
 RESOLUTION = 130
 NUMBER_SIZE = 9.0
 
+LEGEND_ROW = 0.048
+"""Height of a row of the legend, in heights of the axes."""
+
+HIDDEN_ABOVE = 10.0
+"""Errors above this many times the largest of the frontier are cut off, and counted: they would squeeze the rest."""
+
 
 def require_package(name: str) -> Any:
     """Import a drawing package.
@@ -99,7 +105,7 @@ def write_image(table: Table, path: Path) -> None:
     notes = note_lines(table, curves + effects)
     heights = [
         0.75,
-        5.2 if curves else 0.0,
+        6.0 if curves else 0.0,
         list_height if curves else 0.0,
         2.0 if effects else 0.0,
         0.3 + 0.185 * len(notes),
@@ -133,7 +139,7 @@ def write_image(table: Table, path: Path) -> None:
         va="center",
     )
     for column, metric in enumerate(curves):
-        axes = figure.add_axes(place(1, column, len(curves), (0.75, 0.15, 0.55, 0.3)))  # type: ignore[arg-type]
+        axes = figure.add_axes(place(1, column, len(curves), (0.75, 0.15, 0.55, 1.25)))  # type: ignore[arg-type]
         draw_curves(axes, table, metric)
         listing = figure.add_axes(place(2, column, len(curves), (0.2, 0.1, 0.0, 0.25)))  # type: ignore[arg-type]
         draw_frontier_list(listing, table, metric, longest)
@@ -208,10 +214,16 @@ def draw_curves(axes: Any, table: Table, metric: Metric) -> None:
             color=GREY,
         )
     lost = len(table.rows_of(metric)) - len(rows)
-    without = f"   ({lost} settings without error are not drawn)" if lost else ""
-    axes.set_xlabel(with_unit(subject.cost, subject.cost_unit) + without, fontsize=10)
+    remarks = [f"{lost} settings without error are not drawn"] if lost else []
+    worst = max((row.errors[metric.name].value for row in table.frontier(metric)), default=math.inf)
+    above = sum(row.errors[metric.name].value > HIDDEN_ABOVE * worst for row in rows)
+    if above and worst > 0.0:
+        axes.set_ylim(top=HIDDEN_ABOVE * worst)
+        remarks.append(f"{above} settings with larger errors lie above")
+    remark = f"   ({'; '.join(remarks)})" if remarks else ""
+    axes.set_xlabel(with_unit(subject.cost, subject.cost_unit) + remark, fontsize=10)
     axes.set_ylabel(with_unit(metric.title, metric.unit), fontsize=10)
-    axes.set_title(metric.title, fontsize=11, loc="left", fontweight="bold")
+    axes.set_title(metric.title, fontsize=11.5, loc="left", fontweight="bold", y=1.0 + 4.4 * LEGEND_ROW)
     axes.tick_params(labelsize=9)
     axes.grid(True, which="major", color="#dddddd", linewidth=0.7)
     axes.grid(True, which="minor", color="#f0f0f0", linewidth=0.5)
@@ -253,30 +265,46 @@ def draw_frontier(axes: Any, table: Table, metric: Metric) -> None:
 
 
 def draw_legend(axes: Any, table: Table, metric: Metric, colors: Any, markers: Any, strokes: Any) -> None:
-    """Say what colours, markers and lines mean, and what the frontier looks like."""
+    """Say over the axes what colours, markers and lines mean, one row each, and what the frontier looks like."""
+    from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
-    subject, handles = table.subject, []
-    for name, meaning in ((metric.color, colors), (metric.marker, markers), (metric.line, strokes)):
+    subject = table.subject
+    rows = [[Line2D([], [], label="Pareto frontier", color=GOLD, linewidth=6.0, alpha=0.6, solid_capstyle="butt")]]
+    if any(table.is_apart(row, metric) for row in table.rows_of(metric)):
+        text = f"faint: other levels of {subject.axis(metric.apart).title}, with truths of their own"
+        rows[0].append(Line2D([], [], color=next(iter(colors.values())), alpha=0.3, marker="o", label=text))
+    for name, meaning in ((metric.line, strokes), (metric.marker, markers), (metric.color, colors)):
         if not name or len(meaning) < 2:
             continue
         axis = subject.axis(name)
-        handles.append(Line2D([], [], linewidth=0, label=f"{axis.title}:"))
+        row = [Line2D([], [], linewidth=0, label=f"{axis.title}:")]
         for level, value in meaning.items():
             if meaning is colors:
-                style = {"color": value, "linewidth": 3.0, "solid_capstyle": "butt"}
+                line = Line2D([], [], color=value, linewidth=3.0, solid_capstyle="butt")
             elif meaning is markers:
-                style = {"color": GREY, "marker": value, "linewidth": 0}
+                line = Line2D([], [], color=GREY, marker=value, linewidth=0)
             else:
-                style = {"color": GREY, "linestyle": value}
-            handles.append(Line2D([], [], label=axis.label(level), **style))
-    step = {"color": GOLD, "linewidth": 6.0, "alpha": 0.6, "solid_capstyle": "butt"}
-    handles.append(Line2D([], [], label="Pareto frontier", **step))
-    if any(table.is_apart(row, metric) for row in table.rows_of(metric)):
-        title = subject.axis(metric.apart).title.lower()
-        handles.append(Line2D([], [], color=colors[next(iter(colors))], alpha=0.3, label=f"faint: other {title}s"))
-    # Curves fall from upper left to lower right, and nothing lies below the frontier
-    axes.legend(handles=handles, fontsize=8.5, loc="lower left", framealpha=0.9, labelspacing=0.25, borderpad=0.4)
+                line = Line2D([], [], color=GREY, linestyle=value)
+            line.set_label(axis.label(level))
+            row.append(line)
+        rows.append(row)
+    for number, row in enumerate(rows):
+        # A row above the other; the first entry of a row is its title, and needs no handle
+        legend = Legend(
+            axes,
+            row,
+            [line.get_label() for line in row],
+            loc="lower left",
+            bbox_to_anchor=(-0.02, 1.0 + LEGEND_ROW * number),
+            ncols=len(row),
+            fontsize=8.8,
+            frameon=False,
+            borderpad=0.0,
+            columnspacing=1.2,
+            handlelength=1.8,
+        )
+        axes.add_artist(legend)
 
 
 def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) -> None:
@@ -303,7 +331,7 @@ def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) ->
         ]
         for number, row in enumerate(frontier, start=1)
     ]
-    widths = [max(map(len, column)) + 2 for column in zip(header, *lines, strict=True)]
+    widths = [max(map(len, column)) + 2.5 for column in zip(header, *lines, strict=True)]
     place = 0.0
     numeric = {0, len(header) - 2, len(header) - 1}
     for index, (title, width) in enumerate(zip(header, widths, strict=True)):
@@ -315,7 +343,7 @@ def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) ->
                 x,
                 row,
                 text,
-                fontsize=9,
+                fontsize=8.6,
                 ha="right" if right else "left",
                 va="center",
                 color=GREY if row == 0 else "black",

@@ -163,8 +163,8 @@ def _trace_block(
         origins, lift = bare.lifted(offset)
         occlusion.append(ambient_occlusion(scene, origins, normals, offset=lift, **common))
     origins, lift = bare.lifted(plan.offsets[0])
-    # Not as a ratio: its small bias would be in every error
-    arriving = irradiance(scene, origins, normals, light, offset=lift, ratio=False, **common)
+    # The ratio's bias falls with the number of rays, its error with the root: of so many rays it is nothing
+    arriving = irradiance(scene, origins, normals, light, offset=lift, density="mis", ratio=True, **common)
     return References(
         points,
         normals,

@@ -135,7 +135,7 @@ def tracing_axes(plan: TracingPlan) -> tuple[Axis, ...]:
         "offset": plan.offsets,
     }
     return (
-        Axis("rays", "Rays per point", plan.rays, "rays"),
+        Axis("rays", "Rays", plan.rays, "rays", "Rays per point."),
         *(Axis(name, name.capitalize(), levels[name], "", sentences[name]) for name in levels),
     )
 
