@@ -10,11 +10,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
-from beam_warp.checks import require_array, require_choice, require_same_length
+from beam_warp.checks import require_array, require_choice, require_finite, require_range, require_same_length
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
-from beam_warp.kernels.occluders import WarpTreeOccluders, WideTreeOccluders
+from beam_warp.kernels.occluders import OCCLUDERS
 from beam_warp.packed_gaussians import PackedGaussians
 from beam_warp.wide_trees import build_wide_tree, refit
 
@@ -59,11 +59,13 @@ class Scene:
     Attributes:
         backend: Hierarchy that rays traverse.
         occluders: What kernels trace, relative to ``origin``.
+        mesh: Triangles among the Gaussians; None for none.
         report: What was left out or changed.
     """
 
     backend: Backend
     occluders: Any
+    mesh: wp.Mesh | None
     report: SceneReport
     _packed: PackedGaussians = field(repr=False)
     _count: int = field(repr=False)
@@ -78,6 +80,7 @@ class Scene:
         backend: Backend = "wide",
         build: Build = "quality",
         response_degree: Literal[2, 4] = 2,
+        mesh: Any = None,
     ) -> Scene:
         """Upload a cloud and build its hierarchy.
 
@@ -88,9 +91,12 @@ class Scene:
             build: ``"quality"`` for many rays, ``"fast"`` for geometry that changes with every few. With ``wp.Bvh``:
                 the surface-area heuristic, on the host, or LBVH, which only CUDA has.
             response_degree: 2 for Gaussians, 4 for the faster falloff exp(-x^4 / 18) of 3DGRT, if trained with it.
+            mesh: Opaque triangles in the same world, ground or props: anything with ``vertices`` ``(V, 3)`` [m] and
+                ``faces`` ``(F, 3)``, a ``trimesh.Trimesh`` for one.
 
         Raises:
             DeviceError: There is no such device.
+            InvalidArrayError: The mesh's arrays break the contract above.
             InvalidOptionError: An option is none of its choices.
         """
         target = resolve_device(device)
@@ -99,10 +105,14 @@ class Scene:
         if response_degree not in (2, 4):
             raise InvalidOptionError(f"response_degree must be 2 or 4, got {response_degree!r}. Choose one of them.")
         packed = PackedGaussians.from_cloud(cloud if len(cloud) else NOTHING, response_degree, target)
-        occluders = WideTreeOccluders() if backend == "wide" else WarpTreeOccluders()
+        occluders = OCCLUDERS[backend, mesh is not None]()
+        triangles = None
+        if mesh is not None:
+            triangles = _upload_mesh(mesh, packed.origin, target)
+            occluders.mesh.mesh = triangles.id
         occluders.gaussians = packed.gaussians
         occluders.origin = wp.vec3(*packed.origin.tolist())
-        scene = cls(backend, occluders, SceneReport(0, 0, 0), packed, len(cloud))
+        scene = cls(backend, occluders, triangles, SceneReport(0, 0, 0), packed, len(cloud))
         scene._build(build)
         return scene
 
@@ -128,6 +138,11 @@ class Scene:
     def extent(self) -> float:
         """Largest side of the centres' bounding box when the scene was made [m]."""
         return self._packed.extent
+
+    @property
+    def response_degree(self) -> int:
+        """Degree of the Gaussians' response, 2 or 4."""
+        return self.occluders.gaussians.degree
 
     @property
     def has_normals(self) -> bool:
@@ -212,3 +227,16 @@ def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, devic
         rows = upload(require_array(name, value, (None, size)), dtype, device)
     require_same_length(name, rows, "the scene", count)
     return rows
+
+
+def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh:
+    """Return triangles on the device, relative to the scene's origin."""
+    vertices = require_array("mesh.vertices", getattr(mesh, "vertices", None), (None, 3), np.float64)
+    faces = require_array("mesh.faces", getattr(mesh, "faces", None), (None, 3), np.int32)
+    require_finite("mesh.vertices", vertices)
+    if not len(faces):
+        raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")
+    require_range("mesh.faces", faces, 0, len(vertices) - 1, "Index existing vertices.")
+    return wp.Mesh(
+        upload((vertices - origin).astype(np.float32), wp.vec3, device), upload(faces.reshape(-1), int, device)
+    )

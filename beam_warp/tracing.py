@@ -13,7 +13,7 @@ from beam_warp.checks import require_array, require_choice, require_count, requi
 from beam_warp.devices import download_like, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.constants import LARGEST_FLOAT, TRANSMITTANCE_STOP
-from beam_warp.kernels.trace import Rays, launch_trace_rays
+from beam_warp.kernels.trace import Rays, launch_block_rays, launch_trace_rays, launch_trace_rays_wide
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.scene import Scene
 
@@ -110,8 +110,21 @@ def visibility(
     rays.base = scene.occluders.origin
     rays.stream = require_count("seed", seed, 0, 2**32 - 1)
     result = wp.empty(len(rays.origins), dtype=float, device=scene.device)
-    launch_trace_rays(scene.occluders, options.settings(scene), rays, result, scene.device)
+    trace_rays(scene, options, rays, result)
     return download_like(result, origins, directions)
+
+
+def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: wp.array) -> None:
+    """Trace rays that are on the scene's device already, by the fastest way that their rules allow."""
+    settings = options.settings(scene)
+    if scene.backend != "wide" or options.front != "peak" or options.cull or scene.response_degree != 2:
+        launch_trace_rays(scene.occluders, settings, rays, out_visibility, scene.device)
+        return
+    if scene.mesh is not None:
+        reaches = wp.empty(len(rays.origins), dtype=float, device=scene.device)
+        launch_block_rays(scene.occluders.mesh, rays, reaches, scene.device)
+        rays.reaches = reaches
+    launch_trace_rays_wide(scene.occluders.tree, settings, rays, out_visibility, scene.device)
 
 
 def ray_reaches(t_max: Any, count: int, device: Any) -> wp.array:

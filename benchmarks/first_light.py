@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import warp as wp
+from timing import commit
 
 from beam_warp import Scene, ambient_occlusion, converters, visibility
 from beam_warp.axes import change_axes
@@ -31,17 +31,6 @@ from beam_warp.materials import MaterialOptions
 from beam_warp.pipeline import RunOptions, run
 from beam_warp.reference import visibility_reference
 from beam_warp.surfaces import estimate_normals
-
-
-def commit() -> str:
-    """The checkout's commit, or 'unknown' outside one."""
-    try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
-        )
-    except OSError:
-        return "unknown"
-    return found.stdout.strip() or "unknown"
 
 
 def measure_run(path: Path, light: Path, samples: int, device: str | None) -> dict:

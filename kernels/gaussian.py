@@ -3,6 +3,7 @@
 import warp as wp
 
 from beam_warp.kernels.constants import ALPHA_MAX
+from beam_warp.kernels.row_loads import load_row
 
 QUARTIC_FALLOFF = wp.constant(4.5 / 81.0)
 """Response exp(-x^4 / 18) of degree 4: equal to exp(-x^2 / 2) at three standard deviations (3DGRT)."""
@@ -27,9 +28,9 @@ class Gaussians:
 @wp.func
 def whitening_times(gaussians: Gaussians, index: int, v: wp.vec3) -> wp.vec3:
     """M v: world vector to the space of the unit Gaussian."""
-    a = gaussians.whitening_0[index]
-    b = gaussians.whitening_1[index]
-    c = gaussians.whitening_2[index]
+    a = load_row(gaussians.whitening_0, index)
+    b = load_row(gaussians.whitening_1, index)
+    c = load_row(gaussians.whitening_2, index)
     return wp.vec3(
         a[0] * v[0] + a[1] * v[1] + a[2] * v[2],
         b[0] * v[0] + b[1] * v[1] + b[2] * v[2],
@@ -63,7 +64,7 @@ def ray_peak(gaussians: Gaussians, index: int, origin: wp.vec3, direction: wp.ve
     cancellation that ruins the quadratic's discriminant (measured error 0.16 in benign cases) and any affine form
     ``M o + b``. The squared distance is |M p x M d|^2 / |M d|^2 (Moenne-Loccoz et al. 2024).
     """
-    packed = gaussians.center_opacity[index]
+    packed = load_row(gaussians.center_opacity, index)
     p = origin - wp.vec3(packed[0], packed[1], packed[2])
     t_closest = -wp.dot(p, direction)
     p = p + direction * t_closest

@@ -1,4 +1,4 @@
-"""What rays meet, whatever it is made of: Gaussians under either hierarchy.
+"""What rays meet, whatever it is made of: Gaussians under either hierarchy, with or without triangles among them.
 
 Kernels take occluders as ``Any`` and are compiled for the structure that they are given, so that neither backend pays
 for the other's registers and shared memory.
@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.gaussian import Gaussians
+from beam_warp.kernels.mesh_occluder import MeshOccluder, NoMesh, mesh_blocks, nearest_on_mesh
 from beam_warp.kernels.surface_layer import SurfaceLayer, add_to_layer, height_and_thickness
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.kernels.warp_tree import WarpTree, warp_tree_sampled_hit, warp_tree_transmittance
@@ -21,6 +22,7 @@ class WarpTreeOccluders:
     """Gaussians under ``wp.Bvh``."""
 
     tree: WarpTree
+    mesh: NoMesh
     gaussians: Gaussians
     origin: wp.vec3  # world position that everything here is relative to
 
@@ -30,6 +32,27 @@ class WideTreeOccluders:
     """Gaussians under the own hierarchy."""
 
     tree: WideTree
+    mesh: NoMesh
+    gaussians: Gaussians
+    origin: wp.vec3
+
+
+@wp.struct
+class WarpTreeAndMeshOccluders:
+    """Gaussians under ``wp.Bvh``, and triangles."""
+
+    tree: WarpTree
+    mesh: MeshOccluder
+    gaussians: Gaussians
+    origin: wp.vec3
+
+
+@wp.struct
+class WideTreeAndMeshOccluders:
+    """Gaussians under the own hierarchy, and triangles."""
+
+    tree: WideTree
+    mesh: MeshOccluder
     gaussians: Gaussians
     origin: wp.vec3
 
@@ -117,7 +140,10 @@ def transmittance(
         stream: Random stream of the ray; Bernoulli acceptance draws from (stream, Gaussian), so that the result does
             not depend on traversal order.
     """
-    return tree_transmittance(occluders.tree, occluders.gaussians, settings, origin, direction, t_max, stream)
+    v = float(0.0)
+    if not mesh_blocks(occluders.mesh, origin, direction, t_max):
+        v = tree_transmittance(occluders.tree, occluders.gaussians, settings, origin, direction, t_max, stream)
+    return v
 
 
 @wp.func
@@ -127,12 +153,23 @@ def sampled_hit(
     """Index of a Gaussian drawn with probability alpha times the transmittance before it, or -1 for none.
 
     Each Gaussian stops the ray with probability alpha, independently; the nearest that does wins. One unsorted
-    traversal with a shrinking ``t_max`` is enough (Sun et al. 2025). Arguments as `transmittance`.
+    traversal with a shrinking ``t_max`` is enough (Sun et al. 2025). Triangles block: what lies behind one is not
+    hit, and the triangle itself counts as -1. Arguments as `transmittance`.
     """
-    return tree_sampled_hit(occluders.tree, occluders.gaussians, settings, origin, direction, t_max, stream)
+    reach = nearest_on_mesh(occluders.mesh, origin, direction, t_max).t
+    return tree_sampled_hit(occluders.tree, occluders.gaussians, settings, origin, direction, reach, stream)
 
 
 @wp.func
 def surface_layer(occluders: Any, point: wp.vec3, normal: wp.vec3) -> wp.vec2:
     """(height, thickness) [m] along ``normal`` of the layer of Gaussians around a point, relative as above."""
     return height_and_thickness(tree_layer(occluders.tree, occluders.gaussians, point, normal))
+
+
+OCCLUDERS = {
+    ("warp", False): WarpTreeOccluders,
+    ("warp", True): WarpTreeAndMeshOccluders,
+    ("wide", False): WideTreeOccluders,
+    ("wide", True): WideTreeAndMeshOccluders,
+}
+"""Structure for a backend, without and with triangles."""

@@ -9,14 +9,15 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.launching import launch
-from beam_warp.kernels.occluders import WideTreeOccluders, transmittance
+from beam_warp.kernels.mesh_occluder import MeshOccluder, mesh_blocks
+from beam_warp.kernels.occluders import transmittance
 from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.trace_settings import TraceSettings
-from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf_by_default, meet_node, reciprocal
 
-wp.set_module_options({"enable_backward": False})
+# Fast math: divisions and the exponential of a hit within 2 ulp; 9 % more rays a second on an H200.
+wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 RAYS_A_THREAD = 8
 """Measured on an H200 among 1, 8, 16, 32 and 50; 8 and 16 are equal, more leaves lanes idle at the end."""
@@ -40,6 +41,16 @@ class Rays:
 
 
 @wp.kernel
+def block_rays_kernel(first: int, mesh: MeshOccluder, rays: Rays, out_reaches: wp.array[float]):
+    """Reach of each ray, -1 if a triangle lies before it."""
+    i = first + wp.tid()
+    t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
+    if mesh_blocks(mesh, rays.origins[i] - rays.base, rays.directions[i], t_max):
+        t_max = -1.0
+    out_reaches[i] = t_max
+
+
+@wp.kernel
 def trace_rays_kernel(first: int, occluders: Any, settings: TraceSettings, rays: Rays, out_visibility: wp.array[float]):
     """One ray a thread, through any occluders: the readable form."""
     i = first + wp.tid()
@@ -58,19 +69,21 @@ def trace_rays_kernel(first: int, occluders: Any, settings: TraceSettings, rays:
 def trace_rays_wide_kernel(
     first: int,
     tree: WideTree,
-    gaussians: Gaussians,
     settings: TraceSettings,
     rays: Rays,
     lanes: int,
     share: int,
     out_visibility: wp.array[float],
 ):
-    """``share`` rays a thread; neighbouring lanes, ``lanes`` of them, take neighbouring rays."""
+    """``share`` rays a thread, by the default rules; neighbouring lanes, ``lanes`` of them, take neighbouring rays.
+
+    A negative reach is a ray that is blocked already.
+    """
     thread = first + wp.tid()
     count = rays.origins.shape[0]
     ray = (thread / lanes) * lanes * share + thread % lanes
     end = wp.min(ray + lanes * share, count)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(0)
@@ -94,7 +107,7 @@ def trace_rays_wide_kernel(
                     direction = rays.directions[ray]
                     inverse = reciprocal(direction)
                     t_max = rays.reaches[wp.min(ray, rays.reaches.shape[0] - 1)]
-                    v = 1.0
+                    v = wp.where(t_max < 0.0, 0.0, 1.0)
                     first_node = 0
                     inner = 1
                 else:
@@ -105,22 +118,20 @@ def trace_rays_wide_kernel(
             if inner != 0:
                 stack[depth] = (first_node << 4) | inner
                 depth += 1
-            hits = meet_node(tree, node, origin, inverse, t_max)
+            hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
             first_node = hits.first_node
             inner = hits.inner
             leaf = hits.leaf
             while leaf != 0:
-                peak = meet_leaf(
-                    tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max
-                )
+                met = meet_leaf_by_default(tree, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
                 leaf = leaf & (leaf - 1)
-                if peak.alpha > 0.0:
+                if met.alpha > 0.0:
                     if settings.bernoulli == 1:
                         stream = hash_combine(rays.stream, wp.uint32(ray))
-                        if unit_float(hash_combine(stream, wp.uint32(peak.index))) < peak.alpha:
+                        if unit_float(hash_combine(stream, wp.uint32(met.index))) < met.alpha:
                             v = 0.0
                     else:
-                        v *= 1.0 - peak.alpha
+                        v *= 1.0 - met.alpha
                     if v < settings.stop or v == 0.0:
                         leaf = 0
                         inner = 0
@@ -129,26 +140,35 @@ def trace_rays_wide_kernel(
                 out_visibility[ray] = v
 
 
+def launch_block_rays(mesh, rays, out_reaches, device):
+    """Find which rays triangles block."""
+    launch(
+        block_rays_kernel, len(rays.origins), inputs=[mesh, rays], outputs=[out_reaches], device=device, block_dim=64
+    )
+
+
 def launch_trace_rays(occluders, settings, rays, out_visibility, device):
-    """Trace a batch of rays."""
+    """Trace a batch of rays through any occluders, one a thread."""
+    launch(
+        trace_rays_kernel,
+        len(rays.origins),
+        inputs=[occluders, settings, rays],
+        outputs=[out_visibility],
+        device=device,
+        block_dim=64,  # divergent rays: small blocks
+    )
+
+
+def launch_trace_rays_wide(tree, settings, rays, out_visibility, device):
+    """Trace a batch of rays through a wide tree by the default rules."""
     count = len(rays.origins)
-    if not isinstance(occluders, WideTreeOccluders.cls):
-        launch(
-            trace_rays_kernel,
-            count,
-            inputs=[occluders, settings, rays],
-            outputs=[out_visibility],
-            device=device,
-            block_dim=64,  # divergent rays: small blocks
-        )
-        return
     cuda = wp.get_device(device).is_cuda
     lanes = 32 if cuda else 1
     share = min(RAYS_A_THREAD, max(count // THREADS_TO_FILL, 1)) if cuda else RAYS_A_THREAD
     launch(
         trace_rays_wide_kernel,
         -(-count // (lanes * share)) * lanes,
-        inputs=[occluders.tree, occluders.gaussians, settings, rays, lanes, share],
+        inputs=[tree, settings, rays, lanes, share],
         outputs=[out_visibility],
         device=device,
         block_dim=64,

@@ -25,6 +25,17 @@ class WideLayout:
     upper: wp.array[wp.vec3]
 
 
+@wp.func
+def widest_axis(lower: wp.vec3, upper: wp.vec3) -> int:
+    e = upper - lower
+    axis = int(0)
+    if e[1] > e[0]:
+        axis = 1
+    if e[2] > e[axis]:
+        axis = 2
+    return axis
+
+
 @wp.kernel
 def open_children_kernel(
     first: int,
@@ -59,6 +70,15 @@ def open_children_kernel(
             found[which] = tree.left[node]
             found[count] = tree.right[node]
             count += 1
+    if by_area == 1:  # in ascending order along the widest axis; codes are in order anyway
+        axis = widest_axis(tree.lower[queue[i]], tree.upper[queue[i]])
+        for last in range(count - 1):
+            for k in range(count - 1 - last):
+                a = found[k]
+                b = found[k + 1]
+                if tree.lower[a][axis] + tree.upper[a][axis] > tree.lower[b][axis] + tree.upper[b][axis]:
+                    found[k] = b
+                    found[k + 1] = a
     ordered = wp.vec4i(-1, -1, -1, -1)
     inner = int(0)
     for k in range(count):
@@ -172,12 +192,14 @@ def bound_nodes_kernel(
             high = wp.ceil((child_upper[axis] - lower[axis]) / step[axis] + 0.001)
             low_words[axis] = low_words[axis] | (int(wp.clamp(low, 0.0, 255.0)) << (8 * k))
             high_words[axis] = high_words[axis] | (int(wp.clamp(high, 0.0, 255.0)) << (8 * k))
+    axis = widest_axis(lower, upper)
+    counts = (children[2] << 24) | ((axis & 1) << 27) | (children[3] << 28) | ((axis >> 1) << 31)
     row = node * NODE_ROWS
     out_tree.nodes[row] = wp.vec4i(
         wp.cast(lower[0], int),
         wp.cast(lower[1], int),
         wp.cast(lower[2], int),
-        exponents[0] | (exponents[1] << 8) | (exponents[2] << 16) | (children[2] << 24) | (children[3] << 28),
+        exponents[0] | (exponents[1] << 8) | (exponents[2] << 16) | counts,
     )
     out_tree.nodes[row + 1] = wp.vec4i(children[0], children[1], low_words[0], low_words[1])
     out_tree.nodes[row + 2] = wp.vec4i(low_words[2], high_words[0], high_words[1], high_words[2])

@@ -29,9 +29,10 @@ from beam_warp.kernels.hit_gradients import (
     whitened_closest_point,
 )
 from beam_warp.kernels.launching import launch
+from beam_warp.kernels.mesh_occluder import mesh_blocks
 from beam_warp.kernels.trace_settings import TraceSettings, counts
 from beam_warp.kernels.warp_tree import WarpTree, box_test_direction
-from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,7 +153,7 @@ def tally_hits(  # noqa: F811
 ) -> HitTally:
     """The same, over what `wide_tree_transmittance` visits."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -164,7 +165,7 @@ def tally_hits(  # noqa: F811
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_max)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -197,7 +198,7 @@ def store_hits(  # noqa: F811
 ) -> RayReturn:
     """The same, for the wide tree."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -208,7 +209,7 @@ def store_hits(  # noqa: F811
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_max)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -246,7 +247,8 @@ def count_hits_kernel(
     if adjoints[i] != 0.0:
         t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
         origin = origins[i] - occluders.origin
-        tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max)
+        if not mesh_blocks(occluders.mesh, origin, directions[i], t_max):
+            tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max)
     out_transmittance[i] = tally.transmittance
     out_count[i] = tally.count
 

@@ -10,7 +10,7 @@ from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.surface_layer import SurfaceLayer, add_to_layer
 from beam_warp.kernels.trace_settings import TraceSettings
-from beam_warp.kernels.wide_tree import STACK_SIZE, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,7 +27,7 @@ def wide_tree_transmittance(
 ) -> float:
     """Product of (1 - alpha) in any order, or one Bernoulli sample of it."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -38,7 +38,7 @@ def wide_tree_transmittance(
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_max)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -74,7 +74,7 @@ def wide_tree_sampled_hit(
 ) -> int:
     """The nearest of the Gaussians that each stop the ray with probability alpha, or -1."""
     inverse = reciprocal(direction)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -86,7 +86,7 @@ def wide_tree_sampled_hit(
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, origin, inverse, t_nearest)
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_nearest)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf
@@ -109,7 +109,7 @@ def wide_tree_sampled_hit(
 def wide_tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
     """The layer of Gaussians that contain a point; a ray of no reach meets just the boxes around its origin."""
     inverse = reciprocal(n)
-    stack = wp.zeros(shape=(STACK_SIZE,), dtype=int)
+    stack = Stack()
     depth = int(0)
     first_node = int(0)
     inner = int(1)
@@ -120,7 +120,7 @@ def wide_tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3
         if inner != 0:
             stack[depth] = (first_node << 4) | inner
             depth += 1
-        hits = meet_node(tree, node, p, inverse, 0.0)
+        hits = meet_node(tree, node, p, inverse, 0.0, 0.0)
         first_node = hits.first_node
         inner = hits.inner
         leaf = hits.leaf

@@ -10,23 +10,27 @@ import warp as wp
 
 from beam_warp.kernels.constants import ALPHA_MAX, DIRECTION_FLOOR
 from beam_warp.kernels.gaussian import Gaussians, response
+from beam_warp.kernels.row_loads import load_row, load_words
 from beam_warp.kernels.trace_settings import TraceSettings
 
 NODE_ROWS = wp.constant(3)
 LEAF_ROWS = wp.constant(4)
 LARGEST_DEPTH = 31
-STACK_SIZE = wp.constant(32)
+Stack = wp.types.vector(length=32, dtype=wp.int32)
+"""One entry a level. A vector, because Warp's local arrays carry a header that every access would read."""
 
-FAR_SLACK = wp.constant(1.000001)
-"""Widens the far end of a slab by eight ulp, more than its rounding errors: no box is missed (Ize 2013)."""
+FAR_SLACK = wp.constant(1.000002)
+"""Widens the far end of a slab by 16 ulp, more than its rounding errors, those of fast-math division included: no box
+is missed (Ize 2013)."""
 
 
 @wp.struct
 class WideTree:
     """Nodes and leaves of a hierarchy.
 
-    A node is three rows of four words: corner x, y, z (float bits), and the exponents of the steps in three bytes with
-    the number of inner children and of children in the fourth; first node, first leaf, and lower x and y of the
+    A node is three rows of four words: corner x, y, z (float bits), and the exponents of the steps in three bytes with,
+    in the fourth, from bit 24 three bits of the number of inner children, one of the axis along which they are in
+    order, three of the number of children, and the axis' second bit; first node, first leaf, and lower x and y of the
     children; lower z and upper x, y, z. A leaf is four rows: centre and opacity, row 0 of the whitening and the squared
     support radius, row 1 and the Gaussian's number (int bits), row 2.
     """
@@ -43,6 +47,7 @@ class NodeHits:
     first_leaf: int
     inner: int
     leaf: int
+    axis: int  # along which the inner children are in ascending order, roughly
 
 
 @wp.func_native("""
@@ -55,6 +60,15 @@ class NodeHits:
 def lowest_bit(mask: int) -> int:
     """Number of the lowest set bit; ``mask`` must not be 0."""
     ...
+
+
+@wp.func
+def first_bit(mask: int, backwards: bool) -> int:
+    """Number of the lowest set bit of four, or of the highest."""
+    bit = lowest_bit(mask)
+    if backwards:
+        bit = wp.where(mask >= 8, 3, wp.where(mask >= 4, 2, wp.where(mask >= 2, 1, 0)))
+    return bit
 
 
 @wp.func
@@ -82,9 +96,9 @@ def step_of(exponents: int, axis: int) -> float:
 
 @wp.func
 def boxes_met_one_by_one(
-    row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_max: float
+    row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_min: float, t_max: float
 ) -> int:
-    """Mask of the child boxes that the ray meets between 0 and ``t_max``: the readable form."""
+    """Mask of the child boxes that the ray meets between ``t_min`` and ``t_max``: the readable form."""
     corner_x = (wp.cast(row_0[0], float) - origin[0]) * inverse[0]
     corner_y = (wp.cast(row_0[1], float) - origin[1]) * inverse[1]
     corner_z = (wp.cast(row_0[2], float) - origin[2]) * inverse[2]
@@ -99,7 +113,7 @@ def boxes_met_one_by_one(
         y_1 = byte_of(row_2[2], k) * step_y + corner_y
         z_0 = byte_of(row_2[0], k) * step_z + corner_z
         z_1 = byte_of(row_2[3], k) * step_z + corner_z
-        near = wp.max(wp.max(wp.min(x_0, x_1), wp.min(y_0, y_1)), wp.max(wp.min(z_0, z_1), 0.0))
+        near = wp.max(wp.max(wp.min(x_0, x_1), wp.min(y_0, y_1)), wp.max(wp.min(z_0, z_1), t_min))
         far = wp.min(wp.min(wp.max(x_0, x_1), wp.max(y_0, y_1)), wp.max(z_0, z_1))
         if near <= wp.min(far * FAR_SLACK, t_max):
             mask |= 1 << k
@@ -123,11 +137,11 @@ def boxes_met_one_by_one(
     for (int k = 0; k < 4; ++k) {
         float t_near = fmaxf(
             fmaxf(((near_x >> (8 * k)) & 255) * step_x + corner_x, ((near_y >> (8 * k)) & 255) * step_y + corner_y),
-            fmaxf(((near_z >> (8 * k)) & 255) * step_z + corner_z, 0.0f));
+            fmaxf(((near_z >> (8 * k)) & 255) * step_z + corner_z, t_min));
         float t_far = fminf(
             fminf(((far_x >> (8 * k)) & 255) * step_x + corner_x, ((far_y >> (8 * k)) & 255) * step_y + corner_y),
             ((far_z >> (8 * k)) & 255) * step_z + corner_z);
-        mask |= (t_near <= fminf(t_far * 1.000001f, t_max) ? 1 : 0) << k;
+        mask |= (t_near <= fminf(t_far * 1.000002f, t_max) ? 1 : 0) << k;
     }
 #else
     typedef unsigned char bytes __attribute__((vector_size(4)));
@@ -137,38 +151,100 @@ def boxes_met_one_by_one(
     floats zero = {0.0f, 0.0f, 0.0f, 0.0f};
     floats t_near = __builtin_elementwise_max(
         __builtin_elementwise_max(BYTES(near_x) * step_x + corner_x, BYTES(near_y) * step_y + corner_y),
-        __builtin_elementwise_max(BYTES(near_z) * step_z + corner_z, zero));
+        __builtin_elementwise_max(BYTES(near_z) * step_z + corner_z, zero + t_min));
     floats t_far = __builtin_elementwise_min(
         __builtin_elementwise_min(BYTES(far_x) * step_x + corner_x, BYTES(far_y) * step_y + corner_y),
         BYTES(far_z) * step_z + corner_z);
     #undef BYTES
-    ints met = t_near <= __builtin_elementwise_min(t_far * 1.000001f, zero + t_max);
+    ints met = t_near <= __builtin_elementwise_min(t_far * 1.000002f, zero + t_max);
     mask = (met[0] & 1) | (met[1] & 2) | (met[2] & 4) | (met[3] & 8);
 #endif
     return mask;
 """)
 def boxes_met(
-    row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_max: float
+    row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_min: float, t_max: float
 ) -> int:
     """The same mask, fast: on the CPU with vectors of four, which Warp's own code does not become."""
     ...
 
 
 @wp.func
-def meet_node(tree: WideTree, node: int, origin: wp.vec3, inverse: wp.vec3, t_max: float) -> NodeHits:
+def meet_node(tree: WideTree, node: int, origin: wp.vec3, inverse: wp.vec3, t_min: float, t_max: float) -> NodeHits:
     row = node * NODE_ROWS
-    row_0 = tree.nodes[row]
-    row_1 = tree.nodes[row + 1]
-    row_2 = tree.nodes[row + 2]
-    inner = (row_0[3] >> 24) & 15
-    count = (row_0[3] >> 28) & 15
-    mask = boxes_met(row_0, row_1, row_2, origin, inverse, t_max) & ((1 << count) - 1)
+    row_0 = load_words(tree.nodes, row)
+    row_1 = load_words(tree.nodes, row + 1)
+    row_2 = load_words(tree.nodes, row + 2)
+    inner = (row_0[3] >> 24) & 7
+    count = (row_0[3] >> 28) & 7
+    mask = boxes_met(row_0, row_1, row_2, origin, inverse, t_min, t_max) & ((1 << count) - 1)
     hits = NodeHits()
     hits.first_node = row_1[0]
     hits.first_leaf = row_1[1]
     hits.inner = mask & ((1 << inner) - 1)
     hits.leaf = mask >> inner
+    hits.axis = ((row_0[3] >> 27) & 1) | ((row_0[3] >> 30) & 2)
     return hits
+
+
+@wp.struct
+class CanonicalRay:
+    """A ray in the space where a leaf's Gaussian is the unit sphere, begun at its point closest to the centre."""
+
+    q: wp.vec3  # whitened closest point
+    d: wp.vec3  # whitened direction, not of unit length
+    dd: float  # d.d
+    cc: float  # |q x d|^2: dd times the squared distance to the centre
+    t_dd: float  # dd times t of the largest response
+
+
+@wp.func
+def canonical_ray(
+    center: wp.vec4, m_0: wp.vec4, m_1: wp.vec4, m_2: wp.vec4, origin: wp.vec3, direction: wp.vec3
+) -> CanonicalRay:
+    """Arithmetic of `ray_peak`, without its divisions."""
+    ray = CanonicalRay()
+    p = origin - wp.vec3(center[0], center[1], center[2])
+    t_closest = -wp.dot(p, direction)
+    p = p + direction * t_closest
+    ray.q = wp.vec3(
+        m_0[0] * p[0] + m_0[1] * p[1] + m_0[2] * p[2],
+        m_1[0] * p[0] + m_1[1] * p[1] + m_1[2] * p[2],
+        m_2[0] * p[0] + m_2[1] * p[1] + m_2[2] * p[2],
+    )
+    ray.d = wp.vec3(
+        m_0[0] * direction[0] + m_0[1] * direction[1] + m_0[2] * direction[2],
+        m_1[0] * direction[0] + m_1[1] * direction[1] + m_1[2] * direction[2],
+        m_2[0] * direction[0] + m_2[1] * direction[1] + m_2[2] * direction[2],
+    )
+    ray.dd = wp.dot(ray.d, ray.d)
+    c = wp.cross(ray.q, ray.d)
+    ray.cc = wp.dot(c, c)
+    ray.t_dd = t_closest * ray.dd - wp.dot(ray.q, ray.d)
+    return ray
+
+
+@wp.struct
+class LeafAlpha:
+    """How strongly a leaf's Gaussian acts on a ray, by the default rules."""
+
+    alpha: float  # 0 where it does not count
+    index: int
+
+
+@wp.func
+def meet_leaf_by_default(tree: WideTree, leaf: int, origin: wp.vec3, direction: wp.vec3, t_max: float) -> LeafAlpha:
+    """Peak in front, no culling, degree 2: what almost every ray asks for, a tenth faster than `meet_leaf`."""
+    row = leaf * LEAF_ROWS
+    center = load_row(tree.leaves, row)
+    m_0 = load_row(tree.leaves, row + 1)
+    m_1 = load_row(tree.leaves, row + 2)
+    m_2 = load_row(tree.leaves, row + 3)
+    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
+    result = LeafAlpha()
+    if ray.cc < m_0[3] * ray.dd and ray.t_dd > 0.0 and ray.t_dd < t_max * ray.dd:
+        result.alpha = wp.min(ALPHA_MAX, center[3] * wp.exp(-0.5 * ray.cc / ray.dd))
+        result.index = wp.cast(m_1[3], int)
+    return result
 
 
 @wp.struct
@@ -190,36 +266,21 @@ def meet_leaf(
     direction: wp.vec3,
     t_max: float,
 ) -> LeafPeak:
-    """The same arithmetic as `ray_peak` and `counts`, from the leaf's own rows."""
+    """The same as `ray_peak` and `counts`, from the leaf's own rows."""
     row = leaf * LEAF_ROWS
-    center = tree.leaves[row]
-    m_0 = tree.leaves[row + 1]
-    m_1 = tree.leaves[row + 2]
-    m_2 = tree.leaves[row + 3]
-    p = origin - wp.vec3(center[0], center[1], center[2])
-    t_closest = -wp.dot(p, direction)
-    p = p + direction * t_closest
-    q = wp.vec3(
-        m_0[0] * p[0] + m_0[1] * p[1] + m_0[2] * p[2],
-        m_1[0] * p[0] + m_1[1] * p[1] + m_1[2] * p[2],
-        m_2[0] * p[0] + m_2[1] * p[1] + m_2[2] * p[2],
-    )
-    d = wp.vec3(
-        m_0[0] * direction[0] + m_0[1] * direction[1] + m_0[2] * direction[2],
-        m_1[0] * direction[0] + m_1[1] * direction[1] + m_1[2] * direction[2],
-        m_2[0] * direction[0] + m_2[1] * direction[1] + m_2[2] * direction[2],
-    )
-    dd = wp.dot(d, d)
-    c = wp.cross(q, d)
-    cc = wp.dot(c, c)
+    center = load_row(tree.leaves, row)
+    m_0 = load_row(tree.leaves, row + 1)
+    m_1 = load_row(tree.leaves, row + 2)
+    m_2 = load_row(tree.leaves, row + 3)
+    ray = canonical_ray(center, m_0, m_1, m_2, origin, direction)
     peak = LeafPeak()
-    if cc < m_0[3] * dd:
-        distance_squared = cc / dd
-        peak.t = t_closest - wp.dot(q, d) / dd
+    if ray.cc < m_0[3] * ray.dd:
+        distance_squared = ray.cc / ray.dd
+        peak.t = ray.t_dd / ray.dd
         peak.index = wp.cast(m_1[3], int)
         start = peak.t
         if settings.entry_in_front == 1:
-            start -= wp.sqrt((m_0[3] - distance_squared) / dd)
+            start -= wp.sqrt((m_0[3] - distance_squared) / ray.dd)
         met = start > 0.0 and peak.t < t_max
         if met and settings.cull == 1:
             met = wp.dot(gaussians.normals[peak.index], direction) <= 0.0

@@ -31,6 +31,7 @@ RANKS = {
     "beam_warp.wide_trees": 6,
     "beam_warp.scene": 7,
     "beam_warp.tracing": 8,
+    "beam_warp.surface_tracing": 9,
     "beam_warp.gradients": 9,
     "beam_warp.lighting": 9,
     "beam_warp.irradiance": 10,
