@@ -3,11 +3,11 @@
     python benchmarks/estimators.py [--scene figure] [--device cuda:0] [--out result.json] [--plot errors.png]
 
 Scenes, tiled with Gaussians: "ball", a sphere resting on a floor before a wall, with points on all three; "figure",
-the embedded human figure of `beam demo`, with points all over it. Skies: made here, 128 x 256 texels whose brightest
-is 51, 1,600 and 20,000 times their mean; `--environment FILE` adds one of your own. Every error is the root mean
-square over points, channels and seeds against 16,384 rays (occlusion: cosine, Owen; irradiance: product, ratio, Owen),
-relative to the irradiance there, or to a twentieth of its mean where it is less. In brackets: what another program
-measured before, with triangles, on another figure, under captured skies of the same peaks.
+the embedded human figure of `beam demo`, with points where a camera that looks towards the sun sees it. Skies: made
+here, 128 x 256 texels whose brightest is 51, 1,600 and 20,000 times their mean; `--environment FILE` adds one of your
+own. Every error is the root mean square over points, channels and seeds against 16,384 rays (occlusion: cosine, Owen;
+irradiance: product, ratio, Owen), relative to the irradiance there, or to a twentieth of its mean where it is less. In
+brackets: what another program measured before, with triangles, on another figure, under captured skies of these peaks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp import GaussianCloud, Scene, ambient_occlusion
+from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
 from beam_warp.demo_figure import build_figure
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap, texel_directions
@@ -127,13 +127,18 @@ def sphere_set(count: int) -> NDArray:
 
 
 def make_figure(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:
-    """The demo's figure in mid-step, one Gaussian a vertex."""
+    """The demo's figure in mid-step, one Gaussian a vertex; points spread evenly over what a camera sees of it."""
     mesh = build_figure().at(0.125)
     corners = mesh.vertices[mesh.faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     cloud = GaussianCloud(**discs(mesh.vertices, mesh.normals.astype(np.float64), math.sqrt(area / len(mesh.vertices))))
-    chosen = np.random.default_rng(1).choice(len(mesh.vertices), count, replace=False)
-    return Scene.from_gaussians(cloud, device), mesh.vertices[chosen], mesh.normals[chosen]
+    scene = Scene.from_gaussians(cloud, device)
+    away = mesh.vertices.mean(axis=0) + np.float32([-1.6, -2.0, 0.4]) - mesh.vertices
+    away = (away / np.linalg.norm(away, axis=1, keepdims=True)).astype(np.float32)
+    lifted = mesh.vertices + np.float32(0.01) * mesh.normals
+    seen = np.maximum((mesh.normals * away).sum(axis=1), 0.0).astype(np.float64) * visibility(scene, lifted, away)
+    chosen = np.random.default_rng(1).choice(len(seen), count, replace=False, p=seen / seen.sum())
+    return scene, mesh.vertices[chosen], mesh.normals[chosen]
 
 
 def make_ball(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:

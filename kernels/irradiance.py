@@ -43,11 +43,12 @@ PRODUCT = wp.constant(2)
 
 @wp.struct
 class LightMoments:
-    """First moments of an environment's radiance over cells of the sphere [W/m^2], by channel; dark cells left out."""
+    """First moments of an environment's radiance over cells of the sphere [W/m^2], by channel, each with half the width
+    of what its light is spread over along any axis."""
 
-    red: wp.array[wp.vec3]
-    green: wp.array[wp.vec3]
-    blue: wp.array[wp.vec3]
+    red: wp.array[wp.vec4]
+    green: wp.array[wp.vec4]
+    blue: wp.array[wp.vec4]
 
 
 @wp.struct
@@ -79,6 +80,16 @@ class DrawnLight:
     weights: wp.array[wp.vec3]
 
 
+@wp.func
+def above_horizon(moment: wp.vec4, n: wp.vec3) -> float:
+    """Mean of max(0, h) for h uniform over n . moment, give or take the half width."""
+    middle = n[0] * moment[0] + n[1] * moment[1] + n[2] * moment[2]
+    result = wp.max(middle, 0.0)
+    if wp.abs(middle) < moment[3]:
+        result = (middle + moment[3]) * (middle + moment[3]) / (4.0 * moment[3])
+    return result
+
+
 @wp.kernel
 def sum_unshadowed_kernel(
     first: int, moments: LightMoments, normals: wp.array[wp.vec3], out_irradiance: wp.array[wp.vec3]
@@ -90,9 +101,9 @@ def sum_unshadowed_kernel(
     green = float(0.0)
     blue = float(0.0)
     for cell in range(moments.red.shape[0]):
-        red += wp.max(wp.dot(n, moments.red[cell]), 0.0)
-        green += wp.max(wp.dot(n, moments.green[cell]), 0.0)
-        blue += wp.max(wp.dot(n, moments.blue[cell]), 0.0)
+        red += above_horizon(moments.red[cell], n)
+        green += above_horizon(moments.green[cell], n)
+        blue += above_horizon(moments.blue[cell], n)
     out_irradiance[point] = wp.vec3(red, green, blue) / PI
 
 
