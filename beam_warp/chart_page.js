@@ -198,6 +198,10 @@ function drawCurves(metric, plot, list) {
     hoverlabel: { align: "left" },
     plot_bgcolor: "white",
   };
+  if (!rows.length) {
+    const text = "Nothing is left to show: switch on a level of every factor.";
+    layout.annotations.push({ text, xref: "paper", yref: "paper", x: 0.5, y: 0.5, showarrow: false });
+  }
   Plotly.react(plot, traces, layout, { responsive: true, displaylogo: false });
   listFrontier(frontier, metric, list);
 }
