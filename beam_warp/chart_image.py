@@ -62,7 +62,7 @@ def lines_of(table: Table, rows: Sequence[Row]) -> list[list[Row]]:
     for row in rows:
         key = tuple(row.settings.get(axis.name) for axis in table.subject.axes if axis is not ladder)
         groups.setdefault(key, []).append(row)
-    order = {level: k for k, level in enumerate(ladder.levels)}
+    order: dict[Any, int] = {level: k for k, level in enumerate(ladder.levels)}
     return [sorted(group, key=lambda row: order.get(row.settings.get(ladder.name), -1)) for group in groups.values()]
 
 
@@ -294,7 +294,7 @@ def draw_legend(axes: Any, table: Table, metric: Metric, colors: Any, markers: A
         legend = Legend(
             axes,
             row,
-            [line.get_label() for line in row],
+            [str(line.get_label()) for line in row],
             loc="lower left",
             bbox_to_anchor=(-0.02, 1.0 + LEGEND_ROW * number),
             ncols=len(row),

@@ -192,9 +192,9 @@ function drawCurves(metric, plot, list) {
             },
           ]
         : [],
-    legend: { x: 0, y: 0, bgcolor: "rgba(255,255,255,0.85)", font: { size: 11 } },
+    legend: { orientation: "h", x: 0, y: 1.01, yanchor: "bottom", font: { size: 11 } },
     margin: { l: 70, r: 15, t: 10, b: 50 },
-    height: 520,
+    height: 560,
     hoverlabel: { align: "left" },
     plot_bgcolor: "white",
   };

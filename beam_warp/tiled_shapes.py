@@ -63,11 +63,11 @@ def tile(surfaces: tuple[Surface, ...]) -> GaussianCloud:
     turned = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), w], axis=1)
     turned[w < 1e-9] = (1.0, 0.0, 0.0, 0.0)
     return GaussianCloud(
-        positions=np.concatenate([surface.points for surface in surfaces]),
+        positions=np.concatenate([surface.points for surface in surfaces]).astype(np.float32),
         orientations=turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        scales=spacing[:, None] * TANGENTIAL * np.array([1.0, 1.0, FLATNESS]),
+        scales=(spacing[:, None] * TANGENTIAL * np.array([1.0, 1.0, FLATNESS])).astype(np.float32),
         opacities=np.full(len(normals), OPACITY),
-        normals=normals,
+        normals=normals.astype(np.float32),
     )
 
 

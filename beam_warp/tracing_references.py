@@ -67,7 +67,8 @@ class References:
         kind, number = parse_offset(offset)
         if kind == "metres":
             return np.full(len(self.points), number, np.float32)
-        return self.surface[:, 0] + (LIFT_IN_THICKNESSES if kind == "auto" else number) * self.surface[:, 1]
+        thicknesses = np.float32(LIFT_IN_THICKNESSES if kind == "auto" else number)
+        return self.surface[:, 0] + thicknesses * self.surface[:, 1]
 
     def lifted(self, offset: str) -> tuple[NDArray[np.float32], float | Literal["auto"]]:
         """Return points and the offset to pass on with them: multiples of the thickness are applied to the points."""
