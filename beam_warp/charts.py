@@ -41,7 +41,7 @@ PACE = "Pace"
 """Title of the note on how steady the machine was."""
 
 SHAKY = 1.3
-"""Ratio of costs of the same setting within one run above which a chart warns its reader."""
+"""Ratio of upper to lower quartile of the costs of one setting within a run above which a chart warns its reader."""
 
 PROBE_EVERY = 16
 """Settings between two measurements of the same one: whether the machine kept its pace."""
@@ -316,9 +316,9 @@ def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
     """Return the subject with a note on how the cost of one setting, measured again and again, varied."""
     if len(probes) < 2:
         return subject
-    slow, fast = max(probes) / float(np.median(probes)), min(probes) / float(np.median(probes))
+    fast, low, high, slow = np.quantile(probes, (0.0, 0.25, 0.75, 1.0)) / np.median(probes)
     pace = f"one setting, measured {len(probes)} times during the run, cost {fast:.2f} to {slow:.2f} of its median"
-    if slow > SHAKY * fast:
+    if high > SHAKY * low:
         pace += ": the machine was busy, so small differences in cost mean nothing; measure again on a quiet one"
     return replace(subject, notes={**subject.notes, PACE: pace})
 

@@ -67,8 +67,8 @@ class References:
         kind, number = parse_offset(offset)
         if kind == "metres":
             return np.full(len(self.points), number, np.float32)
-        thicknesses = np.float32(LIFT_IN_THICKNESSES if kind == "auto" else number)
-        return self.surface[:, 0] + thicknesses * self.surface[:, 1]
+        thicknesses = LIFT_IN_THICKNESSES if kind == "auto" else number
+        return (self.surface[:, 0] + thicknesses * self.surface[:, 1]).astype(np.float32)
 
     def lifted(self, offset: str) -> tuple[NDArray[np.float32], float | Literal["auto"]]:
         """Return points and the offset to pass on with them: multiples of the thickness are applied to the points."""
@@ -77,7 +77,7 @@ class References:
             return self.points, "auto"
         if kind == "metres":
             return self.points, number
-        return self.points + self.normals * self.lift_lengths(offset)[:, None], 0.0
+        return (self.points + self.normals * self.lift_lengths(offset)[:, None]).astype(np.float32), 0.0
 
 
 def find_references(
