@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
 from beam_warp.devices import upload
-from beam_warp.kernels.bounds import launch_pack_gaussians
+from beam_warp.kernels.bounds import launch_count_fates, launch_pack_gaussians
 from beam_warp.kernels.gaussian import Gaussians
 
 SMALLEST_RELATIVE_SCALE = 1e-7
@@ -109,3 +109,9 @@ class PackedGaussians:
             self.takes_part,
             self.device,
         )
+
+    def fate_counts(self) -> list[int]:
+        """Return how many Gaussians met each fate of `kernels.bounds`."""
+        counts = wp.zeros(4, dtype=int, device=self.device)
+        launch_count_fates(self.fates, counts, self.device)
+        return counts.numpy().tolist()

@@ -197,8 +197,9 @@ class Scene:
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
         packed = self._packed
-        number = np.bincount(packed.fates.numpy()[: len(self)], minlength=4)
-        traced = int(number[TRACED] + number[RAISED])
+        number = packed.fate_counts()
+        traced = number[TRACED] + number[RAISED]
+        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
         depth, method = 0, WARP_BUILDS[build]
         if self.backend == "wide":
             self._tree = build_wide_tree(packed, traced, build)
@@ -209,9 +210,7 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
-        self.report = SceneReport(
-            traced, int(number[INVISIBLE]), int(number[RAISED]), int(number[NOT_FINITE]), depth, method
-        )
+        self.report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:

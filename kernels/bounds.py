@@ -86,6 +86,25 @@ def pack_gaussians_kernel(
     out_takes_part[i] = wp.where(fate == TRACED or fate == RAISED, 1, 0)
 
 
+FATES_A_THREAD = wp.constant(256)
+
+
+@wp.kernel
+def count_fates_kernel(first: int, fates: wp.array[int], out_counts: wp.array[int]):
+    """How many Gaussians met each fate."""
+    begin = (first + wp.tid()) * FATES_A_THREAD
+    counts = wp.vec4i()
+    for i in range(begin, wp.min(begin + FATES_A_THREAD, fates.shape[0])):
+        counts[fates[i]] += 1
+    for fate in range(4):
+        wp.atomic_add(out_counts, fate, counts[fate])
+
+
+def launch_count_fates(fates, out_counts, device):
+    """Count into ``out_counts``, four numbers that must be 0."""
+    launch(count_fates_kernel, -(-len(fates) // FATES_A_THREAD), inputs=[fates], outputs=[out_counts], device=device)
+
+
 def launch_pack_gaussians(
     positions,
     orientations,

@@ -1,7 +1,8 @@
 """What a ray sees, front to back: depth, normal, blended attributes and what is left of the light.
 
 Hits are collected in rounds of the nearest `BUFFER_SIZE` behind the last one, in the order (t, index), so that
-coincident Gaussians are neither lost nor counted twice; then they are blended, until transmittance falls below the stop.
+coincident Gaussians are neither lost nor counted twice; then they are blended, until transmittance falls below the
+stop.
 """
 
 from typing import Any
