@@ -4,6 +4,7 @@
 const COLORS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"];
 const SYMBOLS = ["circle", "triangle-up", "square", "diamond", "triangle-down", "cross", "x"];
 const DASHES = ["solid", "dash", "dot", "dashdot"];
+const CROWDED = 0.1; // decades
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const subject = data.subject;
@@ -110,6 +111,14 @@ function drawCurves(metric, plot, list) {
   const first = apart ? apart.levels.find((level) => rows.some((row) => row.settings[apart.name] === level)) : null;
   const isRival = (row) => !apart || row.settings[apart.name] === first;
   const frontier = frontierOf(rows.filter(isRival), metric);
+  const places = []; // whether a number stands above: only where the one before stands below, and near
+  frontier.forEach((row, index) => {
+    const near = (a, b) => Math.abs(Math.log10(a / b)) < CROWDED;
+    const last = frontier[index - 1];
+    places.push(
+      index > 0 && !places[index - 1] && near(row.cost[0], last.cost[0]) && near(errorOf(row)[0], errorOf(last)[0]),
+    );
+  });
   const traces = [
     {
       x: frontier.map((row) => row.cost[0]),
@@ -168,15 +177,19 @@ function drawCurves(metric, plot, list) {
       gridcolor: "#ddd",
       minor: { showgrid: true },
     },
-    annotations: frontier.map((row, index) => ({
-      x: Math.log10(row.cost[0]),
-      y: Math.log10(errorOf(row)[0]),
-      text: `<b>${index + 1}</b>`,
-      showarrow: false,
-      xshift: -10,
-      yshift: -11,
-      font: { size: 13, color: "black" },
-    })),
+    annotations: frontier.map((row, index) => {
+      // Below and left, where nothing is; above and right of a neighbour that is too near
+      const side = places[index] ? 1 : -1;
+      return {
+        x: Math.log10(row.cost[0]),
+        y: Math.log10(errorOf(row)[0]),
+        text: `<b>${index + 1}</b>`,
+        showarrow: false,
+        xshift: 11 * side,
+        yshift: 11 * side,
+        font: { size: 13, color: "black" },
+      };
+    }),
     shapes:
       metric.floor > 0 && rows.some((row) => errorOf(row)[0] < 30 * metric.floor)
         ? [
