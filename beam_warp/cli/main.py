@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
 from beam_warp._version import __version__
+from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
 from beam_warp.cli.render import Render, render
@@ -28,6 +29,7 @@ Command = (
     | Annotated[Render, subcommand("render", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Stability, subcommand("stability", prefix_name=False)]
+    | Annotated[Chart, subcommand("chart", prefix_name=False)]
 )
 
 
@@ -44,4 +46,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: render(command))
     if isinstance(command, Stability):
         return run_command(lambda: stability(command))
+    if isinstance(command, Chart):
+        return run_command(lambda: chart(command))
     return run_command(lambda: demo(command))

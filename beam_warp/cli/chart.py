@@ -1,0 +1,231 @@
+"""``beam chart``: what a setting costs against how wrong it is, on the user's own data and device."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from beam_warp import converters
+from beam_warp.axes import change_axes
+from beam_warp.chart_image import require_package, write_image
+from beam_warp.chart_page import write_page
+from beam_warp.charts import Settings, Table, read_table, run_study, table_paths
+from beam_warp.checks import require_number
+from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.tiled_shapes import still_life
+
+REFERENCE_PART = 0.35
+"""References may take this part of the budget; where they would take longer, fewer points are measured."""
+
+LEAST_PART = 0.4
+"""Measuring gets at least this part of the budget, however long normals and references took."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Measure error against time for every way to trace visibility, and mark the best ones.
+
+    Writes OUT/tracing.csv, OUT/tracing.png and OUT/tracing.html (one file, no network). A run that was stopped, or that
+    the budget cut short, goes on when it is called again with the same options; OUT/tracing.partial.csv can be drawn as
+    it is, with --from-csv. References are kept in OUT/tracing.references.npz for the next run on the same Gaussians.
+
+    How to read it: each curve is one way to trace, with more rays to the right. Errors are against many rays from the
+    same offset: noise, which falls with rays. The offset has a chart of its own: how far its truth lies from that of
+    the finest offset, which no number of rays mends. Too small an offset shades itself, too large a one leaks light;
+    choose the largest whose shift you can bear, then read the curves.
+
+    Not every combination is measured: one or two factors at a time are varied around the defaults, the first of each
+    list. Options that list values choose what is compared; --crossing full multiplies everything.
+
+    Example: beam chart tracing person.ply --environment studio.hdr --out chart
+    """
+
+    study: Annotated[Positional[Literal["tracing"]], arg(metavar="tracing", help="What to measure.")]
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
+    scene: Annotated[
+        Positional[Path | None],
+        arg(metavar="[SCENE]", help="Gaussians: any file or folder that beam-convert reads; a built-in scene if none."),
+    ] = None
+    from_csv: Annotated[Path | None, arg(metavar="FILE", help="Draw this table again; measure nothing.")] = None
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; a built-in low sun by default.")
+    ] = None
+    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
+    frame: Annotated[int, arg(metavar="N", help="Frame of a sequence, counted from 0.")] = 0
+    budget_seconds: Annotated[
+        float, arg(metavar="S", help="Time for references and measuring; what does not fit is skipped and counted.")
+    ] = 120.0
+    rays: Annotated[tuple[int, ...], arg(metavar="N ...", help="Rays per point.")] = (4, 16, 64, 256, 1024)
+    backends: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="wide, warp.")] = ("wide", "warp")
+    acceptances: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="product, bernoulli.")] = (
+        "product",
+        "bernoulli",
+    )
+    samplers: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="owen, stratified, iid.")] = (
+        "owen",
+        "stratified",
+        "iid",
+    )
+    densities: Annotated[
+        tuple[str, ...], arg(metavar="NAME ...", help="Of irradiance: product, environment, cosine, mis.")
+    ] = ("product", "environment", "cosine", "mis")
+    ratios: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="Of irradiance: ratio, plain.")] = (
+        "ratio",
+        "plain",
+    )
+    offsets: Annotated[
+        tuple[str, ...],
+        arg(metavar="OFFSET ...", help="Lifts of ray origins: auto, metres (0.02), or local thicknesses (2t)."),
+    ] = ("auto", "2t", "8t", "0.02")
+    crossing: Annotated[
+        Literal["star", "full"], arg(help="Vary one or two factors around the defaults, or cross all.")
+    ] = "star"
+    points: Annotated[
+        int | None, arg(metavar="N", help="Points at which errors are measured; 128 on a CPU, 4096 on a GPU.")
+    ] = None
+    reference_rays: Annotated[int, arg(metavar="N", help="Rays per point of the references.")] = 16384
+    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts.")] = 3
+    seed: Annotated[int, arg(help="Chooses the points.")] = 0
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the frontier as JSON.")] = False
+
+
+def chart(args: Chart) -> int:
+    """Measure or read a table, draw it, and say what is on the frontier."""
+    for package in ("matplotlib", "plotly"):
+        require_package(package)
+    if args.from_csv is not None and (args.scene is not None or args.environment is not None):
+        raise InvalidOptionError(
+            f"from-csv must be given without a scene or an environment, got {args.scene or args.environment} too: it "
+            "measures nothing. Drop one of them."
+        )
+    skipped: list[Settings] = []
+    if args.from_csv is not None:
+        table = read_table(args.from_csv)
+        _make_folder(args.out)
+    else:
+        with progress(args.quiet or args.json) as report:
+            table, skipped = _measure(args, report)
+    name = table.subject.name
+    image, page = args.out / f"{name}.png", args.out / f"{name}.html"
+    write_image(table, image)
+    write_page(table, page)
+    if args.json:
+        print_json(_summary(table, skipped, [image, page]))
+    elif not args.quiet:
+        _say(table, skipped, image, page)
+    return 0
+
+
+def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+    """Read the inputs, prepare the study and measure it."""
+    require_number("budget-seconds", args.budget_seconds, 0.0)
+    from beam_warp.devices import resolve_device
+    from beam_warp.tracing_plan import TracingPlan
+    from beam_warp.tracing_study import tracing_study
+
+    plan = TracingPlan(
+        backends=args.backends,
+        acceptances=args.acceptances,
+        samplers=args.samplers,
+        offsets=args.offsets,
+        densities=args.densities,
+        ratios=args.ratios,
+        rays=args.rays,
+        crossing=args.crossing,
+        points=args.points,
+        reference_rays=args.reference_rays,
+        repeats=args.repeats,
+        seed=args.seed,
+    )
+    if args.environment is None:
+        from beam_warp.demo_environments import sunset
+
+        environment, environment_name = sunset(), "the built-in low sun"
+    else:
+        environment, environment_name = EnvironmentMap.read(args.environment), args.environment.name
+    if args.scene is None:
+        cloud, name = still_life(), "the built-in still life"
+    else:
+        sequence = converters.read(args.scene, source_axes=args.source_axes)
+        if not (0 <= args.frame < len(sequence)):
+            raise InvalidOptionError(
+                f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
+            )
+        cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
+    resolve_device(args.device)  # an unknown device is refused before a folder is made
+    _make_folder(args.out)
+    started = time.perf_counter()
+    study = tracing_study(
+        cloud,
+        environment,
+        plan,
+        name=name,
+        environment_name=environment_name,
+        device=args.device,
+        references_file=args.out / "tracing.references.npz",
+        reference_seconds=REFERENCE_PART * args.budget_seconds,
+        progress=report,
+    )
+    left = max(args.budget_seconds - (time.perf_counter() - started), LEAST_PART * args.budget_seconds)
+    try:
+        return run_study(study, args.out, budget_seconds=left, progress=report)
+    except KeyboardInterrupt:
+        partial = table_paths(args.out, study.subject)[1]
+        print(f"kept {partial}: call again to continue, or draw it with --from-csv", file=sys.stderr)
+        raise
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"out must be a folder, got {folder} ({error.strerror}). Choose another.") from error
+
+
+def _summary(table: Table, skipped: list[Settings], files: list[Path]) -> dict[str, Any]:
+    """Return what was found, JSON-able."""
+    return {
+        "title": table.subject.title,
+        "notes": dict(table.subject.notes),
+        "measured": len(table.rows),
+        "planned": table.subject.planned,
+        "skipped": [dict(settings) for settings in skipped],
+        "frontier": {
+            metric.name: [
+                {**row.settings, "cost": row.cost.value, "error": row.errors[metric.name].value}
+                for row in table.frontier(metric)
+            ]
+            for metric in table.subject.metrics
+            if not metric.by
+        },
+        "files": [str(path) for path in files],
+    }
+
+
+def _say(table: Table, skipped: list[Settings], image: Path, page: Path) -> None:
+    """Print the frontier and what was left out."""
+    subject = table.subject
+    print(subject.title)
+    for metric in subject.metrics:
+        frontier = table.frontier(metric)
+        if not frontier:
+            continue
+        print(f"\n{metric.title}: the frontier\n{'time [s]':>10} {'error':>10}  settings")
+        for row in frontier:
+            print(f"{row.cost.value:10.3g} {row.errors[metric.name].value:10.3g}  {subject.label(row.settings)}")
+    print(f"\n{len(table.rows):,} of {subject.planned:,} planned settings measured; look at {image} and {page}")
+    if "Plan" in subject.notes:
+        print(f"plan: {subject.notes['Plan']}")
+    if skipped:
+        names = "; ".join(subject.label(settings) for settings in skipped[:3])
+        more = f"; and {len(skipped) - 3:,} more" if len(skipped) > 3 else ""
+        print(f"skipped for the budget: {names}{more}. Call again to go on with them.", file=sys.stderr)

@@ -1,0 +1,122 @@
+"""`beam chart` as a user meets it: a small study end to end, drawing again, and one line for every mistake."""
+
+import json
+
+import numpy as np
+import pytest
+
+from beam_warp import GaussianSequence, write
+from beam_warp.charts import read_table
+from beam_warp.cli.main import main
+from beam_warp.images import write_exr
+from beam_warp.tiled_shapes import still_life
+
+QUICK = (
+    *("--device", "cpu", "--points", 8, "--reference-rays", 64, "--repeats", 1, "--rays", 4, 8),
+    *("--backends", "warp", "--samplers", "owen", "--densities", "product", "--offsets", "auto", "0.01"),
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "still.ply"
+    write(GaussianSequence.from_clouds([still_life(400)]), path)
+    return path
+
+
+def beam(*words):
+    return main([str(word) for word in words])
+
+
+def test_measure_then_draw_again(scene, tmp_path, capsys):
+    out = tmp_path / "made" / "here"
+    assert beam("chart", "tracing", scene, "--out", out, *QUICK, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["measured"] == report["planned"]
+    assert report["skipped"] == []
+    assert report["frontier"]["occlusion_error"][0]["rays"] == 4
+    assert "still.ply" in report["title"]
+    names = {"tracing.csv", "tracing.png", "tracing.html", "tracing.references.npz"}
+    assert {path.name for path in out.iterdir()} == names
+
+    # A table that was cut short draws as well
+    text = (out / "tracing.csv").read_text(encoding="utf-8")
+    short = tmp_path / "short.csv"
+    short.write_text(text[: len(text) * 3 // 4], encoding="utf-8")
+    again = tmp_path / "again"
+    assert beam("chart", "tracing", "--from-csv", short, "--out", again) == 0
+    said = capsys.readouterr().out
+    assert f"{len(read_table(short).rows)} of {report['planned']} planned settings measured" in said
+    assert {path.name for path in again.iterdir()} == {"tracing.png", "tracing.html"}
+
+
+def test_quiet_and_budget(scene, tmp_path, capsys):
+    words = ("chart", "tracing", scene, "--out", tmp_path, *QUICK, "--budget-seconds", 0)
+    assert beam(*words, "--quiet") == 0
+    said = capsys.readouterr()
+    assert said.out == said.err == ""
+    assert len(read_table(tmp_path / "tracing.csv").rows) == 1
+    assert beam(*words) == 0  # one more: the budget is for each call
+    said = capsys.readouterr()
+    assert "2 of" in said.out
+    assert "skipped for the budget" in said.err
+
+
+def test_stop_keeps_what_was_measured(scene, tmp_path, capsys, monkeypatch):
+    from beam_warp import tracing_study
+
+    measure, measured = tracing_study._Bench.measure, []
+
+    def stop_later(self, settings):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(settings)
+        return measure(self, settings)
+
+    monkeypatch.setattr(tracing_study._Bench, "measure", stop_later)
+    assert beam("chart", "tracing", scene, "--out", tmp_path, *QUICK) == 130
+    assert "tracing.partial.csv: call again to continue" in capsys.readouterr().err
+    assert len(read_table(tmp_path / "tracing.partial.csv").rows) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("none.ply",), "input must be an existing file or folder, got none.ply"),
+        (("none.xyz",), "file name must end in one of"),
+        (("--environment", "none.exr"), "none.exr"),
+        (("--from-csv", "none.csv"), "table must be a readable file, got none.csv"),
+        (("scene.ply", "--from-csv", "none.csv"), "from-csv must be given without a scene"),
+        (("--samplers", "sobol"), "samplers must be one of owen, stratified, iid, got 'sobol'"),
+        (("--offsets", "3x"), "offsets must be auto, metres"),
+        (("--rays", "1"), "rays must be an integer in [4, 65536], got 1"),
+        (("--budget-seconds", "nan"), "budget-seconds must be a number"),
+    ],
+)
+def test_mistakes(words, says, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert beam("chart", "tracing", *words, "--out", out) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert says in line
+    assert not out.exists()
+
+
+def test_frame_device_and_folder_mistakes(scene, tmp_path, capsys):
+    assert beam("chart", "tracing", scene, "--frame", 3, "--out", tmp_path / "out") == 2
+    assert "frame must be in [0, 0], got 3" in capsys.readouterr().err
+    assert beam("chart", "tracing", scene, "--device", "cuda:99", "--out", tmp_path / "out") == 2
+    assert "device must be one of" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("in the way")
+    assert beam("chart", "tracing", scene, *QUICK, "--out", tmp_path / "file") == 2
+    assert "out must be a folder" in capsys.readouterr().err
+
+
+def test_own_light_is_named(scene, tmp_path, capsys):
+    write_exr(tmp_path / "sky.exr", dict.fromkeys("RGB", np.ones((16, 32), np.float32)))
+    words = ("--environment", tmp_path / "sky.exr", "--json", "--budget-seconds", 0)
+    assert beam("chart", "tracing", scene, "--out", tmp_path / "out", *QUICK, *words) == 0
+    assert json.loads(capsys.readouterr().out)["notes"]["Light"] == "sky.exr"
