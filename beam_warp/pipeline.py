@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -345,7 +345,7 @@ class _Job:
             "roughness": frame.roughness,
             **{EVIDENCE + name: getattr(measured.evidence, name) for name in ColorEvidence.ARRAYS},
             "from_shape": surface.from_shape,
-            "report": np.array(astuple(scene.report)),
+            "report": np.array([scene.report.traced, scene.report.dropped, scene.report.raised_scales]),
         }
         with self.timer("store"):
             write_frame(self.path(number), key, arrays)
