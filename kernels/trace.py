@@ -30,7 +30,9 @@ THREADS_TO_FILL = 1 << 17
 class Rays:
     """A batch of rays.
 
-    ``reaches`` holds one number, or one for each ray. Bernoulli acceptance draws from (``stream``, ray, Gaussian).
+    ``reaches`` holds one number, or one for each ray; below 0 the ray is blocked already. Bernoulli acceptance draws
+    from (the ray's stream, Gaussian): ``streams`` where it is given, so that the order of rays does not matter, else
+    from ``stream`` and the ray's number.
     """
 
     origins: wp.array[wp.vec3]
@@ -38,6 +40,15 @@ class Rays:
     reaches: wp.array[float]
     base: wp.vec3  # subtracted from the origins
     stream: wp.uint32
+    streams: wp.array[wp.uint32]  # one for each ray, or none
+
+
+@wp.func
+def stream_of_ray(rays: Rays, ray: int) -> wp.uint32:
+    stream = hash_combine(rays.stream, wp.uint32(ray))
+    if rays.streams.shape[0] > 0:
+        stream = rays.streams[ray]
+    return stream
 
 
 @wp.kernel
@@ -45,7 +56,7 @@ def block_rays_kernel(first: int, mesh: MeshOccluder, rays: Rays, out_reaches: w
     """Reach of each ray, -1 if a triangle lies before it."""
     i = first + wp.tid()
     t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
-    if mesh_blocks(mesh, rays.origins[i] - rays.base, rays.directions[i], t_max):
+    if t_max >= 0.0 and mesh_blocks(mesh, rays.origins[i] - rays.base, rays.directions[i], t_max):
         t_max = -1.0
     out_reaches[i] = t_max
 
@@ -55,14 +66,12 @@ def trace_rays_kernel(first: int, occluders: Any, settings: TraceSettings, rays:
     """One ray a thread, through any occluders: the readable form."""
     i = first + wp.tid()
     t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
-    out_visibility[i] = transmittance(
-        occluders,
-        settings,
-        rays.origins[i] - rays.base,
-        rays.directions[i],
-        t_max,
-        hash_combine(rays.stream, wp.uint32(i)),
-    )
+    v = float(0.0)
+    if t_max >= 0.0:
+        v = transmittance(
+            occluders, settings, rays.origins[i] - rays.base, rays.directions[i], t_max, stream_of_ray(rays, i)
+        )
+    out_visibility[i] = v
 
 
 @wp.kernel
@@ -75,10 +84,7 @@ def trace_rays_wide_kernel(
     share: int,
     out_visibility: wp.array[float],
 ):
-    """``share`` rays a thread, by the default rules; neighbouring lanes, ``lanes`` of them, take neighbouring rays.
-
-    A negative reach is a ray that is blocked already.
-    """
+    """``share`` rays a thread, by the default rules; neighbouring lanes, ``lanes`` of them, take neighbouring rays."""
     thread = first + wp.tid()
     count = rays.origins.shape[0]
     ray = (thread / lanes) * lanes * share + thread % lanes
@@ -127,8 +133,7 @@ def trace_rays_wide_kernel(
                 leaf = leaf & (leaf - 1)
                 if met.alpha > 0.0:
                     if settings.bernoulli == 1:
-                        stream = hash_combine(rays.stream, wp.uint32(ray))
-                        if unit_float(hash_combine(stream, wp.uint32(met.index))) < met.alpha:
+                        if unit_float(hash_combine(stream_of_ray(rays, ray), wp.uint32(met.index))) < met.alpha:
                             v = 0.0
                     else:
                         v *= 1.0 - met.alpha

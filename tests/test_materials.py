@@ -6,13 +6,13 @@ from shapes import cloud_of, disc_points, sphere_points, tiles
 
 from beam_warp import GaussianCloud, Observability, Scene
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
 from beam_warp.exposure import estimate_exposure
 from beam_warp.images import linear_to_srgb
 from beam_warp.materials import (
     MaterialOptions,
-    PreparedLight,
     measure_materials,
     solve_base_color,
     view_set,
@@ -39,7 +39,7 @@ def certain(normals):
 
 def decompose(cloud, normals, environment, device, options=None, frames=(0,)):
     scene = Scene.from_gaussians(cloud, device)
-    light = PreparedLight.from_environment(environment, scene.device)
+    light = SampledEnvironment.from_environment(environment, scene.device)
     roughness = np.full(len(cloud), ROUGHNESS, np.float32)
     evidence = None
     for frame in frames:
@@ -257,7 +257,7 @@ class TestExposure:
             scene,
             certain(points),
             np.full(1500, ROUGHNESS, np.float32),
-            PreparedLight.from_environment(
+            SampledEnvironment.from_environment(
                 EnvironmentMap.constant((1.0, 1.0, 1.0), height=32).exposed(stops), scene.device
             ),
             options=MaterialOptions(),
@@ -274,8 +274,8 @@ def test_views_are_unit_and_on_the_visible_side():
 
 def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
     scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
-    one = PreparedLight.from_environment(sky(), scene.device).scaled(4.0)
-    other = PreparedLight.from_environment(sky().scaled(4.0), scene.device)
+    one = SampledEnvironment.from_environment(sky(), scene.device).scaled(4.0)
+    other = SampledEnvironment.from_environment(sky().scaled(4.0), scene.device)
     assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
     for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
         assert np.allclose(getattr(one.blocks, name).numpy(), getattr(other.blocks, name).numpy(), rtol=1e-5, atol=1e-6)
