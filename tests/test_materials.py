@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from shapes import cloud_of, disc_points, sphere_points, tiles
 
-from beam_warp import GaussianCloud, Observability, Scene
+from beam_warp import GaussianCloud, Observability, Scene, irradiance
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
@@ -99,6 +99,20 @@ class TestConvexBody:
         solved, _ = decompose(cloud, points, dim, device)
         expected = (reflected(0.4, np.pi) - SPECULAR_ALBEDO * 0.5) / (0.5 * (1.0 - SPECULAR_ALBEDO))
         assert np.abs(solved.base_color - expected).max() < 0.03
+
+
+def test_light_of_open_surfaces_is_the_unshadowed_irradiance(device):
+    """Far from each other nothing is in the way: what is measured is the closed form, under a sun of one texel too."""
+    normals, _ = sphere_points(200)
+    cloud = cloud_of(tiles(1000.0 * normals, normals, 0.05))
+    radiance = EnvironmentMap.constant((0.3, 0.4, 0.6), height=64).radiance.copy()
+    radiance[14, 30] = (2e4, 1.5e4, 1e4)
+    environment = EnvironmentMap(radiance)
+    _, measured = decompose(with_radiance(cloud, np.full((200, 3), 0.5)), normals, environment, device)
+    free = irradiance(Scene.from_gaussians(cloud.select(np.arange(0)), device), normals, normals, environment)
+    assert (measured.ambient_occlusion == 1.0).all()
+    # the same closed form times a ratio of equal sums
+    np.testing.assert_allclose(measured.evidence.irradiance, np.pi * free.value, rtol=1e-5)
 
 
 class TestOccluded:
