@@ -12,7 +12,7 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.surface_rays import RayBatch, place_and_index, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
 from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
@@ -31,9 +31,9 @@ def draw_occlusion_kernel(
     out_rays: Rays,
 ):
     """One cosine-distributed ray a thread."""
-    item = place_and_index(batch, samples.count, first + wp.tid())
-    place = item[0]
-    index = item[1]
+    item = first + wp.tid()
+    place = item / samples.count
+    index = item % samples.count
     stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
     drawn = draw_square(samples, index, stream)
     at = rays_of(batch, place)

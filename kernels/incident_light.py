@@ -23,7 +23,7 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.surface_rays import RayBatch, place_and_index, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
 from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
@@ -137,12 +137,12 @@ def draw_light_kernel(
     out_weights: wp.array[wp.vec3],
 ):
     """One ray a thread, and its radiance times cosine over pi times density; what brings no light is not traced."""
-    item = place_and_index(batch, technique.samples.count, first + wp.tid())
-    place = item[0]
+    item = first + wp.tid()
+    place = item / technique.samples.count
     normal = batch.normals[place]
     point_stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
     stream = hash_combine(point_stream, LIGHT_STREAM + wp.uint32(technique.density))
-    square = draw_square(technique.samples, item[1], stream)
+    square = draw_square(technique.samples, item % technique.samples.count, stream)
     drawn = draw_light(technique, distribution, blocks, cumulative, place, normal, square.u, square.v)
     weight = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
     at = rays_of(batch, place)

@@ -26,7 +26,7 @@ from beam_warp.kernels.sampling import (
     unit_float,
 )
 from beam_warp.kernels.spherical_harmonics import captured_radiance
-from beam_warp.kernels.surface_rays import RayBatch, place_and_index, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
 from beam_warp.kernels.trace import Rays
 from beam_warp.kernels.trace_settings import TraceSettings
 
@@ -79,10 +79,10 @@ def draw_light_kernel(
     out_radiance_over_pdf: wp.array[wp.vec3],
 ):
     """One ray a thread, by environment times cosine; what goes below the horizon is not traced."""
-    item = place_and_index(batch, samples.count, first + wp.tid())
-    place = item[0]
+    item = first + wp.tid()
+    place = item / samples.count
     stream = hash_combine(stream_of(seed, frame, wp.uint32(batch.rows[place])), LIGHT_STREAM)
-    square = draw_square(samples, item[1], stream)
+    square = draw_square(samples, item % samples.count, stream)
     drawn = square_to_product(blocks, cumulative, place, square.u, square.v)
     at = rays_of(batch, place)
     ray = at[0] + square.slot * at[1]

@@ -37,15 +37,6 @@ def rays_of(batch: RayBatch, place: int) -> wp.vec2i:
 
 
 @wp.func
-def place_and_index(batch: RayBatch, sample_count: int, item: int) -> wp.vec2i:
-    """Which point's place, and which of its ``sample_count`` samples: work in the order of the batch's rays."""
-    begin = item / (batch.group * sample_count) * batch.group
-    size = wp.min(batch.group, batch.rows.shape[0] - begin)
-    rest = item - begin * sample_count
-    return wp.vec2i(begin + rest % size, rest / size)
-
-
-@wp.func
 def ray_origin(batch: RayBatch, place: int) -> wp.vec3:
     """Relative to ``batch.base``, subtracted first: far from the world's origin the offset would be rounded away."""
     return batch.positions[place] - batch.base + batch.normals[place] * batch.offsets[place]
