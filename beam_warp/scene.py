@@ -189,20 +189,20 @@ class Scene:
         self._packed.place(*arrays)
         if tree != "refit":
             self._build(tree)
-        elif self.backend == "warp":
+            return
+        if self.backend == "warp":
             self._tree.refit()
         else:
             refit(self._tree, self._packed)
+        self._report(self._packed.fate_counts(), self.report.depth, self.report.build)
 
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
         packed = self._packed
         number = packed.fate_counts()
-        traced = number[TRACED] + number[RAISED]
-        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
         depth, method = 0, WARP_BUILDS[build]
         if self.backend == "wide":
-            self._tree = build_wide_tree(packed, traced, build)
+            self._tree = build_wide_tree(packed, number[TRACED] + number[RAISED], build)
             self.occluders.tree = self._tree.tree
             depth, method = len(self._tree.levels), self._tree.method
         else:
@@ -210,7 +210,14 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
-        self.report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
+        self._report(number, depth, method)
+
+    def _report(self, number: list[int], depth: int, build: str) -> None:
+        """Say what became of the Gaussians; ``number`` counts their fates."""
+        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
+        self.report = SceneReport(
+            number[TRACED] + number[RAISED], invisible, number[RAISED], number[NOT_FINITE], depth, build
+        )
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
