@@ -105,7 +105,8 @@ def count_fates_kernel(first: int, fates: wp.array[int], out_counts: wp.array[in
 
 def launch_count_fates(fates, out_counts, device):
     """Count into ``out_counts``, four numbers that must be 0."""
-    launch(count_fates_kernel, -(-len(fates) // FATES_A_THREAD), inputs=[fates], outputs=[out_counts], device=device)
+    groups = -(-len(fates) // FATES_A_THREAD)
+    launch(count_fates_kernel, groups, inputs=[fates], outputs=[out_counts], device=device, in_order=True)
 
 
 def launch_pack_gaussians(
