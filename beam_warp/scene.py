@@ -19,7 +19,10 @@ from beam_warp.packed_gaussians import PackedGaussians
 from beam_warp.wide_trees import build_wide_tree, refit
 
 NOTHING = GaussianCloud(
-    positions=np.zeros((1, 3)), orientations=[[0.0, 0.0, 0.0, 1.0]], scales=np.ones((1, 3)), opacities=[0.0]
+    positions=np.zeros((1, 3), np.float32),
+    orientations=np.array([[0.0, 0.0, 0.0, 1.0]], np.float32),
+    scales=np.ones((1, 3), np.float32),
+    opacities=np.zeros(1, np.float32),
 )
 """One Gaussian that no ray sees: with it kernels need no case for an empty scene."""
 
@@ -189,20 +192,20 @@ class Scene:
         self._packed.place(*arrays)
         if tree != "refit":
             self._build(tree)
-        elif self.backend == "warp":
+            return
+        if self.backend == "warp":
             self._tree.refit()
         else:
             refit(self._tree, self._packed)
+        self._report(self._packed.fate_counts(), self.report.depth, self.report.build)
 
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
         packed = self._packed
         number = packed.fate_counts()
-        traced = number[TRACED] + number[RAISED]
-        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
         depth, method = 0, WARP_BUILDS[build]
         if self.backend == "wide":
-            self._tree = build_wide_tree(packed, traced, build)
+            self._tree = build_wide_tree(packed, number[TRACED] + number[RAISED], build)
             self.occluders.tree = self._tree.tree
             depth, method = len(self._tree.levels), self._tree.method
         else:
@@ -210,7 +213,14 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
-        self.report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
+        self._report(number, depth, method)
+
+    def _report(self, number: list[int], depth: int, build: str) -> None:
+        """Say what became of the Gaussians; ``number`` counts their fates."""
+        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
+        self.report = SceneReport(
+            number[TRACED] + number[RAISED], invisible, number[RAISED], number[NOT_FINITE], depth, build
+        )
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
@@ -230,8 +240,13 @@ def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, devic
 
 def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh:
     """Return triangles on the device, relative to the scene's origin."""
-    vertices = require_array("mesh.vertices", getattr(mesh, "vertices", None), (None, 3), np.float64)
-    faces = require_array("mesh.faces", getattr(mesh, "faces", None), (None, 3), np.int32)
+    for name in ("vertices", "faces"):
+        if getattr(mesh, name, None) is None:
+            raise InvalidArrayError(
+                f"mesh must have vertices and faces, got {type(mesh).__name__} without {name}. Pass a trimesh.Trimesh."
+            )
+    vertices = require_array("mesh.vertices", mesh.vertices, (None, 3), np.float64)
+    faces = require_array("mesh.faces", mesh.faces, (None, 3), np.int32)
     require_finite("mesh.vertices", vertices)
     if not len(faces):
         raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")

@@ -333,12 +333,7 @@ class TestOnTheDevice:
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize(("name", "width"), [("positions", 3), ("orientations", 4), ("scales", 3)])
-    def test_broken_vectors(self, request, device, name, width, bad):
-        if name == "scales" and np.isnan(bad):
-            reason = (
-                "wp.min and wp.max of a vector pass over NaN: kernels/bounds.py traces the row at the smallest scale"
-            )
-            request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+    def test_broken_vectors(self, device, name, width, bad):
         for column in range(width):
             value = np.full((1, width), 0.5)
             value[0, column] = bad
@@ -369,10 +364,7 @@ class TestOnTheDevice:
 
     @pytest.mark.parametrize("backend", BACKENDS)
     @pytest.mark.parametrize("tree", ["refit", "fast", "quality"])
-    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, request, device, rng, backend, tree):
-        if tree == "refit":
-            reason = "Scene.move(tree='refit') leaves the row out but keeps the report of the build"
-            request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, device, rng, backend, tree):
         cloud, rays = random_cloud(rng, 60, scale=(-2.0, 0.3), opacity=(0.1, 0.9)), random_rays(rng, 200)
         scene = Scene.from_gaussians(cloud, device, backend=backend)
         positions = cloud.positions.copy()
