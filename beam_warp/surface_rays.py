@@ -8,7 +8,7 @@ import warp as wp
 
 from beam_warp.checks import require_number
 from beam_warp.kernels.constants import LARGEST_FLOAT
-from beam_warp.kernels.surface_rays import RayBatch, launch_local_surface
+from beam_warp.kernels.surface_rays import RayBatch, launch_lift_off_surface, launch_local_surface
 from beam_warp.kernels.trace import Rays
 from beam_warp.morton_order import morton_order
 from beam_warp.scene import Scene
@@ -54,8 +54,9 @@ def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float
         return wp.full(len(points), value, dtype=float, device=scene.device)
     surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
     launch_local_surface(scene.occluders, points, normals, surface, scene.device)
-    height, thickness = surface.numpy().T
-    return wp.array(height + LIFT_IN_THICKNESSES * thickness, dtype=float, device=scene.device)
+    offsets = wp.empty(len(points), dtype=float, device=scene.device)
+    launch_lift_off_surface(surface, LIFT_IN_THICKNESSES, offsets, scene.device)
+    return offsets
 
 
 def ray_batches(

@@ -55,6 +55,13 @@ def local_surface_kernel(
     out_surface[i] = surface_layer(occluders, points[i] - occluders.origin, normals[i])
 
 
+@wp.kernel
+def lift_off_surface_kernel(first: int, surface: wp.array[wp.vec2], thicknesses: float, out_offsets: wp.array[float]):
+    """Distance from each point to ``thicknesses`` times the layer's thickness above its height."""
+    i = first + wp.tid()
+    out_offsets[i] = surface[i][0] + thicknesses * surface[i][1]
+
+
 def launch_local_surface(occluders, points, normals, out_surface, device):
     """Measure the layer of Gaussians around each point."""
     launch(
@@ -65,3 +72,8 @@ def launch_local_surface(occluders, points, normals, out_surface, device):
         device=device,
         block_dim=64,
     )
+
+
+def launch_lift_off_surface(surface, thicknesses, out_offsets, device):
+    """Find how far ray origins are moved along the normals."""
+    launch(lift_off_surface_kernel, len(surface), inputs=[surface, thicknesses], outputs=[out_offsets], device=device)
