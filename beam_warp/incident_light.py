@@ -177,7 +177,6 @@ def _gather(
         normals,
         offset,
         count,
-        stratified=all(technique.samples.columns > 0 for technique in parts),
         points_at_once=points_for_weights(device) if is_product else None,
     ):
         cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)

@@ -87,7 +87,7 @@ def ambient_occlusion(
     error = wp.zeros(len(at), dtype=float, device=scene.device)
     is_bernoulli = options.acceptance == "bernoulli"
     done = 0
-    for batch in ray_batches(scene, at, up, offset, samples.count, stratified=samples.columns > 0):
+    for batch in ray_batches(scene, at, up, offset, samples.count):
         rays = room_for_rays(batch, scene.device, bernoulli=is_bernoulli, reaches=False)
         launch_draw_occlusion(batch, samples, (seed, frame), rays, scene.device)
         traced = wp.empty(len(rays.origins), dtype=float, device=scene.device)

@@ -229,7 +229,6 @@ def measure_materials(
         normals,
         options.offset,
         samples.count,
-        stratified=samples.columns > 0,
         points_at_once=points_for_weights(device),
     ):
         light_rays = _trace_light(scene, light, batch, samples, stream)

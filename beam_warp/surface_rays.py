@@ -32,16 +32,6 @@ WEIGHTED_POINTS_AT_ONCE = 1 << 15
 WEIGHTED_POINTS_AT_ONCE_ON_CUDA = 1 << 17
 """The same on a GPU: 256 MiB."""
 
-POINTS_IN_GROUP = 1
-"""Points whose rays of one stratum are neighbours, where samples have strata; see `RayBatch`.
-
-A CPU core traces one ray after the other and wants those from one point together: 32 points changed nothing and 1024
-took 15 to 25 % longer (torus of 140,000 Gaussians, 64 rays from 3,000 points).
-"""
-
-POINTS_IN_GROUP_ON_CUDA = 1024
-"""The same on a GPU, where 32 rays are traced in step."""
-
 
 def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float | Literal["auto"]) -> wp.array:
     """Return how far along its normal each ray origin is moved [m], ``(N,)`` float32 on the scene's device.
@@ -66,14 +56,12 @@ def ray_batches(
     offset: float | Literal["auto"],
     sample_count: int,
     *,
-    stratified: bool,
     points_at_once: int | None = None,
 ) -> list[RayBatch]:
     """Return points in Morton order, so many at a time that their rays are at most `RAYS_AT_ONCE`.
 
-    Trained clouds come in random order. Rays of points in Morton order trace 1.03 to 1.15 times faster on a CPU core
-    and 1.1 to 1.2 times on an H200; there another 1.15 to 1.2 if neighbours also share a direction. Results do not
-    depend on the order: random streams belong to the points' rows.
+    Trained clouds come in random order. Rays of points in Morton order trace 1.03 to 1.15 times faster on a CPU core.
+    Results do not depend on the order: random streams belong to the points' rows.
 
     Args:
         scene: What the rays will be traced through.
@@ -81,7 +69,6 @@ def ray_batches(
         normals: Unit normals, like ``points``.
         offset: As for `ray_offsets`.
         sample_count: Rays a point.
-        stratified: Whether a slot is the same stratum for every point, so that its rays have similar directions.
         points_at_once: At most so many points a batch.
     """
     count, device = len(points), scene.device
@@ -90,9 +77,7 @@ def ray_batches(
     rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
     offsets = ray_offsets(scene, positions, directions, offset)
-    rays_at_once, group = RAYS_AT_ONCE, POINTS_IN_GROUP
-    if device.is_cuda:
-        rays_at_once, group = RAYS_AT_ONCE_ON_CUDA, POINTS_IN_GROUP_ON_CUDA
+    rays_at_once = RAYS_AT_ONCE_ON_CUDA if device.is_cuda else RAYS_AT_ONCE
     step = min(max(1, rays_at_once // sample_count), points_at_once or count)
     batches = []
     for start in range(0, count, step):
@@ -102,7 +87,6 @@ def ray_batches(
         batch.offsets, batch.rows = offsets[part], rows[part]
         batch.base = scene.occluders.origin
         batch.sample_count = sample_count
-        batch.group = group if stratified else 1
         batches.append(batch)
     return batches
 

@@ -12,7 +12,7 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
@@ -36,8 +36,8 @@ def draw_occlusion_kernel(
     index = item % samples.count
     stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
     drawn = draw_square(samples, index, stream)
-    at = rays_of(batch, place)
-    ray = at[0] + drawn.slot * at[1]
+    begin = place * batch.sample_count
+    ray = begin + drawn.slot
     out_rays.origins[ray] = ray_origin(batch, place)
     out_rays.directions[ray] = tangent_frame(batch.normals[place]) * square_to_cosine_hemisphere(drawn.u, drawn.v)
     if out_rays.streams.shape[0] > 0:
@@ -55,12 +55,12 @@ def reduce_visibility_kernel(
 ):
     """Mean and standard error of each point's samples; of one sample nothing is known but that it lies in [0, 1]."""
     place = first + wp.tid()
-    at = rays_of(batch, place)
+    begin = place * batch.sample_count
     total = float(0.0)
     spread = Spread()
     spread.paired = wp.where(samples.columns > 0, 1, 0)
     for k in range(samples.count):
-        v = visibility[at[0] + k * at[1]]
+        v = visibility[begin + k]
         total += v
         spread = add_term(spread, v)
     error = float(LARGEST_DEVIATION)

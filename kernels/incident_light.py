@@ -23,7 +23,7 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
@@ -145,9 +145,9 @@ def draw_light_kernel(
     square = draw_square(technique.samples, item % technique.samples.count, stream)
     drawn = draw_light(technique, distribution, blocks, cumulative, place, normal, square.u, square.v)
     weight = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
-    at = rays_of(batch, place)
+    begin = place * batch.sample_count
     slot = technique.begin + square.slot
-    ray = at[0] + slot * at[1]
+    ray = begin + slot
     out_weights[ray] = weight
     out_rays.origins[ray] = ray_origin(batch, place)
     out_rays.directions[ray] = drawn.direction
@@ -177,11 +177,11 @@ def reduce_light_kernel(
     place = first + wp.tid()
     row = batch.rows[place]
     count = counts[0] + counts[1]
-    at = rays_of(batch, place)
+    begin = place * batch.sample_count
     free = wp.vec3()
     seen = wp.vec3()
     for k in range(count):
-        ray = at[0] + k * at[1]
+        ray = begin + k
         free += weights[ray]
         seen += weights[ray] * visibility[ray]
     value = wp.vec3()
@@ -199,10 +199,10 @@ def reduce_light_kernel(
         here.paired = paired[0]
         there.paired = paired[1]
         for k in range(counts[0]):
-            ray = at[0] + k * at[1]
+            ray = begin + k
             here = add_term(here, weights[ray][c] * (visibility[ray] - center))
         for k in range(counts[0], count):
-            ray = at[0] + k * at[1]
+            ray = begin + k
             there = add_term(there, weights[ray][c] * (visibility[ray] - center))
         value[c] = scale * seen[c]
         error[c] = scale * wp.sqrt(variance_of_sum(here) + variance_of_sum(there))

@@ -26,7 +26,7 @@ from beam_warp.kernels.sampling import (
     unit_float,
 )
 from beam_warp.kernels.spherical_harmonics import captured_radiance
-from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace import Rays
 from beam_warp.kernels.trace_settings import TraceSettings
 
@@ -84,8 +84,8 @@ def draw_light_kernel(
     stream = hash_combine(stream_of(seed, frame, wp.uint32(batch.rows[place])), LIGHT_STREAM)
     square = draw_square(samples, item % samples.count, stream)
     drawn = square_to_product(blocks, cumulative, place, square.u, square.v)
-    at = rays_of(batch, place)
-    ray = at[0] + square.slot * at[1]
+    begin = place * batch.sample_count
+    ray = begin + square.slot
     out_rays.origins[ray] = ray_origin(batch, place)
     out_rays.directions[ray] = drawn.direction
     out_rays.reaches[ray] = wp.where(wp.dot(batch.normals[place], drawn.direction) > 0.0, float(LARGEST_FLOAT), -1.0)
@@ -142,13 +142,13 @@ def fit_color_kernel(
     """
     place = first + wp.tid()
     point = batch.rows[place]
-    at = rays_of(batch, place)
+    begin = place * batch.sample_count
     n = batch.normals[place]
     roughness = surface.roughness[point]
     free = wp.vec3()
     seen = wp.vec3()
     for k in range(batch.sample_count):
-        ray = at[0] + k * at[1]
+        ray = begin + k
         f = rays.radiance_over_pdf[ray] * wp.max(wp.dot(n, rays.directions[ray]), 0.0)
         free += f
         seen += f * rays.visibility[ray]
@@ -167,7 +167,7 @@ def fit_color_kernel(
         spread = float(0.0)
         before = float(0.0)
         for k in range(batch.sample_count):
-            ray = at[0] + k * at[1]
+            ray = begin + k
             w = rays.radiance_over_pdf[ray]
             power = (w[0] + w[1] + w[2]) * wp.max(wp.dot(n, rays.directions[ray]), 0.0)
             term = (rays.visibility[ray] - ratio) * power
@@ -185,7 +185,7 @@ def fit_color_kernel(
         weight = views[view][2]  # projected area: what a camera there sees of the surface
         specular = wp.vec3()
         for k in range(batch.sample_count):
-            ray = at[0] + k * at[1]
+            ray = begin + k
             light = rays.directions[ray]
             cosine = wp.dot(n, light)
             if cosine > 0.0:

@@ -1,4 +1,4 @@
-"""Batches of rays: every ray has one place, and no result depends on order, groups, batches or streams of the batch."""
+"""Batches of rays: no result depends on order, batches or streams of the batch."""
 
 from typing import Any
 
@@ -20,7 +20,6 @@ from beam_warp.kernels.sampling import (
     stream_of,
     tangent_frame,
 )
-from beam_warp.kernels.surface_rays import RayBatch, rays_of
 from beam_warp.kernels.trace import Rays
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.sampling import SAMPLERS, sample_set
@@ -40,46 +39,22 @@ def surroundings():
     return cloud, rng.uniform(-1, 1, (POINTS, 3)).astype(np.float32), normals.astype(np.float32)
 
 
-def set_layout(monkeypatch, group, rays_at_once):
-    for name, value in (("POINTS_IN_GROUP", group), ("RAYS_AT_ONCE", rays_at_once)):
-        monkeypatch.setattr(f"beam_warp.surface_rays.{name}", value)
-        monkeypatch.setattr(f"beam_warp.surface_rays.{name}_ON_CUDA", value)
+def set_rays_at_once(monkeypatch, count):
+    for name in ("RAYS_AT_ONCE", "RAYS_AT_ONCE_ON_CUDA"):
+        monkeypatch.setattr(f"beam_warp.surface_rays.{name}", count)
 
 
 def keep_order(lowers, uppers, takes_part):
     return wp.array(np.arange(len(lowers)), dtype=int, device=lowers.device), None
 
 
-@wp.kernel
-def number_rays_kernel(batch: RayBatch, out_rays: wp.array2d[int]):
-    place, slot = wp.tid()
-    at = rays_of(batch, place)
-    out_rays[place, slot] = at[0] + slot * at[1]
-
-
-@pytest.mark.parametrize("count", [1, 4, 255, 257, 300])
-@pytest.mark.parametrize("group", [1, 4, 256, 1024])
-@pytest.mark.parametrize("sample_count", [1, 6])
-def test_every_ray_has_one_place(device, count, group, sample_count):
-    """Counts on both sides of a group's end."""
-    batch = RayBatch()
-    batch.rows = wp.zeros(count, dtype=int, device=device)
-    batch.sample_count, batch.group = sample_count, group
-    numbers = wp.full((count, sample_count), -1, dtype=int, device=device)
-    wp.launch(number_rays_kernel, (count, sample_count), [batch], [numbers], device=device)
-    rays = numbers.numpy()
-    assert (np.sort(rays.ravel()) == np.arange(count * sample_count)).all()
-    together = min(group, count)
-    assert (rays[:together].T.ravel() == np.arange(together * sample_count)).all()  # slot by slot
-
-
 class TestBatches:
     def test_points_come_once_and_neighbours_together(self, device, surroundings, monkeypatch):
-        set_layout(monkeypatch, 1, 70 * 4)
+        set_rays_at_once(monkeypatch, 70 * 4)
         cloud, points, normals = surroundings
         scene = Scene.from_gaussians(cloud, device)
         at, up = (upload(array, wp.vec3, scene.device) for array in (points, normals))
-        batches = ray_batches(scene, at, up, 0.1, 4, stratified=True)
+        batches = ray_batches(scene, at, up, 0.1, 4)
         assert [len(batch.rows) for batch in batches] == [70, 70, 70, 70, 20]
         rows = np.concatenate([batch.rows.numpy() for batch in batches])
         assert (np.sort(rows) == np.arange(POINTS)).all()
@@ -95,13 +70,13 @@ class TestBatches:
     def test_no_points(self, device, surroundings):
         scene = Scene.from_gaussians(surroundings[0], device)
         none = wp.empty(0, dtype=wp.vec3, device=scene.device)
-        assert ray_batches(scene, none, none, "auto", 4, stratified=True) == []
+        assert ray_batches(scene, none, none, "auto", 4) == []
 
     def test_points_at_once(self, device, surroundings):
         cloud, points, normals = surroundings
         scene = Scene.from_gaussians(cloud, device)
         at, up = (upload(array, wp.vec3, scene.device) for array in (points, normals))
-        batches = ray_batches(scene, at, up, 0.1, 4, stratified=True, points_at_once=128)
+        batches = ray_batches(scene, at, up, 0.1, 4, points_at_once=128)
         assert [len(batch.rows) for batch in batches] == [128, 128, 44]
 
 
@@ -140,7 +115,7 @@ class TestOrderDoesNotMatter:
         cloud, points, normals = surroundings
         scene = Scene.from_gaussians(cloud, device, backend=backend)
         options = TraceOptions(acceptance=acceptance)
-        set_layout(monkeypatch, 64, 100 * sample_count)
+        set_rays_at_once(monkeypatch, 100 * sample_count)
         result = ambient_occlusion(
             scene, points, normals, sample_count=sample_count, sampler=sampler, options=options, seed=3, frame=2
         )
@@ -170,7 +145,7 @@ class TestOrderDoesNotMatter:
         assert np.abs(result.visibility - mean).mean() < 1e-5
 
     @pytest.mark.parametrize("acceptance", ["product", "bernoulli"])
-    def test_same_bits_for_any_order_and_group(self, device, surroundings, monkeypatch, acceptance):
+    def test_same_bits_for_any_order_and_batch(self, device, surroundings, monkeypatch, acceptance):
         cloud, points, normals = surroundings
         scene = Scene.from_gaussians(cloud, device)
         light = EnvironmentMap.constant((1.0, 2.0, 0.5))
@@ -186,7 +161,7 @@ class TestOrderDoesNotMatter:
                 yield arriving.standard_error
 
         usual = list(results())
-        set_layout(monkeypatch, 128, 16 * 77)
+        set_rays_at_once(monkeypatch, 16 * 77)
         for one, other in zip(usual, results(), strict=True):
             assert np.array_equal(one, other)
         monkeypatch.setattr("beam_warp.surface_rays.morton_order", keep_order)
