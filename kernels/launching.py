@@ -1,7 +1,9 @@
 """How a kernel runs over a range: one launch on CUDA, chunks over threads on the CPU (one thread a launch there).
 
 Every kernel launched here takes ``first: int`` as its first input and works on item ``first + wp.tid()``.
-Items must write disjoint outputs; then the result has the same bits for every chunking and thread count.
+Items must write disjoint outputs; then the result has the same bits for every chunking and thread count. Kernels that
+count or bound with atomics are launched with ``shares_outputs``: on the CPU Warp's atomics are plain reads and writes,
+and two threads would lose each other's.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ def launch(
     outputs: Sequence[Any],
     device: Any,
     block_dim: int = 256,
+    shares_outputs: bool = False,
 ) -> None:
     """Run ``kernel`` for items 0 … count - 1.
 
@@ -46,6 +49,7 @@ def launch(
         outputs: Kernel outputs.
         device: Where the arrays are.
         block_dim: CUDA block size.
+        shares_outputs: Items write to the same places, with atomics: one thread runs them all on the CPU.
     """
     if count <= 0:
         return
@@ -53,7 +57,7 @@ def launch(
     if target.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=target, block_dim=block_dim)
         return
-    threads = thread_count()
+    threads = 1 if shares_outputs else thread_count()
     chunk = max(MIN_CHUNK, -(-count // (threads * CHUNKS_PER_THREAD)))
     starts = range(0, count, chunk)
 

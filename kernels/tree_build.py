@@ -15,8 +15,8 @@ from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
 
-CELLS = 2097151.0
-"""Morton cells along the longest side: 21 bits an axis."""
+CELLS = 2097150.0
+"""Morton cells along the longest side: 21 bits an axis, all of them set in none, so that no code is `MORTON_LAST`."""
 
 LAST_CELL = wp.constant(CELLS)
 MORTON_LAST = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
@@ -194,6 +194,7 @@ def launch_order_boxes(lowers, uppers, takes_part, bounds, out_keys, out_items, 
         inputs=[lowers, uppers, takes_part],
         outputs=[bounds],
         device=device,
+        shares_outputs=True,
     )
     launch(
         order_boxes_kernel,
