@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -60,16 +60,16 @@ class Scene:
         backend: Hierarchy that rays traverse.
         occluders: What kernels trace, relative to ``origin``.
         mesh: Triangles among the Gaussians; None for none.
-        report: What was left out or changed.
     """
 
     backend: Backend
     occluders: Any
     mesh: wp.Mesh | None
-    report: SceneReport
     _packed: PackedGaussians = field(repr=False)
     _count: int = field(repr=False)
     _tree: Any = field(repr=False, default=None)
+    _report: SceneReport = field(repr=False, default=SceneReport(0, 0, 0))
+    _refitted: bool = field(repr=False, default=False)
 
     @classmethod
     def from_gaussians(
@@ -112,9 +112,28 @@ class Scene:
             occluders.mesh.mesh = triangles.id
         occluders.gaussians = packed.gaussians
         occluders.origin = wp.vec3(*packed.origin.tolist())
-        scene = cls(backend, occluders, triangles, SceneReport(0, 0, 0), packed, len(cloud))
+        scene = cls(backend, occluders, triangles, packed, len(cloud))
         scene._build(build)
         return scene
+
+    @property
+    def report(self) -> SceneReport:
+        """What was left out or changed; after a refit it is counted when asked for, as a refit reads nothing back."""
+        if self._refitted:
+            fates = self._packed.fates.numpy().copy()
+            if self.backend == "wide":  # what was left out when the tree was built stays out
+                absent = np.ones(len(fates), np.bool_)
+                absent[self._tree.layout.items.numpy()[: self._tree.count]] = False
+                fates[absent & ((fates == TRACED) | (fates == RAISED))] = NOT_FINITE
+            number = np.bincount(fates, minlength=4).tolist()
+            self._report = replace(
+                self._report,
+                traced=number[TRACED] + number[RAISED],
+                raised_scales=number[RAISED],
+                not_finite=number[NOT_FINITE],
+            )
+            self._refitted = False
+        return self._report
 
     @property
     def packed(self) -> PackedGaussians:
@@ -186,7 +205,10 @@ class Scene:
                 ("scales", scales, 3, wp.vec3),
             )
         ]
+        if not len(self):
+            return
         self._packed.place(*arrays)
+        self._refitted = tree == "refit"
         if tree != "refit":
             self._build(tree)
         elif self.backend == "warp":
@@ -210,7 +232,7 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
-        self.report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
+        self._report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:

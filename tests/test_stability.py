@@ -369,10 +369,7 @@ class TestOnTheDevice:
 
     @pytest.mark.parametrize("backend", BACKENDS)
     @pytest.mark.parametrize("tree", ["refit", "fast", "quality"])
-    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, request, device, rng, backend, tree):
-        if tree == "refit":
-            reason = "Scene.move(tree='refit') leaves the row out but keeps the report of the build"
-            request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, device, rng, backend, tree):
         cloud, rays = random_cloud(rng, 60, scale=(-2.0, 0.3), opacity=(0.1, 0.9)), random_rays(rng, 200)
         scene = Scene.from_gaussians(cloud, device, backend=backend)
         positions = cloud.positions.copy()

@@ -402,6 +402,26 @@ class TestMove:
         assert scene.report.traced == 0
         assert visibility(scene, np.zeros((1, 3)), [[1.0, 0.0, 0.0]]) == 1.0
 
+    def test_the_report_follows_refits(self, device, rng):
+        """A row may break and come back; one that was broken when the tree was built stays out, and is counted."""
+        cloud = random_cloud(rng, 20, scale=(-2.0, 0.3), opacity=(0.1, 0.9))
+        cloud = cloud.with_arrays(opacities=np.r_[0.0, cloud.opacities[1:]])
+        broken = cloud.positions.copy()
+        broken[7] = np.nan
+        scene = Scene.from_gaussians(cloud, device)
+
+        def counts(positions, scales=cloud.scales, tree="refit"):
+            scene.move(positions, cloud.orientations, scales, tree=tree)
+            report = scene.report
+            return report.traced, report.dropped, report.raised_scales, report.not_finite
+
+        assert counts(broken) == (18, 1, 0, 1)
+        assert counts(cloud.positions) == (19, 1, 0, 0)
+        assert counts(cloud.positions, cloud.scales * [1.0, 1.0, 0.0]) == (19, 1, 19, 0)
+        assert counts(broken, tree="fast") == (18, 1, 0, 1)
+        assert counts(cloud.positions) == (18, 1, 0, 1)
+        assert scene.report.build == "fast"
+
     def test_bad_shapes_and_types_are_refused(self, device, rng):
         cloud = random_cloud(rng, 10)
         scene = Scene.from_gaussians(cloud, device)
