@@ -253,11 +253,12 @@ def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, devic
 def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh:
     """Return triangles on the device, relative to the scene's origin."""
     vertices = require_array("mesh.vertices", getattr(mesh, "vertices", None), (None, 3), np.float64)
-    faces = require_array("mesh.faces", getattr(mesh, "faces", None), (None, 3), np.int32)
+    faces = require_array("mesh.faces", getattr(mesh, "faces", None), (None, 3), np.int64)
     require_finite("mesh.vertices", vertices)
     if not len(faces):
         raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")
     require_range("mesh.faces", faces, 0, len(vertices) - 1, "Index existing vertices.")
     return wp.Mesh(
-        upload((vertices - origin).astype(np.float32), wp.vec3, device), upload(faces.reshape(-1), int, device)
+        upload((vertices - origin).astype(np.float32), wp.vec3, device),
+        upload(faces.reshape(-1).astype(np.int32), int, device),
     )
