@@ -93,7 +93,7 @@ class TestVisibility:
         cloud = on_x([-1.0], [0.5])
         scene = Scene.from_gaussians(cloud, device, backend=backend, mesh=quad(1.0))
         assert visibility(scene, *along_x(), t_max=1.5) == pytest.approx(1.0 - 0.5 * np.exp(-2.0), abs=1e-6)
-        scene.move(cloud.positions + [9.0, 0.0, 0.0], cloud.orientations, cloud.scales)
+        scene.move(cloud.positions + np.float32(9.0), cloud.orientations, cloud.scales)
         assert visibility(scene, *along_x(), t_max=1.5)[0] == 1.0
         assert visibility(scene, *along_x())[0] == 0.0
 
