@@ -19,7 +19,10 @@ from beam_warp.packed_gaussians import PackedGaussians
 from beam_warp.wide_trees import build_wide_tree, refit
 
 NOTHING = GaussianCloud(
-    positions=np.zeros((1, 3)), orientations=[[0.0, 0.0, 0.0, 1.0]], scales=np.ones((1, 3)), opacities=[0.0]
+    positions=np.zeros((1, 3), np.float32),
+    orientations=np.array([[0.0, 0.0, 0.0, 1.0]], np.float32),
+    scales=np.ones((1, 3), np.float32),
+    opacities=np.zeros(1, np.float32),
 )
 """One Gaussian that no ray sees: with it kernels need no case for an empty scene."""
 
@@ -252,8 +255,9 @@ def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, devic
 
 def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh:
     """Return triangles on the device, relative to the scene's origin."""
-    vertices = require_array("mesh.vertices", getattr(mesh, "vertices", None), (None, 3), np.float64)
-    faces = require_array("mesh.faces", getattr(mesh, "faces", None), (None, 3), np.int64)
+    arrays: dict[str, Any] = {name: getattr(mesh, name, None) for name in ("vertices", "faces")}
+    vertices = require_array("mesh.vertices", arrays["vertices"], (None, 3), np.float64)
+    faces = require_array("mesh.faces", arrays["faces"], (None, 3), np.int64)
     require_finite("mesh.vertices", vertices)
     if not len(faces):
         raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")
