@@ -1,12 +1,19 @@
 """Bernoulli acceptance: right on average, independent between seeds, rays and Gaussians, on every path of tracing."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
+import warp as wp
 from estimates import LARGEST_Z, SIGNIFICANCE, require_zero_mean
 from scipy import stats
 from shapes import random_cloud, random_rays
 
 from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp.kernels.occluders import sampled_hit
+from beam_warp.kernels.sampling import hash_combine
+from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.reference import visibility_reference
 from beam_warp.scene import BACKENDS
 from beam_warp.tracing import TraceOptions
@@ -122,3 +129,48 @@ def test_every_seed_is_taken(device, backend, options, seed):
     scene = Scene.from_gaussians(on_x([0.5]), device, backend=backend)
     drawn = visibility(scene, *along_x(10_000), options=options, seed=seed)
     assert abs(drawn.mean() - 0.5) < LARGEST_Z * 0.5 / np.sqrt(10_000)
+
+
+@wp.kernel
+def sample_hits_kernel(
+    occluders: Any,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    seed: wp.uint32,
+    out_index: wp.array[int],
+):
+    i = wp.tid()
+    stream = hash_combine(seed, wp.uint32(i))
+    out_index[i] = sampled_hit(occluders, settings, origin - occluders.origin, direction, t_max, stream)
+
+
+@pytest.mark.parametrize("front", ["peak", "entry"])
+@pytest.mark.parametrize("limit", ["none", "t_max", "mesh"])
+def test_sampled_hits_follow_alpha_times_the_transmittance_before(device, backend, front, limit):
+    """Indices of hits on one ray, counted over streams, against the weights of blending: a chi-square test."""
+    rng, count = np.random.default_rng(11), 50_000
+    opacities, places = rng.uniform(0.05, 0.5, 10), rng.permutation(10)
+    cloud = on_x(opacities).with_arrays(positions=places[:, None] * [1.0, 0.0, 0.0])
+    reach = 3e38 if limit == "none" else 8.5  # from -2: places up to 6
+    plate = None
+    if limit == "mesh":
+        vertices = [[6.5, -9.0, -9.0], [6.5, 9.0, -9.0], [6.5, 0.0, 9.0]]
+        plate, reach = SimpleNamespace(vertices=vertices, faces=[[0, 1, 2]]), 3e38
+    scene = Scene.from_gaussians(cloud, device, backend=backend, mesh=plate)
+    drawn = wp.empty(count, dtype=int, device=device)
+    settings = TraceOptions(front=front).settings(scene)
+    inputs = [scene.occluders, settings, wp.vec3(-2.0, 0.0, 0.0), wp.vec3(1.0, 0.0, 0.0), reach, wp.uint32(5)]
+    wp.launch(sample_hits_kernel, dim=count, inputs=inputs, outputs=[drawn], device=device)
+    order = [k for k in np.argsort(places) if limit == "none" or places[k] <= 6]
+    weights = np.zeros(11)  # the last for none
+    passed = 1.0
+    for k in order:
+        weights[k], passed = passed * opacities[k], passed * (1.0 - opacities[k])
+    weights[-1] = passed
+    found = np.bincount(np.where(drawn.numpy() < 0, 10, drawn.numpy()), minlength=11)
+    assert not found[weights == 0.0].any()
+    expected = count * weights[weights > 0.0]
+    assert expected.min() > 100.0
+    require_chi_square(np.sum((found[weights > 0.0] - expected) ** 2 / expected), len(expected) - 1)

@@ -239,6 +239,13 @@ class TestDepth:
         with pytest.raises(AssertionError, match="a tree over 100 boxes came out"):
             build(packed_of(random_cloud(rng, 100, opacity=(0.1, 1.0)), device), "quality")
 
+    def test_a_tree_of_too_many_nodes_is_refused(self, device, rng, monkeypatch):
+        monkeypatch.setattr(wide_trees, "LARGEST_NODE_COUNT", 20)
+        with pytest.raises(
+            InvalidArrayError, match=r"cloud must make a tree of at most 20 nodes, got \d+ for 100 Gauss"
+        ):
+            build(packed_of(random_cloud(rng, 100, opacity=(0.1, 1.0)), device), "fast")
+
 
 class TestLeaves:
     @pytest.mark.parametrize("spread", [0.5, 2.0, 4.0])
