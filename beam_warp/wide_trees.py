@@ -175,8 +175,8 @@ def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method
     begins = np.concatenate([[0], np.cumsum(used)]).tolist()
     if begins[-1] > LARGEST_NODE_COUNT:
         raise InvalidArrayError(
-            f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {begins[-1]:,} for {count:,} Gaussians."
-            ' Split the cloud, or use backend="warp".'
+            f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {begins[-1]:,} for {count:,} "
+            'Gaussians. Split the cloud, or use backend="warp".'
         )
     layout.lower = wp.empty(begins[-1], dtype=wp.vec3, device=device)
     layout.upper = wp.empty(begins[-1], dtype=wp.vec3, device=device)
