@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
     from beam_warp.gradients import visibility_gradients as visibility_gradients
+    from beam_warp.incident_light import Irradiance as Irradiance
+    from beam_warp.incident_light import irradiance as irradiance
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
     from beam_warp.materials import MaterialOptions as MaterialOptions
@@ -46,6 +48,7 @@ _HOMES = {
     "GBuffer": "rasterizing",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
+    "Irradiance": "incident_light",
     "MaterialOptions": "materials",
     "Observability": "assets",
     "RunOptions": "pipeline",
@@ -58,6 +61,7 @@ _HOMES = {
     "change_axes": "axes",
     "closest_surface": "surface_tracing",
     "estimate_normals": "surfaces",
+    "irradiance": "incident_light",
     "rasterize": "rasterizing",
     "read": "converters",
     "run": "pipeline",

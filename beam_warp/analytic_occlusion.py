@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.assets import GaussianCloud
 from beam_warp.devices import device_label
-from beam_warp.lighting import ambient_occlusion, ray_offsets
+from beam_warp.lighting import ambient_occlusion
 from beam_warp.reference import visibility_reference
 from beam_warp.scene import BACKENDS, Scene
+from beam_warp.surface_rays import ray_offsets
 from beam_warp.tracing import EXACT
 
 OVERLAP = 1.0

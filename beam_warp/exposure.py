@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
-from beam_warp.materials import MaterialOptions, PreparedLight, measure_materials
+from beam_warp.environment_sampling import SampledEnvironment
+from beam_warp.materials import MaterialOptions, measure_materials
 from beam_warp.scene import Scene
 from beam_warp.surfaces import SurfaceNormals
 
@@ -30,7 +31,7 @@ def estimate_exposure(
     scene: Scene,
     surface: SurfaceNormals,
     roughness: NDArray[np.float32],
-    light: PreparedLight,
+    light: SampledEnvironment,
     *,
     options: MaterialOptions,
     subset: int = 4096,

@@ -8,27 +8,14 @@ from typing import Any, Literal
 
 import warp as wp
 
-from beam_warp.checks import require_count, require_number, require_same_length
+from beam_warp.checks import require_count, require_same_length
 from beam_warp.devices import download_like, upload_vectors
 from beam_warp.errors import InvalidOptionError
-from beam_warp.kernels.ambient_occlusion import (
-    launch_local_surface,
-    launch_reduce_visibility,
-    launch_trace_occlusion,
-)
+from beam_warp.kernels.ambient_occlusion import launch_draw_occlusion, launch_reduce_visibility
 from beam_warp.sampling import Sampler, sample_set
 from beam_warp.scene import Scene
-from beam_warp.tracing import EXACT, TraceOptions
-
-LIFT_IN_THICKNESSES = 4.0
-"""How far ``offset="auto"`` lifts ray origins off the local surface, in standard deviations of its thickness.
-
-On tiled planes, spheres and bowls with and without noise in tilt and height, 3 still shades itself by up to 0.012 and 5
-opens bowls of round Gaussians by another 0.007; 4 is the compromise.
-"""
-
-RAYS_AT_ONCE = 1 << 20
-"""Rays whose results are held at a time, 4 MiB, and after which progress is reported."""
+from beam_warp.surface_rays import ray_batches, room_for_rays
+from beam_warp.tracing import EXACT, TraceOptions, trace_rays
 
 Progress = Callable[[int, int], None]
 """Called with (points done, points in all)."""
@@ -45,21 +32,6 @@ class AmbientOcclusion:
 
     visibility: Any
     standard_error: Any
-
-
-def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float | Literal["auto"]) -> wp.array:
-    """Return how far along its normal each ray origin is moved [m], ``(N,)`` float32 on the scene's device.
-
-    ``"auto"``: to the mean of the Gaussians' opacity along the normal's line, where the surface is seen, and from
-    there `LIFT_IN_THICKNESSES` standard deviations outwards. A number is taken as it is.
-    """
-    if offset != "auto":
-        value = require_number("offset", offset)
-        return wp.full(len(points), value, dtype=float, device=scene.device)
-    surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
-    launch_local_surface(scene.occluders, points, normals, surface, scene.device)
-    height, thickness = surface.numpy().T
-    return wp.array(height + LIFT_IN_THICKNESSES * thickness, dtype=float, device=scene.device)
 
 
 def ambient_occlusion(
@@ -113,27 +85,15 @@ def ambient_occlusion(
     require_same_length("normals", up, "points", len(at))
     mean = wp.ones(len(at), dtype=float, device=scene.device)
     error = wp.zeros(len(at), dtype=float, device=scene.device)
-    if len(at):
-        settings = options.settings(scene)
-        offsets = ray_offsets(scene, at, up, offset)
-        step = max(1, RAYS_AT_ONCE // samples.count)
-        traced = wp.empty(min(step, len(at)) * samples.count, dtype=float, device=scene.device)
-        for start in range(0, len(at), step):
-            part = slice(start, min(start + step, len(at)))
-            launch_trace_occlusion(
-                scene.occluders,
-                settings,
-                at[part],
-                up[part],
-                offsets[part],
-                seed,
-                frame,
-                start,
-                samples,
-                traced,
-                scene.device,
-            )
-            launch_reduce_visibility(traced, samples, mean[part], error[part], scene.device)
-            if progress is not None:
-                progress(part.stop, len(at))
+    is_bernoulli = options.acceptance == "bernoulli"
+    done = 0
+    for batch in ray_batches(scene, at, up, offset, samples.count, stratified=samples.columns > 0):
+        rays = room_for_rays(batch, scene.device, bernoulli=is_bernoulli, reaches=False)
+        launch_draw_occlusion(batch, samples, (seed, frame), rays, scene.device)
+        traced = wp.empty(len(rays.origins), dtype=float, device=scene.device)
+        trace_rays(scene, options, rays, traced)
+        launch_reduce_visibility(batch, samples, traced, mean, error, scene.device)
+        done += len(batch.rows)
+        if progress is not None:
+            progress(done, len(at))
     return AmbientOcclusion(download_like(mean, points, normals), download_like(error, points, normals))

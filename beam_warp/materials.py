@@ -19,33 +19,29 @@ from scipy.spatial import cKDTree
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, Observability
 from beam_warp.checks import require_count
 from beam_warp.devices import upload
-from beam_warp.environment_sampling import environment_blocks
-from beam_warp.environments import EnvironmentMap
+from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.errors import InvalidArrayError
 from beam_warp.ggx import specular_albedo_table
 from beam_warp.images import srgb_to_linear
-from beam_warp.kernels.product_sampling import EnvironmentBlocks, launch_accumulate_block_weights
+from beam_warp.kernels.incident_light import launch_sum_unshadowed
+from beam_warp.kernels.product_sampling import launch_accumulate_block_weights
 from beam_warp.kernels.residues import (
-    CapturedColor,
+    CapturedSurface,
     ColorFit,
     LightRays,
-    SurfacePoints,
+    launch_draw_light,
     launch_fit_color,
     launch_trace_bounce,
-    launch_trace_light,
 )
-from beam_warp.lighting import Progress, ambient_occlusion, ray_offsets
+from beam_warp.kernels.sampling import SampleSet
+from beam_warp.kernels.surface_rays import RayBatch
+from beam_warp.lighting import Progress, ambient_occlusion
 from beam_warp.sampling import sample_set
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.surface_rays import points_for_weights, ray_batches, room_for_rays
 from beam_warp.surfaces import SurfaceNormals
-from beam_warp.tracing import EXACT
-
-POINTS_AT_ONCE = 1 << 14
-"""Gaussians whose rays are held at a time: 64 rays of 28 bytes and 512 block weights each, 60 MiB."""
-
-POINTS_AT_ONCE_ON_CUDA = 1 << 16
-"""The same on a GPU, which wants more work at once: 240 MiB."""
+from beam_warp.tracing import EXACT, trace_rays
 
 BOUNCE_PART = 4
 """The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
@@ -89,42 +85,6 @@ class MaterialOptions:
         """Check the numbers."""
         require_count("sample_count", self.sample_count, 2, 4096)
         require_count("seed", self.seed, 0, 2**32 - 1)
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedLight:
-    """An environment on a device, ready to be sampled; make it once, use it for every frame.
-
-    Attributes:
-        blocks: What drawing directions needs.
-        irradiance_map: Unshadowed irradiance by normal, lat-long.
-        mean_irradiance: Its mean over channels, for uniform light of the same mean radiance.
-    """
-
-    blocks: EnvironmentBlocks
-    irradiance_map: wp.array
-    mean_irradiance: float
-
-    @classmethod
-    def from_environment(cls, environment: EnvironmentMap, device: Any) -> PreparedLight:
-        """Accumulate what sampling and the ratio estimator need."""
-        return cls(
-            environment_blocks(environment, device),
-            upload(environment.default_irradiance, wp.vec3, device),
-            float(np.pi * environment.mean_radiance().mean()),
-        )
-
-    def scaled(self, factor: float) -> PreparedLight:
-        """Return the same light times a factor; cheaper than preparing it again, and its directions are the same."""
-        device = self.irradiance_map.device
-        blocks = EnvironmentBlocks()
-        for name in ("block_direction", "block_sine", "row_cdf", "column_cdf"):
-            setattr(blocks, name, getattr(self.blocks, name))
-        for name in ("radiance", "luminance", "block_power"):
-            array = getattr(self.blocks, name)
-            setattr(blocks, name, upload(array.numpy() * np.float32(factor), array.dtype, device))
-        irradiance = upload(self.irradiance_map.numpy() * np.float32(factor), wp.vec3, device)
-        return PreparedLight(blocks, irradiance, self.mean_irradiance * factor)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,7 +154,7 @@ def measure_materials(
     scene: Scene,
     surface: SurfaceNormals,
     roughness: NDArray[np.float32],
-    light: PreparedLight,
+    light: SampledEnvironment,
     *,
     options: MaterialOptions,
     frame: int = 0,
@@ -208,7 +168,7 @@ def measure_materials(
         scene: The same Gaussians, uploaded.
         surface: Their normals.
         roughness: Their perceptual roughness, ``(N,)``.
-        light: The light of the capture.
+        light: The light of the capture, prepared on the scene's device.
         options: Rays, offset, bounce, seed.
         frame: Number of the frame. Light rays differ from frame to frame, so that fits over frames average their
             noise; occlusion rays do not, so that ambient occlusion does not flicker.
@@ -237,92 +197,82 @@ def measure_materials(
         # Occlusion and light are about as much work, so each is half of the way.
         progress=None if progress is None else lambda done, total: progress(done // 2, total),
     )
-    results = {
-        name: np.zeros((count, *shape), np.float32)
-        for name, shape in (
-            ("irradiance", (3,)),
-            ("numerator", (3,)),
-            ("denominator", (3,)),
-            ("observed", (3,)),
-            ("noise", ()),
-        )
-    }
     table = upload(specular_albedo_table(), wp.vec2, device)
     views = upload(view_set(), wp.vec3, device)
     is_display = cloud.radiance_color_space == DISPLAY_SRGB
-    radiance = upload(cloud.radiance, wp.vec3, device)
     # Hits are taken as diffuse: the band of degree 0 is their mean colour over views.
     mean_color = 0.5 + SH_C0 * cloud.radiance[:, 0]
     if is_display:
         mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
     hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32), wp.vec3, device)
-    samples = options.sample_count
-    settings = EXACT.settings(scene)
+    samples = sample_set("owen", options.sample_count)
+    stream = (options.seed, frame)
     # What is buried is filled from neighbours anyway: its light is not traced.
     seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY)
-    step = POINTS_AT_ONCE_ON_CUDA if device.is_cuda else POINTS_AT_ONCE
-    for start in range(0, len(seen), step):
-        here = seen[start : start + step]
-        at = chosen[here]
-        size = len(at)
-        points = SurfacePoints()
-        points.positions = upload(cloud.positions[at], wp.vec3, device)
-        points.normals = upload(surface.normals[at], wp.vec3, device)
-        points.offsets = ray_offsets(scene, points.positions, points.normals, options.offset)
-        points.roughness = upload(roughness[at].astype(np.float32), float, device)
-        cumulative = wp.empty((size, 512), dtype=float, device=device)
-        launch_accumulate_block_weights(light.blocks, points.normals, cumulative, device)
-        rays = LightRays()
-        rays.directions = wp.empty(size * samples, dtype=wp.vec3, device=device)
-        rays.radiance_over_pdf = wp.empty(size * samples, dtype=wp.vec3, device=device)
-        rays.visibility = wp.empty(size * samples, dtype=float, device=device)
-        launch_trace_light(
-            scene,
-            settings,
-            points,
-            light.blocks,
-            cumulative,
-            (options.seed, frame),
-            start,
-            sample_set("owen", samples),
-            rays,
-        )
-        bounce = wp.zeros(size, dtype=wp.vec3, device=device)
+    points = upload(cloud.positions[chosen[seen]], wp.vec3, device)
+    normals = upload(surface.normals[chosen[seen]], wp.vec3, device)
+    captured = CapturedSurface()
+    captured.radiance = upload(cloud.radiance, wp.vec3, device)
+    captured.gaussians = upload(chosen[seen].astype(np.int32), int, device)
+    captured.display_srgb = int(is_display)
+    captured.roughness = upload(roughness[chosen[seen]].astype(np.float32), float, device)
+    unshadowed, bounce, irradiance = (wp.zeros(len(seen), dtype=wp.vec3, device=device) for _ in range(3))
+    launch_sum_unshadowed(light.moments, normals, unshadowed, device)
+    fit = ColorFit()
+    for name in ("numerator", "denominator", "observed"):
+        setattr(fit, name, wp.empty(len(seen), dtype=wp.vec3, device=device))
+    fit.relative_error = wp.empty(len(seen), dtype=float, device=device)
+    done = count - len(seen)
+    for batch in ray_batches(
+        scene,
+        points,
+        normals,
+        options.offset,
+        samples.count,
+        stratified=samples.columns > 0,
+        points_at_once=points_for_weights(device),
+    ):
+        light_rays = _trace_light(scene, light, batch, samples, stream)
         if options.bounce:
-            bounce_samples = max(samples // BOUNCE_PART, 2)
-            launch_trace_bounce(
-                scene, settings, points, hit_radiance, (options.seed, frame), start, bounce_samples, bounce
-            )
-        captured = CapturedColor()
-        captured.radiance = radiance
-        captured.rows = upload(at.astype(np.int32), int, device)
-        captured.display_srgb = int(is_display)
-        irradiance = wp.empty(size, dtype=wp.vec3, device=device)
-        fit = ColorFit()
-        for name in ("numerator", "denominator", "observed"):
-            setattr(fit, name, wp.empty(size, dtype=wp.vec3, device=device))
-        fit.relative_error = wp.empty(size, dtype=float, device=device)
-        launch_fit_color(
-            points,
-            rays,
-            samples,
-            light.irradiance_map,
-            bounce,
-            table,
-            views,
-            captured,
-            irradiance,
-            fit,
-            device,
-        )
-        results["irradiance"][here] = irradiance.numpy()
-        for name in ("numerator", "denominator", "observed"):
-            results[name][here] = getattr(fit, name).numpy()
-        results["noise"][here] = fit.relative_error.numpy() ** 2
+            bounce_samples = max(samples.count // BOUNCE_PART, 2)
+            launch_trace_bounce(scene, EXACT.settings(scene), batch, hit_radiance, stream, bounce_samples, bounce)
+        launch_fit_color(batch, light_rays, unshadowed, bounce, table, views, captured, irradiance, fit, device)
+        done += len(batch.rows)
         if progress is not None:
-            progress(count - (len(seen) - min(start + step, len(seen))) // 2, count)
-    evidence = ColorEvidence.from_arrays({"openness": occlusion.visibility, **results})
+            progress(count - (count - done) // 2, count)
+
+    def by_row(array: wp.array) -> NDArray[np.float32]:
+        """Zeros for what is buried."""
+        result = np.zeros((count, *array.numpy().shape[1:]), np.float32)
+        result[seen] = array.numpy()
+        return result
+
+    evidence = ColorEvidence(
+        numerator=by_row(fit.numerator),
+        denominator=by_row(fit.denominator),
+        observed=by_row(fit.observed),
+        irradiance=by_row(irradiance),
+        openness=occlusion.visibility,
+        noise=by_row(fit.relative_error) ** 2,
+    )
     return MaterialMeasurement(occlusion.visibility, occlusion.standard_error, evidence)
+
+
+def _trace_light(
+    scene: Scene, light: SampledEnvironment, batch: RayBatch, samples: SampleSet, stream: tuple[int, int]
+) -> LightRays:
+    """Draw a batch's rays towards the environment and trace them."""
+    device = scene.device
+    cumulative = wp.empty((len(batch.rows), 512), dtype=float, device=device)
+    launch_accumulate_block_weights(light.blocks, batch.normals, cumulative, device)
+    rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
+    result = LightRays()
+    result.directions = rays.directions
+    result.radiance_over_pdf = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
+    result.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
+    launch_draw_light(light.blocks, cumulative, batch, samples, stream, rays, result.radiance_over_pdf, device)
+    trace_rays(scene, EXACT, rays, result.visibility)
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,8 +112,6 @@ class PackedGaussians:
 
     def fate_counts(self) -> list[int]:
         """Return how many Gaussians met each fate of `kernels.bounds`."""
-        if self.device.is_cpu:  # where two threads of a kernel would lose each other's counts
-            return np.bincount(self.fates.numpy(), minlength=4).tolist()
         counts = wp.zeros(4, dtype=int, device=self.device)
         launch_count_fates(self.fates, counts, self.device)
         return counts.numpy().tolist()

@@ -24,6 +24,7 @@ from beam_warp.cameras import Camera, bulk
 from beam_warp.checks import require_number
 from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
+from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError, OutputError
 from beam_warp.exposure import estimate_exposure
@@ -33,7 +34,6 @@ from beam_warp.kernels.launching import thread_count
 from beam_warp.materials import (
     ColorEvidence,
     MaterialOptions,
-    PreparedLight,
     measure_materials,
     solve_base_color,
 )
@@ -270,7 +270,7 @@ class _Job:
         self.resumed = 0
         self.first = _Frame(0, sequence[0], self)
         with self.timer("prepare light"):
-            given = PreparedLight.from_environment(environment, self.device)
+            given = SampledEnvironment.from_environment(environment, self.device)
         self.exposure = self._find_exposure(environment, given)
         self.lit = environment.scaled(2.0**self.exposure)
         self.light = given.scaled(2.0**self.exposure)
@@ -291,7 +291,7 @@ class _Job:
             sort_keys=True,
         )
 
-    def _find_exposure(self, environment: EnvironmentMap, light: PreparedLight) -> float:
+    def _find_exposure(self, environment: EnvironmentMap, light: SampledEnvironment) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
             return require_number("exposure", self.options.exposure, -32.0, 32.0)

@@ -224,7 +224,6 @@ class Scene:
         packed = self._packed
         number = packed.fate_counts()
         traced = number[TRACED] + number[RAISED]
-        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
         depth, method = 0, WARP_BUILDS[build]
         if self.backend == "wide":
             self._tree = build_wide_tree(packed, traced, build)
@@ -235,6 +234,8 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
+        # The one Gaussian of an empty scene is not the cloud's.
+        invisible = number[INVISIBLE] if len(self) else 0
         self._report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
 
 
@@ -255,9 +256,13 @@ def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, devic
 
 def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh:
     """Return triangles on the device, relative to the scene's origin."""
-    arrays: dict[str, Any] = {name: getattr(mesh, name, None) for name in ("vertices", "faces")}
-    vertices = require_array("mesh.vertices", arrays["vertices"], (None, 3), np.float64)
-    faces = require_array("mesh.faces", arrays["faces"], (None, 3), np.int64)
+    for name in ("vertices", "faces"):
+        if getattr(mesh, name, None) is None:
+            raise InvalidArrayError(
+                f"mesh must have vertices and faces, got {type(mesh).__name__} without {name}. Pass a trimesh.Trimesh."
+            )
+    vertices = require_array("mesh.vertices", mesh.vertices, (None, 3), np.float64)
+    faces = require_array("mesh.faces", mesh.faces, (None, 3), np.int64)
     require_finite("mesh.vertices", vertices)
     if not len(faces):
         raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")

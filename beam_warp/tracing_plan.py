@@ -10,7 +10,7 @@ from typing import Any, Literal
 from beam_warp.charts import Settings
 from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import InvalidOptionError
-from beam_warp.irradiance import DENSITIES
+from beam_warp.incident_light import DENSITIES
 from beam_warp.sampling import SAMPLERS
 from beam_warp.scene import BACKENDS
 from beam_warp.tracing import ACCEPTANCES

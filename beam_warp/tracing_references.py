@@ -21,10 +21,11 @@ from beam_warp.devices import upload
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
-from beam_warp.irradiance import irradiance
-from beam_warp.kernels.ambient_occlusion import launch_local_surface
-from beam_warp.lighting import LIFT_IN_THICKNESSES, ambient_occlusion
+from beam_warp.incident_light import irradiance
+from beam_warp.kernels.surface_rays import launch_local_surface
+from beam_warp.lighting import ambient_occlusion
 from beam_warp.scene import Scene
+from beam_warp.surface_rays import LIFT_IN_THICKNESSES
 from beam_warp.surfaces import estimate_normals
 from beam_warp.tracing_plan import TracingPlan, parse_offset
 

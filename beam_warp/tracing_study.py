@@ -17,11 +17,12 @@ from beam_warp.charts import Axis, Interval, Metric, Row, Settings, Study, Subje
 from beam_warp.devices import resolve_device, upload
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
-from beam_warp.irradiance import irradiance
+from beam_warp.incident_light import irradiance
 from beam_warp.kernels.launching import thread_count
-from beam_warp.lighting import LIFT_IN_THICKNESSES, ambient_occlusion
+from beam_warp.lighting import ambient_occlusion
 from beam_warp.reference import visibility_reference
 from beam_warp.scene import Scene
+from beam_warp.surface_rays import LIFT_IN_THICKNESSES
 from beam_warp.tracing import TraceOptions, visibility
 from beam_warp.tracing_plan import DEFAULT_PLAN, TracingPlan
 from beam_warp.tracing_references import Progress, References, find_references

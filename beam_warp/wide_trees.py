@@ -10,13 +10,11 @@ import numpy as np
 import warp as wp
 
 from beam_warp.errors import InvalidArrayError
-from beam_warp.kernels.constants import LARGEST_FLOAT
 from beam_warp.kernels.radix_tree import launch_split_runs
 from beam_warp.kernels.tree_build import (
     BinaryTree,
     launch_choose_neighbors,
     launch_merge_clusters,
-    launch_order_boxes,
     launch_start_clusters,
 )
 from beam_warp.kernels.tree_collapse import (
@@ -26,6 +24,7 @@ from beam_warp.kernels.tree_collapse import (
     launch_open_level,
 )
 from beam_warp.kernels.wide_tree import LARGEST_DEPTH, LARGEST_NODE_COUNT, LEAF_ROWS, NODE_ROWS, WideTree
+from beam_warp.morton_order import morton_order
 from beam_warp.packed_gaussians import PackedGaussians
 
 WIDTH = 4
@@ -80,7 +79,7 @@ def build_wide_tree(packed: PackedGaussians, count: int, method: Method) -> Buil
     Raises:
         InvalidArrayError: The tree has more nodes than traversal can number, from about 75 million Gaussians on.
     """
-    items, keys = _morton_order(packed)
+    items, keys = morton_order(packed.lowers, packed.uppers, packed.takes_part)
     methods: tuple[Method, ...] = (method, "places") if method != "places" else ("places",)
     for chosen in methods:
         if count == 0:
@@ -101,17 +100,6 @@ def refit(built: BuiltTree, packed: PackedGaussians) -> None:
     launch_fill_leaves(packed.gaussians, built.layout, built.count, built.tree, packed.device)
     for begin, count in reversed(built.levels):
         launch_bound_nodes(begin, count, packed.lowers, packed.uppers, built.layout, built.tree, packed.device)
-
-
-def _morton_order(packed: PackedGaussians) -> tuple[wp.array, wp.array]:
-    """Return (items, keys) in Morton order; what takes no part comes last."""
-    total, device = len(packed), packed.device
-    keys = wp.empty(2 * total, dtype=wp.int64, device=device)
-    items = wp.empty(2 * total, dtype=int, device=device)
-    bounds = wp.array([[LARGEST_FLOAT] * 3, [-LARGEST_FLOAT] * 3], dtype=wp.vec3, device=device)
-    launch_order_boxes(packed.lowers, packed.uppers, packed.takes_part, bounds, keys, items, device)
-    wp.utils.radix_sort_pairs(keys, items, total)
-    return items, keys
 
 
 def _split(keys: wp.array, count: int, device: Any) -> tuple[BinaryTree, int]:

@@ -29,7 +29,7 @@ from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
 from beam_warp.demo_figure import build_figure
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap, texel_directions
-from beam_warp.irradiance import irradiance
+from beam_warp.incident_light import irradiance
 
 REFERENCE_RAYS = 16_384
 SEEDS = range(1, 5)

@@ -26,10 +26,10 @@ from beam_warp import Scene, ambient_occlusion, converters, visibility
 from beam_warp.axes import change_axes
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
-from beam_warp.lighting import ray_offsets
 from beam_warp.materials import MaterialOptions
 from beam_warp.pipeline import RunOptions, run
 from beam_warp.reference import visibility_reference
+from beam_warp.surface_rays import ray_offsets
 from beam_warp.surfaces import estimate_normals
 
 

@@ -1,12 +1,8 @@
-"""Ambient occlusion of surface points: where rays start, the rays themselves, and their mean with its error."""
-
-from typing import Any
+"""Ambient occlusion of surface points: the rays, and their mean with its error."""
 
 import warp as wp
 
-from beam_warp.kernels.constants import LARGEST_FLOAT
 from beam_warp.kernels.launching import launch
-from beam_warp.kernels.occluders import surface_layer, transmittance
 from beam_warp.kernels.sampling import (
     SampleSet,
     draw_square,
@@ -16,7 +12,8 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.trace_settings import TraceSettings
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,121 +22,72 @@ LARGEST_DEVIATION = wp.constant(0.5)
 
 
 @wp.kernel
-def local_surface_kernel(
+def draw_occlusion_kernel(
     first: int,
-    occluders: Any,
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    out_surface: wp.array[wp.vec2],
-):
-    """(height, thickness) of the layer of Gaussians around each point, along its normal."""
-    i = first + wp.tid()
-    out_surface[i] = surface_layer(occluders, points[i] - occluders.origin, normals[i])
-
-
-@wp.kernel
-def trace_occlusion_kernel(
-    first: int,
-    occluders: Any,
-    settings: TraceSettings,
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    offsets: wp.array[float],
+    batch: RayBatch,
+    samples: SampleSet,
     seed: wp.uint32,
     frame: wp.uint32,
-    first_point: int,
-    samples: SampleSet,
-    out_visibility: wp.array[float],
+    out_rays: Rays,
 ):
-    """One cosine-distributed ray a thread; the result goes to the ray's slot."""
-    ray = first + wp.tid()
-    point = ray / samples.count
-    index = ray % samples.count
-    n = normals[point]
-    stream = stream_of(seed, frame, wp.uint32(first_point + point))
+    """One cosine-distributed ray a thread."""
+    item = first + wp.tid()
+    place = item / samples.count
+    index = item % samples.count
+    stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
     drawn = draw_square(samples, index, stream)
-    direction = tangent_frame(n) * square_to_cosine_hemisphere(drawn.u, drawn.v)
-    origin = points[point] - occluders.origin + n * offsets[point]
-    out_visibility[point * samples.count + drawn.slot] = transmittance(
-        occluders, settings, origin, direction, LARGEST_FLOAT, hash_combine(stream, wp.uint32(index + 16))
-    )
+    at = rays_of(batch, place)
+    ray = at[0] + drawn.slot * at[1]
+    out_rays.origins[ray] = ray_origin(batch, place)
+    out_rays.directions[ray] = tangent_frame(batch.normals[place]) * square_to_cosine_hemisphere(drawn.u, drawn.v)
+    if out_rays.streams.shape[0] > 0:
+        out_rays.streams[ray] = hash_combine(stream, wp.uint32(index + 16))
 
 
 @wp.kernel
 def reduce_visibility_kernel(
     first: int,
-    visibility: wp.array[float],
+    batch: RayBatch,
     samples: SampleSet,
+    visibility: wp.array[float],
     out_mean: wp.array[float],
     out_error: wp.array[float],
 ):
     """Mean and standard error of each point's samples; of one sample nothing is known but that it lies in [0, 1]."""
-    point = first + wp.tid()
-    start = point * samples.count
+    place = first + wp.tid()
+    at = rays_of(batch, place)
     total = float(0.0)
     spread = Spread()
     spread.paired = wp.where(samples.columns > 0, 1, 0)
     for k in range(samples.count):
-        total += visibility[start + k]
-        spread = add_term(spread, visibility[start + k])
-    out_mean[point] = total / float(samples.count)
-    out_error[point] = LARGEST_DEVIATION
+        v = visibility[at[0] + k * at[1]]
+        total += v
+        spread = add_term(spread, v)
+    error = float(LARGEST_DEVIATION)
     if samples.count > 1:
-        out_error[point] = wp.sqrt(variance_of_sum(spread)) / float(samples.count)
+        error = wp.sqrt(variance_of_sum(spread)) / float(samples.count)
+    out_mean[batch.rows[place]] = total / float(samples.count)
+    out_error[batch.rows[place]] = error
 
 
-def launch_local_surface(occluders, points, normals, out_surface, device):
-    """Measure the layer of Gaussians around each point."""
+def launch_draw_occlusion(batch, samples, stream, out_rays, device):
+    """Draw the rays of a batch; ``stream`` is (seed, frame)."""
     launch(
-        local_surface_kernel,
-        len(points),
-        inputs=[occluders, points, normals],
-        outputs=[out_surface],
+        draw_occlusion_kernel,
+        len(batch.rows) * samples.count,
+        inputs=[batch, samples, wp.uint32(stream[0]), wp.uint32(stream[1])],
+        outputs=[out_rays],
         device=device,
-        block_dim=64,
     )
 
 
-def launch_trace_occlusion(
-    occluders,
-    settings,
-    points,
-    normals,
-    offsets,
-    seed,
-    frame,
-    first_point,
-    samples,
-    out_visibility,
-    device,
-):
-    """Trace ``samples.count`` rays from each point."""
-    launch(
-        trace_occlusion_kernel,
-        len(points) * samples.count,
-        inputs=[
-            occluders,
-            settings,
-            points,
-            normals,
-            offsets,
-            wp.uint32(seed),
-            wp.uint32(frame),
-            first_point,
-            samples,
-        ],
-        outputs=[out_visibility],
-        device=device,
-        block_dim=64,
-    )
-
-
-def launch_reduce_visibility(visibility, samples, out_mean, out_error, device):
-    """Reduce each point's samples to mean and error."""
+def launch_reduce_visibility(batch, samples, visibility, out_mean, out_error, device):
+    """Reduce each point's samples to mean and error, in its own row."""
     launch(
         reduce_visibility_kernel,
-        len(out_mean),
-        inputs=[visibility, samples],
+        len(batch.rows),
+        inputs=[batch, samples, visibility],
         outputs=[out_mean, out_error],
         device=device,
+        block_dim=64,
     )

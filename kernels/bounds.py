@@ -39,9 +39,10 @@ def pack_gaussians_kernel(
     opacity = opacities[i]
     norm = wp.length(orientation)
     fate = int(TRACED)
-    # Comparisons are phrased so that NaN and infinity fail them.
+    # Comparisons are phrased so that NaN and infinity fail them; minima and maxima would pass over NaN.
     usable = wp.length(center) < LARGEST_LENGTH and norm > 0.0 and norm < LARGEST_LENGTH and opacity <= 1.0
-    usable = usable and wp.min(scale) >= 0.0 and wp.max(scale) < LARGEST_LENGTH
+    for k in range(3):
+        usable = usable and scale[k] >= 0.0 and scale[k] < LARGEST_LENGTH
     if not usable:
         fate = NOT_FINITE
         center = wp.vec3()
@@ -50,6 +51,8 @@ def pack_gaussians_kernel(
     if not (opacity > ALPHA_MIN):
         if usable:
             fate = INVISIBLE
+        opacity = 0.0
+    if not usable:
         opacity = 0.0
     floor = wp.max(smallest_scale, wp.max(scale) * largest_ratio)
     if fate == TRACED and wp.min(scale) < floor:
@@ -102,7 +105,8 @@ def count_fates_kernel(first: int, fates: wp.array[int], out_counts: wp.array[in
 
 def launch_count_fates(fates, out_counts, device):
     """Count into ``out_counts``, four numbers that must be 0."""
-    launch(count_fates_kernel, -(-len(fates) // FATES_A_THREAD), inputs=[fates], outputs=[out_counts], device=device)
+    groups = -(-len(fates) // FATES_A_THREAD)
+    launch(count_fates_kernel, groups, inputs=[fates], outputs=[out_counts], device=device, in_order=True)
 
 
 def launch_pack_gaussians(

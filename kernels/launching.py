@@ -2,8 +2,7 @@
 
 Every kernel launched here takes ``first: int`` as its first input and works on item ``first + wp.tid()``.
 Items must write disjoint outputs; then the result has the same bits for every chunking and thread count. Kernels that
-count or bound with atomics are launched with ``shares_outputs``: on the CPU Warp's atomics are plain reads and writes,
-and two threads would lose each other's.
+share outputs by atomics are launched ``in_order``.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def launch(
     outputs: Sequence[Any],
     device: Any,
     block_dim: int = 256,
-    shares_outputs: bool = False,
+    in_order: bool = False,
 ) -> None:
     """Run ``kernel`` for items 0 … count - 1.
 
@@ -49,7 +48,8 @@ def launch(
         outputs: Kernel outputs.
         device: Where the arrays are.
         block_dim: CUDA block size.
-        shares_outputs: Items write to the same places, with atomics: one thread runs them all on the CPU.
+        in_order: Use one thread on the CPU. Kernels with atomics need it: there Warp's atomics are plain additions,
+            made for its own launches of one thread.
     """
     if count <= 0:
         return
@@ -57,7 +57,7 @@ def launch(
     if target.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=target, block_dim=block_dim)
         return
-    threads = 1 if shares_outputs else thread_count()
+    threads = 1 if in_order else thread_count()
     chunk = max(MIN_CHUNK, -(-count // (threads * CHUNKS_PER_THREAD)))
     starts = range(0, count, chunk)
 

@@ -11,9 +11,8 @@ import warp as wp
 from beam_warp.kernels.brdf import specular_albedo, specular_brdf
 from beam_warp.kernels.constants import LARGEST_FLOAT
 from beam_warp.kernels.environment_sampling import radiance_over_pdf
-from beam_warp.kernels.latlong import latlong_bilinear
 from beam_warp.kernels.launching import launch
-from beam_warp.kernels.occluders import sampled_hit, transmittance
+from beam_warp.kernels.occluders import sampled_hit
 from beam_warp.kernels.product_sampling import EnvironmentBlocks, square_to_product
 from beam_warp.kernels.sampling import (
     SampleSet,
@@ -27,6 +26,8 @@ from beam_warp.kernels.sampling import (
     unit_float,
 )
 from beam_warp.kernels.spherical_harmonics import captured_radiance
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.trace import Rays
 from beam_warp.kernels.trace_settings import TraceSettings
 
 wp.set_module_options({"enable_backward": False})
@@ -37,18 +38,8 @@ BOUNCE_STREAM = wp.constant(wp.uint32(0x424F554E))
 
 
 @wp.struct
-class SurfacePoints:
-    """Where light is gathered."""
-
-    positions: wp.array[wp.vec3]
-    normals: wp.array[wp.vec3]
-    offsets: wp.array[float]
-    roughness: wp.array[float]
-
-
-@wp.struct
 class LightRays:
-    """Rays towards the environment, ``sample_count`` a point, in order of their strata."""
+    """Rays towards the environment as a batch lays them out, and what they found."""
 
     directions: wp.array[wp.vec3]
     radiance_over_pdf: wp.array[wp.vec3]
@@ -56,12 +47,13 @@ class LightRays:
 
 
 @wp.struct
-class CapturedColor:
-    """Spherical harmonics of the whole cloud, the row of each point in it, and whether they are display sRGB."""
+class CapturedSurface:
+    """What is known of the points, by row: spherical harmonics of the whole cloud, each point's place in it, …"""
 
     radiance: wp.array2d[wp.vec3]
-    rows: wp.array[int]
-    display_srgb: int
+    gaussians: wp.array[int]
+    display_srgb: int  # whether the harmonics are display sRGB
+    roughness: wp.array[float]
 
 
 @wp.struct
@@ -75,34 +67,29 @@ class ColorFit:
 
 
 @wp.kernel
-def trace_light_kernel(
+def draw_light_kernel(
     first: int,
-    occluders: Any,
-    settings: TraceSettings,
-    points: SurfacePoints,
     blocks: EnvironmentBlocks,
     cumulative: wp.array2d[float],
+    batch: RayBatch,
+    samples: SampleSet,
     seed: wp.uint32,
     frame: wp.uint32,
-    first_point: int,
-    samples: SampleSet,
-    out_rays: LightRays,
+    out_rays: Rays,
+    out_radiance_over_pdf: wp.array[wp.vec3],
 ):
-    ray = first + wp.tid()
-    point = ray / samples.count
-    index = ray % samples.count
-    stream = hash_combine(stream_of(seed, frame, wp.uint32(first_point + point)), LIGHT_STREAM)
-    at = draw_square(samples, index, stream)
-    drawn = square_to_product(blocks, cumulative, point, at.u, at.v)
-    slot = point * samples.count + at.slot
-    n = points.normals[point]
-    v = float(0.0)
-    if wp.dot(n, drawn.direction) > 0.0:
-        origin = points.positions[point] - occluders.origin + n * points.offsets[point]
-        v = transmittance(occluders, settings, origin, drawn.direction, LARGEST_FLOAT, stream + wp.uint32(index))
-    out_rays.directions[slot] = drawn.direction
-    out_rays.radiance_over_pdf[slot] = radiance_over_pdf(drawn)
-    out_rays.visibility[slot] = v
+    """One ray a thread, by environment times cosine; what goes below the horizon is not traced."""
+    item = first + wp.tid()
+    place = item / samples.count
+    stream = hash_combine(stream_of(seed, frame, wp.uint32(batch.rows[place])), LIGHT_STREAM)
+    square = draw_square(samples, item % samples.count, stream)
+    drawn = square_to_product(blocks, cumulative, place, square.u, square.v)
+    at = rays_of(batch, place)
+    ray = at[0] + square.slot * at[1]
+    out_rays.origins[ray] = ray_origin(batch, place)
+    out_rays.directions[ray] = drawn.direction
+    out_rays.reaches[ray] = wp.where(wp.dot(batch.normals[place], drawn.direction) > 0.0, float(LARGEST_FLOAT), -1.0)
+    out_radiance_over_pdf[ray] = radiance_over_pdf(drawn)
 
 
 @wp.kernel
@@ -110,20 +97,18 @@ def trace_bounce_kernel(
     first: int,
     occluders: Any,
     settings: TraceSettings,
-    points: SurfacePoints,
+    batch: RayBatch,
     gaussian_radiance: wp.array[wp.vec3],
     seed: wp.uint32,
     frame: wp.uint32,
-    first_point: int,
     sample_count: int,
     out_irradiance: wp.array[wp.vec3],
 ):
     """Irradiance over pi from the captured radiance of what cosine-distributed rays hit: one bounce, already lit."""
-    point = first + wp.tid()
-    n = points.normals[point]
-    basis = tangent_frame(n)
-    origin = points.positions[point] - occluders.origin + n * points.offsets[point]
-    stream = hash_combine(stream_of(seed, frame, wp.uint32(first_point + point)), BOUNCE_STREAM)
+    place = first + wp.tid()
+    basis = tangent_frame(batch.normals[place])
+    origin = ray_origin(batch, place)
+    stream = hash_combine(stream_of(seed, frame, wp.uint32(batch.rows[place])), BOUNCE_STREAM)
     total = wp.vec3()
     for sample in range(sample_count):
         direction = basis * square_to_cosine_hemisphere(
@@ -134,20 +119,19 @@ def trace_bounce_kernel(
         )
         if hit >= 0:
             total += gaussian_radiance[hit]
-    out_irradiance[point] = total / float(sample_count)
+    out_irradiance[batch.rows[place]] = total / float(sample_count)
 
 
 @wp.kernel
 def fit_color_kernel(
     first: int,
-    points: SurfacePoints,
+    batch: RayBatch,
     rays: LightRays,
-    sample_count: int,
-    irradiance_map: wp.array2d[wp.vec3],
+    unshadowed: wp.array[wp.vec3],
     bounce: wp.array[wp.vec3],
     albedo_table: wp.array2d[wp.vec2],
     views: wp.array[wp.vec3],
-    captured: CapturedColor,
+    surface: CapturedSurface,
     out_irradiance: wp.array[wp.vec3],
     out_fit: ColorFit,
 ):
@@ -156,21 +140,22 @@ def fit_color_kernel(
     E = E_unshadowed * sum V f / sum f: the noise of f cancels, what remains comes from where V varies
     (Heitz et al. 2018). Diffuse weight 1 - E_spec(n.v): what the specular lobe reflects is not left for diffusion.
     """
-    point = first + wp.tid()
-    start = point * sample_count
-    n = points.normals[point]
-    roughness = points.roughness[point]
+    place = first + wp.tid()
+    point = batch.rows[place]
+    at = rays_of(batch, place)
+    n = batch.normals[place]
+    roughness = surface.roughness[point]
     free = wp.vec3()
     seen = wp.vec3()
-    for k in range(sample_count):
-        f = rays.radiance_over_pdf[start + k] * wp.max(wp.dot(n, rays.directions[start + k]), 0.0)
+    for k in range(batch.sample_count):
+        ray = at[0] + k * at[1]
+        f = rays.radiance_over_pdf[ray] * wp.max(wp.dot(n, rays.directions[ray]), 0.0)
         free += f
-        seen += f * rays.visibility[start + k]
-    unshadowed = latlong_bilinear(irradiance_map, n)
+        seen += f * rays.visibility[ray]
     irradiance = wp.vec3()
     for c in range(3):
         if free[c] > 0.0:
-            irradiance[c] = unshadowed[c] * seen[c] / free[c]
+            irradiance[c] = unshadowed[point][c] * PI * seen[c] / free[c]
     out_irradiance[point] = irradiance
 
     # Error of the ratio by neighbouring strata of its linearised terms (V - R) f, on the sum of the channels.
@@ -181,10 +166,11 @@ def fit_color_kernel(
         ratio = seen_sum / free_sum
         spread = float(0.0)
         before = float(0.0)
-        for k in range(sample_count):
-            w = rays.radiance_over_pdf[start + k]
-            power = (w[0] + w[1] + w[2]) * wp.max(wp.dot(n, rays.directions[start + k]), 0.0)
-            term = (rays.visibility[start + k] - ratio) * power
+        for k in range(batch.sample_count):
+            ray = at[0] + k * at[1]
+            w = rays.radiance_over_pdf[ray]
+            power = (w[0] + w[1] + w[2]) * wp.max(wp.dot(n, rays.directions[ray]), 0.0)
+            term = (rays.visibility[ray] - ratio) * power
             if k % 2 == 1:
                 spread += (term - before) * (term - before)
             before = term
@@ -198,17 +184,18 @@ def fit_color_kernel(
         v = basis * views[view]
         weight = views[view][2]  # projected area: what a camera there sees of the surface
         specular = wp.vec3()
-        for k in range(sample_count):
-            light = rays.directions[start + k]
+        for k in range(batch.sample_count):
+            ray = at[0] + k * at[1]
+            light = rays.directions[ray]
             cosine = wp.dot(n, light)
             if cosine > 0.0:
-                specular += rays.radiance_over_pdf[start + k] * (
-                    rays.visibility[start + k] * cosine * specular_brdf(n, v, light, roughness)
+                specular += rays.radiance_over_pdf[ray] * (
+                    rays.visibility[ray] * cosine * specular_brdf(n, v, light, roughness)
                 )
         albedo = specular_albedo(albedo_table, weight, roughness)
-        specular = specular / float(sample_count) + bounce[point] * albedo
+        specular = specular / float(batch.sample_count) + bounce[point] * albedo
         diffuse = (irradiance / PI + bounce[point]) * (1.0 - albedo)
-        target = captured_radiance(captured.radiance, captured.rows[point], -v, captured.display_srgb) - specular
+        target = captured_radiance(surface.radiance, surface.gaussians[point], -v, surface.display_srgb) - specular
         numerator += wp.cw_mul(diffuse, target) * weight
         denominator += wp.cw_mul(diffuse, diffuse) * weight
         observed += wp.cw_mul(target, target) * weight
@@ -218,41 +205,30 @@ def fit_color_kernel(
     out_fit.relative_error[point] = relative_error
 
 
-def launch_trace_light(scene, settings, points, blocks, cumulative, stream, first_point, samples, out_rays):
-    """Draw and trace the rays towards the environment; ``stream`` is (seed, frame)."""
+def launch_draw_light(blocks, cumulative, batch, samples, stream, out_rays, out_radiance_over_pdf, device):
+    """Draw the rays towards the environment; ``stream`` is (seed, frame)."""
     launch(
-        trace_light_kernel,
-        len(points.positions) * samples.count,
-        inputs=[
-            scene.occluders,
-            settings,
-            points,
-            blocks,
-            cumulative,
-            wp.uint32(stream[0]),
-            wp.uint32(stream[1]),
-            first_point,
-            samples,
-        ],
-        outputs=[out_rays],
-        device=scene.device,
-        block_dim=64,
+        draw_light_kernel,
+        len(batch.rows) * samples.count,
+        inputs=[blocks, cumulative, batch, samples, wp.uint32(stream[0]), wp.uint32(stream[1])],
+        outputs=[out_rays, out_radiance_over_pdf],
+        device=device,
+        block_dim=128,
     )
 
 
-def launch_trace_bounce(scene, settings, points, gaussian_radiance, stream, first_point, sample_count, out_irradiance):
+def launch_trace_bounce(scene, settings, batch, gaussian_radiance, stream, sample_count, out_irradiance):
     """Gather one bounce; ``stream`` is (seed, frame)."""
     launch(
         trace_bounce_kernel,
-        len(points.positions),
+        len(batch.rows),
         inputs=[
             scene.occluders,
             settings,
-            points,
+            batch,
             gaussian_radiance,
             wp.uint32(stream[0]),
             wp.uint32(stream[1]),
-            first_point,
             sample_count,
         ],
         outputs=[out_irradiance],
@@ -261,33 +237,12 @@ def launch_trace_bounce(scene, settings, points, gaussian_radiance, stream, firs
     )
 
 
-def launch_fit_color(
-    points,
-    rays,
-    sample_count,
-    irradiance_map,
-    bounce,
-    albedo_table,
-    views,
-    captured,
-    out_irradiance,
-    out_fit,
-    device,
-):
-    """Accumulate the least-squares sums of every point."""
+def launch_fit_color(batch, rays, unshadowed, bounce, albedo_table, views, surface, out_irradiance, out_fit, device):
+    """Accumulate the least-squares sums of every point; all but ``rays`` is by row."""
     launch(
         fit_color_kernel,
-        len(points.positions),
-        inputs=[
-            points,
-            rays,
-            sample_count,
-            irradiance_map,
-            bounce,
-            albedo_table,
-            views,
-            captured,
-        ],
+        len(batch.rows),
+        inputs=[batch, rays, unshadowed, bounce, albedo_table, views, surface],
         outputs=[out_irradiance, out_fit],
         device=device,
         block_dim=64,

@@ -194,7 +194,7 @@ def launch_order_boxes(lowers, uppers, takes_part, bounds, out_keys, out_items, 
         inputs=[lowers, uppers, takes_part],
         outputs=[bounds],
         device=device,
-        shares_outputs=True,
+        in_order=True,
     )
     launch(
         order_boxes_kernel,

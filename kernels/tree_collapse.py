@@ -221,7 +221,7 @@ def launch_open_level(
         inputs=[tree, items, leaf_count, int(by_area), level, queue, level_sizes],
         outputs=[out_queue, out_layout],
         device=device,
-        shares_outputs=True,
+        in_order=True,
     )
 
 

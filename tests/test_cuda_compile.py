@@ -18,7 +18,7 @@ from beam_warp import kernels
 
 MODULES = sorted(entry.name for entry in pkgutil.iter_modules(kernels.__path__))
 
-TRACING = {"ambient_occlusion", "closest_surface", "irradiance", "trace", "visibility_adjoint"}
+TRACING = {"closest_surface", "residues", "surface_rays", "trace", "trace_counts", "visibility_adjoint"}
 """Some of the modules that must have been compiled for every structure of occluders."""
 
 

@@ -13,9 +13,9 @@ from beam_warp import Scene, ambient_occlusion
 from beam_warp.environment_sampling import SampledEnvironment, light_moments
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.irradiance import DENSITIES, irradiance, techniques
+from beam_warp.incident_light import DENSITIES, irradiance, techniques
 from beam_warp.kernels.environment_sampling import EnvironmentDistribution
-from beam_warp.kernels.irradiance import Technique, draw_light, launch_sum_unshadowed, mixture_pdf
+from beam_warp.kernels.incident_light import Technique, draw_light, launch_sum_unshadowed, mixture_pdf
 from beam_warp.kernels.product_sampling import EnvironmentBlocks
 from beam_warp.sampling import SAMPLERS
 from beam_warp.tracing import TraceOptions
@@ -385,7 +385,7 @@ class TestCalls:
             whole = irradiance(scene, points, normals, light, density=density, sample_count=16)
             with monkeypatch.context() as patch:
                 patch.setenv("BEAM_WARP_THREADS", "3")
-                patch.setattr("beam_warp.irradiance.RAYS_AT_ONCE", 16 * 70)
+                patch.setattr("beam_warp.surface_rays.RAYS_AT_ONCE", 16 * 70)
                 parts = irradiance(scene, points, normals, light, density=density, sample_count=16)
             assert np.array_equal(whole.value, parts.value)
             assert np.array_equal(whole.standard_error, parts.standard_error)

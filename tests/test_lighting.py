@@ -140,7 +140,7 @@ class TestRepeats:
         n = np.tile(UP, (3000, 1))
         whole = ambient_occlusion(scene, cloud.positions, n, sample_count=8)
         monkeypatch.setenv("BEAM_WARP_THREADS", "3")
-        monkeypatch.setattr("beam_warp.lighting.RAYS_AT_ONCE", 8 * 700)
+        monkeypatch.setattr("beam_warp.surface_rays.RAYS_AT_ONCE", 8 * 700)
         parts = ambient_occlusion(scene, cloud.positions, n, sample_count=8)
         assert np.array_equal(whole.visibility, parts.visibility)
         assert np.array_equal(whole.standard_error, parts.standard_error)

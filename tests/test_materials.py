@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from shapes import cloud_of, disc_points, sphere_points, tiles
 
-from beam_warp import GaussianCloud, Observability, Scene
+from beam_warp import GaussianCloud, Observability, Scene, irradiance
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
 from beam_warp.exposure import estimate_exposure
 from beam_warp.images import linear_to_srgb
 from beam_warp.materials import (
     MaterialOptions,
-    PreparedLight,
     measure_materials,
     solve_base_color,
     view_set,
@@ -39,7 +39,7 @@ def certain(normals):
 
 def decompose(cloud, normals, environment, device, options=None, frames=(0,)):
     scene = Scene.from_gaussians(cloud, device)
-    light = PreparedLight.from_environment(environment, scene.device)
+    light = SampledEnvironment.from_environment(environment, scene.device)
     roughness = np.full(len(cloud), ROUGHNESS, np.float32)
     evidence = None
     for frame in frames:
@@ -99,6 +99,20 @@ class TestConvexBody:
         solved, _ = decompose(cloud, points, dim, device)
         expected = (reflected(0.4, np.pi) - SPECULAR_ALBEDO * 0.5) / (0.5 * (1.0 - SPECULAR_ALBEDO))
         assert np.abs(solved.base_color - expected).max() < 0.03
+
+
+def test_light_of_open_surfaces_is_the_unshadowed_irradiance(device):
+    """Far from each other nothing is in the way: what is measured is the closed form, under a sun of one texel too."""
+    normals, _ = sphere_points(200)
+    cloud = cloud_of(tiles(1000.0 * normals, normals, 0.05))
+    radiance = EnvironmentMap.constant((0.3, 0.4, 0.6), height=64).radiance.copy()
+    radiance[14, 30] = (2e4, 1.5e4, 1e4)
+    environment = EnvironmentMap(radiance)
+    _, measured = decompose(with_radiance(cloud, np.full((200, 3), 0.5)), normals, environment, device)
+    free = irradiance(Scene.from_gaussians(cloud.select(np.arange(0)), device), normals, normals, environment)
+    assert (measured.ambient_occlusion == 1.0).all()
+    # the same closed form times a ratio of equal sums
+    np.testing.assert_allclose(measured.evidence.irradiance, np.pi * free.value, rtol=1e-5)
 
 
 class TestOccluded:
@@ -257,7 +271,7 @@ class TestExposure:
             scene,
             certain(points),
             np.full(1500, ROUGHNESS, np.float32),
-            PreparedLight.from_environment(
+            SampledEnvironment.from_environment(
                 EnvironmentMap.constant((1.0, 1.0, 1.0), height=32).exposed(stops), scene.device
             ),
             options=MaterialOptions(),
@@ -274,8 +288,8 @@ def test_views_are_unit_and_on_the_visible_side():
 
 def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
     scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
-    one = PreparedLight.from_environment(sky(), scene.device).scaled(4.0)
-    other = PreparedLight.from_environment(sky().scaled(4.0), scene.device)
+    one = SampledEnvironment.from_environment(sky(), scene.device).scaled(4.0)
+    other = SampledEnvironment.from_environment(sky().scaled(4.0), scene.device)
     assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
     for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
         assert np.allclose(getattr(one.blocks, name).numpy(), getattr(other.blocks, name).numpy(), rtol=1e-5, atol=1e-6)

@@ -54,7 +54,7 @@ def test_everything_is_written_valid_and_readable(tmp_path, light):
 
 
 def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatch):
-    monkeypatch.setattr("beam_warp.lighting.RAYS_AT_ONCE", 8 * 100)
+    monkeypatch.setattr("beam_warp.surface_rays.RAYS_AT_ONCE", 8 * 100)
     said = []
     sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
     run(sequence, light, tmp_path / "out", FAST, overview=SMALL, progress=lambda *step: said.append(step))

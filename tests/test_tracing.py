@@ -9,7 +9,7 @@ from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.kernels import launching
 from beam_warp.reference import visibility_reference
-from beam_warp.tracing import TraceOptions
+from beam_warp.tracing import TraceOptions, traversal_counts
 
 # V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
 # distance over smallest scale (about 1e3 here), on alphas whose slope in the response is at most 1.
@@ -237,3 +237,39 @@ class TestRefusals:
     def test_reach(self, scene, t_max):
         with pytest.raises(InvalidOptionError, match="t_max must be a number in"):
             visibility(scene, np.zeros((1, 3)), [[1.0, 0, 0]], t_max=t_max)
+
+
+class TestTraversalCounts:
+    def test_hits_are_those_of_brute_force(self, device, rng):
+        cloud, (origins, directions) = random_cloud(rng, 600, scale=(-2.5, 0.3)), random_rays(rng, 200)
+        never = TraceOptions(stop=0.0)
+        found = {
+            backend: traversal_counts(
+                Scene.from_gaussians(cloud, device, backend=backend), origins, directions, options=never
+            )
+            for backend in ("wide", "warp")
+        }
+        # One Gaussian alone blocks or does not: its hits are where V is below 1.
+        hits = np.zeros(200, int)
+        for row in range(600):
+            hits += visibility_reference(cloud.select([row]), origins, directions) < 1.0
+        for counts in found.values():
+            assert np.abs(counts.hits - hits).max() <= 1  # a cut within rounding may go either way
+            assert (counts.tested >= counts.hits).all()
+        assert (found["wide"].nodes > 0).all()
+        assert (found["warp"].nodes == 0).all()
+
+    def test_stop_saves_work(self, device):
+        count = 200
+        cloud = GaussianCloud(
+            positions=np.stack([np.arange(count) * 0.1, np.zeros(count), np.zeros(count)], axis=1),
+            orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+            scales=np.full((count, 3), 0.02),
+            opacities=np.full(count, 0.8),
+        )
+        counts = traversal_counts(Scene.from_gaussians(cloud, device), *along_x())
+        assert counts.hits.tolist() == [6]  # 0.2^6 is the first below 1e-4
+        assert (
+            traversal_counts(Scene.from_gaussians(cloud, device), *along_x(), options=TraceOptions(stop=0.0)).hits
+            == 200
+        )

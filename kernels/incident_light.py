@@ -1,9 +1,4 @@
-"""Light that reaches points from an environment: drawing directions towards it, tracing them, and what they add up to.
-
-Drawing and tracing are apart, so that the kernel that traverses the hierarchy carries no registers of the others.
-"""
-
-from typing import Any
+"""Light that reaches points from an environment: drawing rays towards it, and what they add up to."""
 
 import warp as wp
 
@@ -17,7 +12,6 @@ from beam_warp.kernels.environment_sampling import (
     square_to_environment_pdf,
 )
 from beam_warp.kernels.launching import launch
-from beam_warp.kernels.occluders import transmittance
 from beam_warp.kernels.product_sampling import EnvironmentBlocks, square_to_product
 from beam_warp.kernels.sampling import (
     SampleSet,
@@ -29,7 +23,8 @@ from beam_warp.kernels.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.trace_settings import TraceSettings
+from beam_warp.kernels.surface_rays import RayBatch, ray_origin, rays_of
+from beam_warp.kernels.trace import Rays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,15 +47,6 @@ class LightMoments:
 
 
 @wp.struct
-class Receivers:
-    """Points that light falls on."""
-
-    positions: wp.array[wp.vec3]
-    normals: wp.array[wp.vec3]
-    offsets: wp.array[float]
-
-
-@wp.struct
 class Technique:
     """Samples of each point that one density draws."""
 
@@ -70,14 +56,6 @@ class Technique:
     sample_count: int  # of a point, by all techniques
     cosine_share: float  # part of a point's samples that COSINE draws
     environment_share: float  # part that ENVIRONMENT draws
-
-
-@wp.struct
-class DrawnLight:
-    """Directions, ``sample_count`` a point, and radiance times cosine over pi times density: 0 where no ray is due."""
-
-    directions: wp.array[wp.vec3]
-    weights: wp.array[wp.vec3]
 
 
 @wp.func
@@ -152,56 +130,37 @@ def draw_light_kernel(
     distribution: EnvironmentDistribution,
     blocks: EnvironmentBlocks,
     cumulative: wp.array2d[float],
-    normals: wp.array[wp.vec3],
+    batch: RayBatch,
     seed: wp.uint32,
     frame: wp.uint32,
-    first_point: int,
-    out_light: DrawnLight,
+    out_rays: Rays,
+    out_weights: wp.array[wp.vec3],
 ):
-    """One direction a thread; the samples of a point are neighbours."""
-    i = first + wp.tid()
-    point = i / technique.samples.count
-    index = i % technique.samples.count
-    normal = normals[point]
-    stream = stream_of(seed, frame, wp.uint32(first_point + point))
-    stream = hash_combine(stream, LIGHT_STREAM + wp.uint32(technique.density))
-    at = draw_square(technique.samples, index, stream)
-    drawn = draw_light(technique, distribution, blocks, cumulative, point, normal, at.u, at.v)
-    slot = point * technique.sample_count + technique.begin + at.slot
-    out_light.directions[slot] = drawn.direction
-    out_light.weights[slot] = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
-
-
-@wp.kernel
-def trace_light_kernel(
-    first: int,
-    occluders: Any,
-    settings: TraceSettings,
-    receivers: Receivers,
-    light: DrawnLight,
-    sample_count: int,
-    seed: wp.uint32,
-    frame: wp.uint32,
-    first_point: int,
-    out_visibility: wp.array[float],
-):
-    """One ray a thread, in the order of strata; directions without light are not traced."""
-    i = first + wp.tid()
-    point = i / sample_count
-    weight = light.weights[i]
-    v = float(0.0)
-    if weight[0] + weight[1] + weight[2] > 0.0:
-        stream = stream_of(seed, frame, wp.uint32(first_point + point))
-        stream = hash_combine(hash_combine(stream, LIGHT_STREAM), wp.uint32(i % sample_count))
-        origin = receivers.positions[point] - occluders.origin + receivers.normals[point] * receivers.offsets[point]
-        v = transmittance(occluders, settings, origin, light.directions[i], LARGEST_FLOAT, stream)
-    out_visibility[i] = v
+    """One ray a thread, and its radiance times cosine over pi times density; what brings no light is not traced."""
+    item = first + wp.tid()
+    place = item / technique.samples.count
+    normal = batch.normals[place]
+    point_stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
+    stream = hash_combine(point_stream, LIGHT_STREAM + wp.uint32(technique.density))
+    square = draw_square(technique.samples, item % technique.samples.count, stream)
+    drawn = draw_light(technique, distribution, blocks, cumulative, place, normal, square.u, square.v)
+    weight = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
+    at = rays_of(batch, place)
+    slot = technique.begin + square.slot
+    ray = at[0] + slot * at[1]
+    out_weights[ray] = weight
+    out_rays.origins[ray] = ray_origin(batch, place)
+    out_rays.directions[ray] = drawn.direction
+    out_rays.reaches[ray] = wp.where(weight[0] + weight[1] + weight[2] > 0.0, float(LARGEST_FLOAT), -1.0)
+    if out_rays.streams.shape[0] > 0:
+        out_rays.streams[ray] = hash_combine(hash_combine(point_stream, LIGHT_STREAM), wp.uint32(slot))
 
 
 @wp.kernel
 def reduce_light_kernel(
     first: int,
-    light: DrawnLight,
+    batch: RayBatch,
+    weights: wp.array[wp.vec3],
     visibility: wp.array[float],
     counts: wp.vec2i,
     paired: wp.vec2i,
@@ -215,14 +174,16 @@ def reduce_light_kernel(
     Plain: the mean of V f. Ratio: unshadowed * sum V f / sum f (Heitz et al. 2018), whose error is that of the
     linearised terms (V - ratio) f. Where no sample found light, the ratio is anything in [0, 1].
     """
-    point = first + wp.tid()
+    place = first + wp.tid()
+    row = batch.rows[place]
     count = counts[0] + counts[1]
-    start = point * count
+    at = rays_of(batch, place)
     free = wp.vec3()
     seen = wp.vec3()
-    for k in range(start, start + count):
-        free += light.weights[k]
-        seen += light.weights[k] * visibility[k]
+    for k in range(count):
+        ray = at[0] + k * at[1]
+        free += weights[ray]
+        seen += weights[ray] * visibility[ray]
     value = wp.vec3()
     error = wp.vec3()
     for c in range(3):
@@ -231,23 +192,25 @@ def reduce_light_kernel(
         if ratio == 1:
             scale = 0.0
             if free[c] > 0.0:
-                scale = unshadowed[point][c] / free[c]
+                scale = unshadowed[row][c] / free[c]
                 center = seen[c] / free[c]
         here = Spread()
         there = Spread()
         here.paired = paired[0]
         there.paired = paired[1]
-        for k in range(start, start + counts[0]):
-            here = add_term(here, light.weights[k][c] * (visibility[k] - center))
-        for k in range(start + counts[0], start + count):
-            there = add_term(there, light.weights[k][c] * (visibility[k] - center))
+        for k in range(counts[0]):
+            ray = at[0] + k * at[1]
+            here = add_term(here, weights[ray][c] * (visibility[ray] - center))
+        for k in range(counts[0], count):
+            ray = at[0] + k * at[1]
+            there = add_term(there, weights[ray][c] * (visibility[ray] - center))
         value[c] = scale * seen[c]
         error[c] = scale * wp.sqrt(variance_of_sum(here) + variance_of_sum(there))
         if ratio == 1 and not (free[c] > 0.0):
-            value[c] = 0.5 * unshadowed[point][c]
-            error[c] = 0.5 * unshadowed[point][c]
-    out_value[point] = value
-    out_error[point] = error
+            value[c] = 0.5 * unshadowed[row][c]
+            error[c] = 0.5 * unshadowed[row][c]
+    out_value[row] = value
+    out_error[row] = error
 
 
 def launch_sum_unshadowed(moments, normals, out_irradiance, device):
@@ -255,56 +218,32 @@ def launch_sum_unshadowed(moments, normals, out_irradiance, device):
     launch(sum_unshadowed_kernel, len(normals), inputs=[moments, normals], outputs=[out_irradiance], device=device)
 
 
-def launch_draw_light(technique, environment, cumulative, normals, stream, first_point, out_light, device):
-    """Draw one technique's directions; ``stream`` is (seed, frame)."""
+def launch_draw_light(technique, environment, cumulative, batch, stream, out_rays, out_weights, device):
+    """Draw one technique's rays; ``stream`` is (seed, frame)."""
     launch(
         draw_light_kernel,
-        len(normals) * technique.samples.count,
+        len(batch.rows) * technique.samples.count,
         inputs=[
             technique,
             environment.distribution,
             environment.blocks,
             cumulative,
-            normals,
+            batch,
             wp.uint32(stream[0]),
             wp.uint32(stream[1]),
-            first_point,
         ],
-        outputs=[out_light],
+        outputs=[out_rays, out_weights],
         device=device,
         block_dim=128,
     )
 
 
-def launch_trace_light(
-    occluders, settings, receivers, light, sample_count, stream, first_point, out_visibility, device
-):
-    """Trace the drawn directions; ``stream`` is (seed, frame)."""
-    launch(
-        trace_light_kernel,
-        len(receivers.positions) * sample_count,
-        inputs=[
-            occluders,
-            settings,
-            receivers,
-            light,
-            sample_count,
-            wp.uint32(stream[0]),
-            wp.uint32(stream[1]),
-            first_point,
-        ],
-        outputs=[out_visibility],
-        device=device,
-        block_dim=64,
-    )
-
-
-def launch_reduce_light(light, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device):
-    """Add up each point's samples."""
+def launch_reduce_light(batch, weights, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device):
+    """Add up each point's samples, in its own row; ``unshadowed`` is by row too."""
     launch(
         reduce_light_kernel,
-        len(out_value),
-        inputs=[light, visibility, counts, paired, int(ratio), unshadowed],
+        len(batch.rows),
+        inputs=[batch, weights, visibility, counts, paired, int(ratio), unshadowed],
         outputs=[out_value, out_error],
         device=device,
         block_dim=64,

@@ -12,30 +12,24 @@ from beam_warp.devices import download_like, upload_vectors
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError
-from beam_warp.kernels.irradiance import (
+from beam_warp.kernels.incident_light import (
     COSINE,
     ENVIRONMENT,
     PRODUCT,
-    DrawnLight,
-    Receivers,
     Technique,
     launch_draw_light,
     launch_reduce_light,
     launch_sum_unshadowed,
-    launch_trace_light,
 )
 from beam_warp.kernels.product_sampling import launch_accumulate_block_weights
-from beam_warp.lighting import RAYS_AT_ONCE, ray_offsets
 from beam_warp.sampling import Sampler, sample_set
 from beam_warp.scene import Scene
-from beam_warp.tracing import EXACT, TraceOptions
+from beam_warp.surface_rays import points_for_weights, ray_batches, room_for_rays
+from beam_warp.tracing import EXACT, TraceOptions, trace_rays
 
 Density = Literal["cosine", "environment", "product", "mis"]
 
 DENSITIES = ("cosine", "environment", "product", "mis")
-
-POINTS_AT_ONCE = 1 << 15
-"""Points whose 512 block weights are held at a time for the product density, 64 MiB."""
 
 
 @dataclass(frozen=True)
@@ -150,8 +144,7 @@ def irradiance(
         )
     value = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
     error = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
-    if len(at):
-        _gather(scene, at, up, environment, parts, ratio, offset, options, (seed, frame), value, error)
+    _gather(scene, at, up, environment, parts, ratio, offset, options, (seed, frame), value, error)
     return Irradiance(download_like(value, points, normals), download_like(error, points, normals))
 
 
@@ -168,32 +161,32 @@ def _gather(
     out_value: wp.array,
     out_error: wp.array,
 ) -> None:
-    """Draw, trace and add up, so many points at a time that their rays fit `RAYS_AT_ONCE`."""
+    """Draw, trace and add up, batch by batch."""
     device = scene.device
-    settings = options.settings(scene)
-    offsets = ray_offsets(scene, points, normals, offset)
     count = parts[0].sample_count
-    step = min(len(points), max(1, RAYS_AT_ONCE // count), POINTS_AT_ONCE)
-    light = DrawnLight()
-    light.directions = wp.empty(step * count, dtype=wp.vec3, device=device)
-    light.weights = wp.empty(step * count, dtype=wp.vec3, device=device)
-    visibility = wp.empty(step * count, dtype=float, device=device)
     is_product = parts[0].density == int(PRODUCT)
-    cumulative = wp.empty((step, 512) if is_product else (0, 0), dtype=float, device=device)
-    unshadowed = wp.empty(step if ratio else 0, dtype=wp.vec3, device=device)
+    is_bernoulli = options.acceptance == "bernoulli"
+    unshadowed = wp.empty(len(points) if ratio else 0, dtype=wp.vec3, device=device)
+    if ratio:
+        launch_sum_unshadowed(environment.moments, normals, unshadowed, device)
     counts = wp.vec2i(parts[0].samples.count, count - parts[0].samples.count)
     paired = wp.vec2i(int(parts[0].samples.columns > 0), int(parts[-1].samples.columns > 0))
-    for start in range(0, len(points), step):
-        part = slice(start, min(start + step, len(points)))
-        receivers = Receivers()
-        receivers.positions, receivers.normals, receivers.offsets = points[part], normals[part], offsets[part]
+    for batch in ray_batches(
+        scene,
+        points,
+        normals,
+        offset,
+        count,
+        stratified=all(technique.samples.columns > 0 for technique in parts),
+        points_at_once=points_for_weights(device) if is_product else None,
+    ):
+        cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
         if is_product:
-            launch_accumulate_block_weights(environment.blocks, receivers.normals, cumulative, device)
-        if ratio:
-            launch_sum_unshadowed(environment.moments, receivers.normals, unshadowed, device)
+            launch_accumulate_block_weights(environment.blocks, batch.normals, cumulative, device)
+        rays = room_for_rays(batch, device, bernoulli=is_bernoulli, reaches=True)
+        weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
         for technique in parts:
-            launch_draw_light(technique, environment, cumulative, receivers.normals, stream, start, light, device)
-        launch_trace_light(scene.occluders, settings, receivers, light, count, stream, start, visibility, device)
-        launch_reduce_light(
-            light, visibility, counts, paired, ratio, unshadowed, out_value[part], out_error[part], device
-        )
+            launch_draw_light(technique, environment, cumulative, batch, stream, rays, weights, device)
+        visibility = wp.empty(len(rays.origins), dtype=float, device=device)
+        trace_rays(scene, options, rays, visibility)
+        launch_reduce_light(batch, weights, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device)

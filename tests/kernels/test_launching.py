@@ -1,0 +1,52 @@
+"""Launching: kernels with atomics must not be spread over CPU threads."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beam_warp import Scene, visibility
+from beam_warp.kernels import launching
+
+KERNELS = sorted((Path(__file__).parents[2] / "kernels").glob("*.py"))
+
+
+def kernels_with_atomics(tree):
+    return {
+        node.name
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and any(a.startswith("atomic_") for a in attributes(node))
+    }
+
+
+def attributes(node):
+    return {inner.attr for inner in ast.walk(node) if isinstance(inner, ast.Attribute)}
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.stem)
+def test_kernels_with_atomics_are_launched_in_order(path):
+    """Warp's CPU atomics are plain additions: two threads lose some, and a tree comes out with lost leaves."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    racing = kernels_with_atomics(tree)
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "launch":
+            kernel = getattr(call.args[0], "id", "")
+            if kernel in racing:
+                assert any(word.arg == "in_order" for word in call.keywords), kernel
+                racing.discard(kernel)
+    assert not racing, f"not launched here: {racing}"
+
+
+def test_a_scene_is_the_same_with_many_threads(monkeypatch, rng):
+    from shapes import random_cloud, random_rays
+
+    cloud, rays = random_cloud(rng, 20_000, scale=(-5.0, 0.5)), random_rays(rng, 2_000)
+    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
+    alone = visibility(Scene.from_gaussians(cloud, "cpu"), *rays)
+    monkeypatch.setenv("BEAM_WARP_THREADS", "16")
+    monkeypatch.setattr(launching, "MIN_CHUNK", 64)
+    for build in ("quality", "fast"):
+        scene = Scene.from_gaussians(cloud, "cpu", build=build)
+        assert np.sort(scene._tree.layout.items.numpy()).tolist() == np.flatnonzero(cloud.opacities > 1 / 255).tolist()
+    assert np.array_equal(visibility(Scene.from_gaussians(cloud, "cpu"), *rays), alone)
