@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -63,16 +63,16 @@ class Scene:
         backend: Hierarchy that rays traverse.
         occluders: What kernels trace, relative to ``origin``.
         mesh: Triangles among the Gaussians; None for none.
-        report: What was left out or changed.
     """
 
     backend: Backend
     occluders: Any
     mesh: wp.Mesh | None
-    report: SceneReport
     _packed: PackedGaussians = field(repr=False)
     _count: int = field(repr=False)
     _tree: Any = field(repr=False, default=None)
+    _report: SceneReport = field(repr=False, default=SceneReport(0, 0, 0))
+    _refitted: bool = field(repr=False, default=False)
 
     @classmethod
     def from_gaussians(
@@ -115,9 +115,28 @@ class Scene:
             occluders.mesh.mesh = triangles.id
         occluders.gaussians = packed.gaussians
         occluders.origin = wp.vec3(*packed.origin.tolist())
-        scene = cls(backend, occluders, triangles, SceneReport(0, 0, 0), packed, len(cloud))
+        scene = cls(backend, occluders, triangles, packed, len(cloud))
         scene._build(build)
         return scene
+
+    @property
+    def report(self) -> SceneReport:
+        """What was left out or changed; after a refit it is counted when asked for, as a refit reads nothing back."""
+        if self._refitted:
+            fates = self._packed.fates.numpy().copy()
+            if self.backend == "wide":  # what was left out when the tree was built stays out
+                absent = np.ones(len(fates), np.bool_)
+                absent[self._tree.layout.items.numpy()[: self._tree.count]] = False
+                fates[absent & ((fates == TRACED) | (fates == RAISED))] = NOT_FINITE
+            number = np.bincount(fates, minlength=4).tolist()
+            self._report = replace(
+                self._report,
+                traced=number[TRACED] + number[RAISED],
+                raised_scales=number[RAISED],
+                not_finite=number[NOT_FINITE],
+            )
+            self._refitted = False
+        return self._report
 
     @property
     def packed(self) -> PackedGaussians:
@@ -189,23 +208,25 @@ class Scene:
                 ("scales", scales, 3, wp.vec3),
             )
         ]
+        if not len(self):
+            return
         self._packed.place(*arrays)
+        self._refitted = tree == "refit"
         if tree != "refit":
             self._build(tree)
-            return
-        if self.backend == "warp":
+        elif self.backend == "warp":
             self._tree.refit()
         else:
             refit(self._tree, self._packed)
-        self._report(self._packed.fate_counts(), self.report.depth, self.report.build)
 
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
         packed = self._packed
         number = packed.fate_counts()
+        traced = number[TRACED] + number[RAISED]
         depth, method = 0, WARP_BUILDS[build]
         if self.backend == "wide":
-            self._tree = build_wide_tree(packed, number[TRACED] + number[RAISED], build)
+            self._tree = build_wide_tree(packed, traced, build)
             self.occluders.tree = self._tree.tree
             depth, method = len(self._tree.levels), self._tree.method
         else:
@@ -213,14 +234,9 @@ class Scene:
                 method = "sah"
             self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
             self.occluders.tree.bvh = self._tree.id
-        self._report(number, depth, method)
-
-    def _report(self, number: list[int], depth: int, build: str) -> None:
-        """Say what became of the Gaussians; ``number`` counts their fates."""
-        invisible = number[INVISIBLE] if len(self) else 0  # the one in an empty scene is not the cloud's
-        self.report = SceneReport(
-            number[TRACED] + number[RAISED], invisible, number[RAISED], number[NOT_FINITE], depth, build
-        )
+        # The one Gaussian of an empty scene is not the cloud's.
+        invisible = number[INVISIBLE] if len(self) else 0
+        self._report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
@@ -246,11 +262,12 @@ def _upload_mesh(mesh: Any, origin: NDArray[np.float32], device: Any) -> wp.Mesh
                 f"mesh must have vertices and faces, got {type(mesh).__name__} without {name}. Pass a trimesh.Trimesh."
             )
     vertices = require_array("mesh.vertices", mesh.vertices, (None, 3), np.float64)
-    faces = require_array("mesh.faces", mesh.faces, (None, 3), np.int32)
+    faces = require_array("mesh.faces", mesh.faces, (None, 3), np.int64)
     require_finite("mesh.vertices", vertices)
     if not len(faces):
         raise InvalidArrayError("mesh.faces must hold at least one triangle, got none. Pass None for no mesh.")
     require_range("mesh.faces", faces, 0, len(vertices) - 1, "Index existing vertices.")
     return wp.Mesh(
-        upload((vertices - origin).astype(np.float32), wp.vec3, device), upload(faces.reshape(-1), int, device)
+        upload((vertices - origin).astype(np.float32), wp.vec3, device),
+        upload(faces.reshape(-1).astype(np.int32), int, device),
     )

@@ -3,14 +3,16 @@
 A case builds Gaussians and rays and says what must be detected. Running it traces the rays and compares each with the
 interval that float64 and a count of roundings allow (`beam_warp.reference.visibility_enclosure`): a case has no
 tolerance of its own. Where scales are raised or rows left out, the truth is that of what is traced, and the effect of
-raising is told apart.
+raising is told apart. The closest surface of the same rays must leave the same light, be finite and in order, and
+Bernoulli acceptance must have the same mean.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,15 @@ from beam_warp.checks import require_choice
 from beam_warp.devices import device_label
 from beam_warp.lighting import ambient_occlusion
 from beam_warp.packed_gaussians import SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO
-from beam_warp.reference import Enclosure, rotation_matrices, visibility_enclosure, visibility_reference
+from beam_warp.reference import (
+    FLOAT32_ROUNDOFF,
+    Enclosure,
+    rotation_matrices,
+    visibility_enclosure,
+    visibility_reference,
+)
 from beam_warp.scene import Scene
+from beam_warp.surface_tracing import closest_surface
 from beam_warp.tracing import EXACT, TraceOptions, visibility
 
 NONE_LEFT_OUT = InvalidRows(np.zeros(0, np.int64), 0, 0, 0)
@@ -35,6 +44,16 @@ SCALE_FOR_ZERO = 1e-7
 
 REFERENCE_TOLERANCE = 1e-12
 """The reference against closed forms: both are float64, of products of up to some hundred factors."""
+
+
+SURFACE_THRESHOLDS = (0.9, 0.5, 0.1)
+"""Transmittances whose depths must be in order along every ray."""
+
+BERNOULLI_SEEDS = 64
+"""Samples of each ray; the mean is over all rays of a case."""
+
+FALSE_ALARM = 1e-6
+"""Probability that a sound sampler's mean is called wrong, of each case."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +209,7 @@ def run_case(case: StressCase, device: str | None = None, *, hierarchies: Sequen
         result = visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=stress.options)
         truth = truth or Truth.of(stress, scene)
         faults = _faults(stress, scene, result, truth)
+        faults += _surface_faults(stress, scene, truth) + _bernoulli_faults(stress, scene, truth)
         did = _range_of("V", result)
         if stress.occlusion_points is not None:
             openness = ambient_occlusion(scene, *stress.occlusion_points, offset=0.0, options=stress.options).visibility
@@ -320,6 +340,64 @@ def _faults(stress: Stress, scene: Scene, result: NDArray[np.float32], truth: Tr
     if report.traced + report.dropped + report.not_finite != len(stress.cloud):
         faults.append("the report does not account for every Gaussian")
     return faults
+
+
+def _surface_faults(stress: Stress, scene: Scene, truth: Truth) -> list[str]:
+    """Return what should not be about the closest surface of the same rays."""
+    hits = [
+        closest_surface(
+            scene,
+            stress.origins,
+            stress.directions,
+            t_max=stress.t_max,
+            threshold=threshold,
+            options=replace(stress.options, acceptance="product"),
+        )
+        for threshold in SURFACE_THRESHOLDS
+    ]
+    hit = hits[0]
+    met = hit.hit_counts > 0
+    length = np.linalg.norm(hit.normals.astype(np.float64), axis=1)
+    checks = {
+        "let pass what rounding does not explain": (hit.transmittance >= truth.rays.low)
+        & (hit.transmittance <= truth.rays.high),
+        "have no finite expected depth in front": ~met
+        | ((hit.expected_depth >= 0.0) & np.isfinite(hit.expected_depth)),
+        # Opposite normals may cancel; those that do not are divided by their length: a square root and two roundings.
+        "have normals that are no directions": (length == 0.0) | (np.abs(length - 1.0) <= 8.0 * FLOAT32_ROUNDOFF),
+        "meet their thresholds out of order": np.logical_and.reduce(
+            [near.depth <= far.depth for near, far in itertools.pairwise(hits)]
+        ),
+    }
+    return [f"surfaces: {np.count_nonzero(~good)} rays {what}" for what, good in checks.items() if not good.all()]
+
+
+def _bernoulli_faults(stress: Stress, scene: Scene, truth: Truth) -> list[str]:
+    """Return whether the mean of Bernoulli samples misses that of the truth by more than chance and rounding explain.
+
+    Bernstein's inequality for n independent draws b of variance V (1 - V): with probability at least 1 - delta,
+    |mean of (b - V)| <= sqrt(2 s L) + L / (3 n), s the mean variance over n, L = ln(2 / delta). It holds for few rays
+    and rare hits too, where the mean is far from normal.
+    """
+    count = BERNOULLI_SEEDS * len(stress.origins)
+    if not count:
+        return []
+    options = replace(stress.options, acceptance="bernoulli")
+    drawn = np.array(
+        [
+            visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=options, seed=seed)
+            for seed in range(BERNOULLI_SEEDS)
+        ]
+    )
+    if not np.isin(drawn, (0.0, 1.0)).all():
+        return ["Bernoulli samples are not 0 or 1"]
+    low, high = np.clip(truth.rays.low, 0.0, 1.0), np.clip(truth.rays.high, 0.0, 1.0)
+    likely = np.clip(0.5, low, high)  # of the values possible, the one with the largest variance
+    chance = np.log(2.0 / FALSE_ALARM)
+    allowed = np.sqrt(2.0 * np.mean(likely * (1.0 - likely)) / count * chance) + chance / (3.0 * count)
+    if low.mean() - allowed <= drawn.mean() <= high.mean() + allowed:
+        return []
+    return [f"Bernoulli samples have mean {drawn.mean():.4g}, not {truth.rays.exact.mean():.4g} within {allowed:.2g}"]
 
 
 def _detected(stress: Stress, scene: Scene) -> str:

@@ -70,7 +70,8 @@ def closest_surface(
         directions: Unit directions, like ``origins``.
         attributes: Values to blend, one row a Gaussian of the cloud, ``(M, C)`` float32; None for none.
         t_max: Reach of the rays [m], one number or ``(N,)``.
-        threshold: Transmittance below which a surface is taken to be met: 0.5 is the median depth.
+        threshold: Transmittance below which a surface is taken to be met, at least ``options.stop``: 0.5 is the
+            median depth.
         options: What counts as a hit, and the transmittance at which blending ends.
 
     Raises:
@@ -83,7 +84,11 @@ def closest_surface(
         raise InvalidOptionError(
             f'options.acceptance must be "product" here, got {options.acceptance!r}. Blending needs every hit.'
         )
-    require_number("threshold", threshold, 0.0, 1.0)
+    if require_number("threshold", threshold, 0.0, 1.0) < options.stop:
+        raise InvalidOptionError(
+            f"threshold must be at least options.stop, {options.stop:g}, got {threshold:g}. Lower the stop: what lies "
+            "behind it is not looked at."
+        )
     device = scene.device
     starts = upload_vectors("origins", origins, device)
     ways = upload_vectors("directions", directions, device, unit_length=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.radix_tree import launch_split_runs
 from beam_warp.kernels.tree_build import (
     BinaryTree,
@@ -22,7 +23,7 @@ from beam_warp.kernels.tree_collapse import (
     launch_fill_leaves,
     launch_open_level,
 )
-from beam_warp.kernels.wide_tree import LARGEST_DEPTH, LEAF_ROWS, NODE_ROWS, WideTree
+from beam_warp.kernels.wide_tree import LARGEST_DEPTH, LARGEST_NODE_COUNT, LEAF_ROWS, NODE_ROWS, WideTree
 from beam_warp.morton_order import morton_order
 from beam_warp.packed_gaussians import PackedGaussians
 
@@ -74,6 +75,9 @@ def build_wide_tree(packed: PackedGaussians, count: int, method: Method) -> Buil
         method: ``"quality"`` merges nearest neighbours (PLOC), ``"fast"`` splits the Morton order (Karras 2012),
             ``"places"`` halves it: worse boxes, but never deeper than half the logarithm of the count, for inputs that
             make the others too deep.
+
+    Raises:
+        InvalidArrayError: The tree has more nodes than traversal can number, from about 75 million Gaussians on.
     """
     items, keys = morton_order(packed.lowers, packed.uppers, packed.takes_part)
     methods: tuple[Method, ...] = (method, "places") if method != "places" else ("places",)
@@ -157,6 +161,11 @@ def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method
     used = sizes[: LARGEST_DEPTH + 2]
     used = used[used > 0].tolist()
     begins = np.concatenate([[0], np.cumsum(used)]).tolist()
+    if begins[-1] > LARGEST_NODE_COUNT:
+        raise InvalidArrayError(
+            f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {begins[-1]:,} for {count:,} "
+            'Gaussians. Split the cloud, or use backend="warp".'
+        )
     layout.lower = wp.empty(begins[-1], dtype=wp.vec3, device=device)
     layout.upper = wp.empty(begins[-1], dtype=wp.vec3, device=device)
     tree.nodes = wp.empty(begins[-1] * NODE_ROWS, dtype=wp.vec4i, device=device)

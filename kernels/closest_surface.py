@@ -197,6 +197,7 @@ def trace_surface_kernel(
     for channel in range(channels):
         out_records.attributes[i, channel] = 0.0
     transmittance = float(1.0)
+    opacity = float(0.0)  # sum of the weights: 1 - transmittance would lose digits of faint hits
     depth = float(0.0)
     normal = wp.vec3()
     threshold_depth = float(wp.inf)
@@ -214,23 +215,24 @@ def trace_surface_kernel(
             if k < taken and transmittance >= settings.stop:
                 index = buffer.index[k]
                 peak = ray_peak(occluders.gaussians, index, origin, direction)
-                weight = transmittance * peak.alpha
-                depth += weight * buffer.t[k]
-                normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
-                for channel in range(channels):
-                    out_records.attributes[i, channel] += weight * attributes[index, channel]
-                transmittance *= 1.0 - peak.alpha
-                hits += 1
-                if threshold_gaussian < 0 and transmittance < threshold:
-                    threshold_gaussian = index
-                    threshold_depth = buffer.t[k]
+                if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
+                    weight = transmittance * peak.alpha
+                    opacity += weight
+                    depth += weight * buffer.t[k]
+                    normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
+                    for channel in range(channels):
+                        out_records.attributes[i, channel] += weight * attributes[index, channel]
+                    transmittance *= 1.0 - peak.alpha
+                    hits += 1
+                    if threshold_gaussian < 0 and transmittance < threshold:
+                        threshold_gaussian = index
+                        threshold_depth = buffer.t[k]
         t_last = buffer.t[LAST]
         index_last = buffer.index[LAST]
         more = 0
         # A full buffer may have hidden others from view.
         if buffer.count >= BUFFER_SIZE and transmittance >= settings.stop:
             more = 1
-    opacity = 1.0 - transmittance
     if hits > 0:
         depth /= opacity
         normal = wp.normalize(normal)

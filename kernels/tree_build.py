@@ -15,8 +15,8 @@ from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
 
-CELLS = 2097151.0
-"""Morton cells along the longest side: 21 bits an axis."""
+CELLS = 2097150.0
+"""Morton cells along the longest side: 21 bits an axis, all of them set in none, so that no code is `MORTON_LAST`."""
 
 LAST_CELL = wp.constant(CELLS)
 MORTON_LAST = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))

@@ -19,6 +19,9 @@ LARGEST_DEPTH = 31
 Stack = wp.types.vector(length=32, dtype=wp.int32)
 """One entry a level. A vector, because Warp's local arrays carry a header that every access would read."""
 
+LARGEST_NODE_COUNT = 1 << 25
+"""A stack's entry numbers a node beside an axis and a mask, six bits, in a signed word."""
+
 FAR_SLACK = wp.constant(1.000002)
 """Widens the far end of a slab by 16 ulp, more than its rounding errors, those of fast-math division included: no box
 is missed (Ize 2013)."""

@@ -89,7 +89,7 @@ class TestTheSuiteItself:
 
     def test_a_small_bias_is_noticed(self, monkeypatch):
         outcome = self.outcome(monkeypatch, lambda v: v * np.float32(1.0 + 1e-3))
-        assert "rays differ by more than rounding explains" in outcome.faults[-1]
+        assert any("rays differ by more than rounding explains" in fault for fault in outcome.faults)
         assert not outcome.passed
 
     def test_lost_hits_are_noticed(self, monkeypatch):
@@ -108,6 +108,55 @@ class TestTheSuiteItself:
         outcome = self.outcome(monkeypatch, spoil, "duplicates on 2⁻ᵏ")
         assert outcome.faults[0] == "1 rays are not finite or outside [0, 1]"
         assert np.isfinite(outcome.error)
+
+    @pytest.mark.parametrize(
+        ("name", "change", "fault"),
+        [
+            ("transmittance", lambda x: x * np.float32(1.001), "rays let pass what rounding does not explain"),
+            ("expected_depth", lambda x: x * np.nan, "rays have no finite expected depth in front"),
+            ("expected_depth", lambda x: -x, "rays have no finite expected depth in front"),
+            ("normals", lambda x: 0.999 * x, "rays have normals that are no directions"),
+            ("normals", lambda x: np.nan * x, "rays have normals that are no directions"),
+            ("depth", lambda x: np.random.default_rng(0).permutation(x), "rays meet their thresholds out of order"),
+            ("depth", lambda x: x * np.nan, "rays meet their thresholds out of order"),
+        ],
+        ids=str,
+    )
+    def test_wrong_surfaces_are_noticed(self, monkeypatch, name, change, fault):
+        real = stability.closest_surface
+        seen = []
+
+        def spoiled(*rays, **options):
+            hit = real(*rays, **options)
+            seen.append(hit)
+            return dataclasses.replace(hit, **{name: change(getattr(hit, name))}) if len(seen) == 1 else hit
+
+        monkeypatch.setattr(stability, "closest_surface", spoiled)
+        (outcome,) = run_case(case_of("round"), "cpu", hierarchies=("wide",))
+        assert len(outcome.faults) == 1
+        assert fault in outcome.faults[0]
+
+    @pytest.mark.parametrize(
+        ("change", "fault"),
+        [
+            (lambda v: np.maximum(v, np.arange(len(v)) % 10 == 0), "Bernoulli samples have mean"),
+            (lambda v: np.minimum(v, np.arange(len(v)) % 10 > 0), "Bernoulli samples have mean"),
+            (lambda v: v * 0.5, "Bernoulli samples are not 0 or 1"),
+            (lambda v: v * np.nan, "Bernoulli samples are not 0 or 1"),
+        ],
+        ids=["too bright", "too dark", "half", "NaN"],
+    )
+    def test_biased_samples_are_noticed(self, monkeypatch, change, fault):
+        real = stability.visibility
+
+        def spoiled(*rays, options, **others):
+            v = real(*rays, options=options, **others)
+            return change(v) if options.acceptance == "bernoulli" else v
+
+        monkeypatch.setattr(stability, "visibility", spoiled)
+        (outcome,) = run_case(case_of("t_max cuts through Gaussians"), "cpu", hierarchies=("wide",))
+        assert len(outcome.faults) == 1
+        assert outcome.faults[0].startswith(fault)
 
     def test_counts_that_differ_are_noticed(self):
         case = case_of("opacity 0, 1/255, just above, 1")

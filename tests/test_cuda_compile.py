@@ -1,0 +1,72 @@
+"""Every kernel compiles for an H200 (sm_90), on machines without a GPU too.
+
+The CPU compiler takes what NVRTC refuses: intrinsics of one side, overloads that only one side resolves, local arrays
+that do not fit. Most changes are made and tested where there is no GPU, so without this such a change would break CUDA
+unnoticed. It runs in a process of its own: declaring overloads changes the modules that other tests have loaded.
+"""
+
+import importlib
+import json
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from beam_warp import kernels
+
+MODULES = sorted(entry.name for entry in pkgutil.iter_modules(kernels.__path__))
+
+TRACING = {"closest_surface", "residues", "surface_rays", "trace", "trace_counts", "visibility_adjoint"}
+"""Some of the modules that must have been compiled for every structure of occluders."""
+
+
+def compile_all(folder):
+    """Return {module: [kernels, error]} after compiling every module under ``folder``."""
+    import warp as wp
+
+    from beam_warp.kernels.occluders import OCCLUDERS
+
+    found = {}
+    for name in MODULES:
+        module = importlib.import_module(f"beam_warp.kernels.{name}")
+        known = list(wp.get_module(module.__name__).kernels.values())
+        if not known:
+            continue
+        try:
+            variants = 0
+            for kernel in known:
+                overloads = OCCLUDERS.values() if kernel.is_generic else [None]
+                for occluders in overloads:
+                    variants += 1
+                    if occluders is not None:
+                        wp.overload(kernel, {"occluders": occluders})
+            (path,) = wp.compile_aot_module(module, arch=90, module_dir=folder)
+            found[name] = [variants, "" if Path(path).stat().st_size else "empty file"]
+        except Exception as error:  # reported by the module's own test
+            found[name] = [0, f"{type(error).__name__}: {error}"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sm_90")
+    result = folder / "result.json"
+    done = subprocess.run([sys.executable, __file__, folder, result], capture_output=True, text=True, check=False)
+    assert result.is_file(), done.stdout[-4000:] + done.stderr[-4000:]
+    return json.loads(result.read_text())
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+@pytest.mark.parametrize("name", MODULES)
+def test_compiles_for_sm_90(compiled, name):
+    if name not in compiled:
+        pytest.skip("holds no kernels of its own")
+    count, error = compiled[name]
+    assert not error
+    assert count >= (4 if name in TRACING else 1)
+
+
+if __name__ == "__main__":
+    Path(sys.argv[2]).write_text(json.dumps(compile_all(sys.argv[1])))
