@@ -145,7 +145,10 @@ def traversal_counts(
 
 
 def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: wp.array) -> None:
-    """Trace rays that are on the scene's device already, by the fastest way that their rules allow."""
+    """Trace rays that are on the scene's device already, by the fastest way that their rules allow.
+
+    Where triangles block rays, ``rays`` gets reaches of its own.
+    """
     settings = options.settings(scene)
     if scene.backend != "wide" or options.front != "peak" or options.cull or scene.response_degree != 2:
         launch_trace_rays(scene.occluders, settings, rays, out_visibility, scene.device)
@@ -160,6 +163,11 @@ def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: 
 def ray_reaches(t_max: Any, count: int, device: Any) -> wp.array:
     """Return ``t_max`` on the device, one number or one a ray; infinity becomes the largest float."""
     if isinstance(t_max, wp.array):
+        if t_max.dtype is not wp.float32 or t_max.ndim != 1 or t_max.device != device:
+            raise InvalidArrayError(
+                f"t_max must be a one-dimensional warp array of float32 on {device}, got dtype "
+                f"{t_max.dtype.__name__}, {t_max.ndim} dimensions, on {t_max.device}. Convert it or pass NumPy."
+            )
         require_same_length("t_max", t_max, "origins", count)
         return t_max
     if np.ndim(t_max) == 0:

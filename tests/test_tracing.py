@@ -239,6 +239,21 @@ class TestRefusals:
             visibility(scene, np.zeros((1, 3)), [[1.0, 0, 0]], t_max=t_max)
 
 
+class TestReach:
+    def test_device_arrays_of_another_type_are_refused(self, device):
+        scene = Scene.from_gaussians(one_gaussian(), device)
+        with pytest.raises(InvalidArrayError, match=r"t_max must be a one-dimensional warp array of float32 on"):
+            visibility(scene, *along_x(), t_max=wp.zeros(1, dtype=wp.float64, device=scene.device))
+
+    def test_one_reach_a_ray(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.5), device)
+        origins, directions = (np.repeat(a, 2, axis=0) for a in along_x())
+        found = visibility(scene, origins, directions, t_max=np.array([1.9, 2.1]))
+        assert found == pytest.approx([1.0, 0.5], abs=1e-6)
+        on_device = wp.array([1.9, 2.1], dtype=float, device=scene.device)
+        assert (visibility(scene, origins, directions, t_max=on_device) == found).all()
+
+
 class TestTraversalCounts:
     def test_hits_are_those_of_brute_force(self, device, rng):
         cloud, (origins, directions) = random_cloud(rng, 600, scale=(-2.5, 0.3)), random_rays(rng, 200)
