@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 from beam_warp._version import __version__
 from beam_warp.analytic_occlusion import SHAPES, OcclusionOutcome
 from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
-from beam_warp.stability import CASES, Outcome
+from beam_warp.stability import Outcome
+from beam_warp.stress_cases import CASES
 
 HOW_TO_READ = """\
 Scenes on which ray tracers lose hits, return NaN or never return, and what this one makes of them. The numbers are

@@ -42,6 +42,7 @@ RANKS = {
     "beam_warp.sampling": 5,
     "beam_warp.environment_sampling": 5,
     "beam_warp.rasterizing": 7,
+    "beam_warp.stress_cases": 9,
     "beam_warp.stability": 10,
     "beam_warp.analytic_occlusion": 10,
     "beam_warp.stability_report": 11,

@@ -13,8 +13,9 @@ from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, laun
 from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.reference import rotation_matrices, visibility_enclosure, visibility_reference
 from beam_warp.scene import BACKENDS
-from beam_warp.stability import CASES, HIERARCHIES, case_of, run_case, scene_under
+from beam_warp.stability import HIERARCHIES, run_case, scene_under
 from beam_warp.stability_report import HOW_TO_READ, OCCLUSION_TEXT
+from beam_warp.stress_cases import CASES, case_of
 from beam_warp.tracing import EXACT, TraceOptions
 
 SMALL = [case for case in CASES if not case.large]

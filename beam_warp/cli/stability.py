@@ -42,8 +42,9 @@ def stability(args: Stability) -> int:
         raise OutputError(f"out must be in a folder that exists, got {args.out.parent}. Create it first.")
 
     from beam_warp.analytic_occlusion import SHAPES, measure_shapes
-    from beam_warp.stability import CASES, run_cases
+    from beam_warp.stability import run_cases
     from beam_warp.stability_report import StabilityResult, read_result, write_page
+    from beam_warp.stress_cases import CASES
 
     others = [read_result(path) for path in args.beside]
     cases = [case for case in CASES if args.large or not case.large]
