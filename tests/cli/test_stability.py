@@ -7,7 +7,7 @@ import pytest
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from beam_warp import analytic_occlusion, stability
+from beam_warp import analytic_occlusion, stability, stress_cases
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
@@ -17,7 +17,7 @@ NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 
 @pytest.fixture(autouse=True)
 def few_cases(monkeypatch):
-    monkeypatch.setattr(stability, "CASES", [stability.case_of(name) for name in NAMES])
+    monkeypatch.setattr(stress_cases, "CASES", [stress_cases.case_of(name) for name in NAMES])
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
@@ -66,9 +66,9 @@ def test_json_of_another_device_stands_beside(tmp_path, capsys):
 
 
 def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
-    case = stability.case_of("one Gaussian")
+    case = stress_cases.case_of("one Gaussian")
     broken = dataclasses.replace(case, build=lambda: dataclasses.replace(case.build(), expected={"traced": 2}))
-    monkeypatch.setattr(stability, "CASES", [broken])
+    monkeypatch.setattr(stress_cases, "CASES", [broken])
     assert run("--quiet") == 1
     assert "failed: one Gaussian on cpu, wide: traced must be 2, got 1" in capsys.readouterr().err
 
