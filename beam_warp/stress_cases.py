@@ -121,7 +121,7 @@ def _cloud(
     return GaussianCloud(**(arrays | changes))
 
 
-def _aimed(
+def aimed_rays(
     rng: np.random.Generator,
     cloud: GaussianCloud,
     count: int,
@@ -145,7 +145,7 @@ def _axis_parallel(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
     return d
 
 
-def _box_planes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def box_planes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return lower and upper box planes ``(N, 3)`` of unturned Gaussians, rounded as the tracer rounds them."""
     one = np.float32(1.0)
     levels = np.float32(2.0) * np.log(cloud.opacities / np.float32(1.0 / 255.0))
@@ -158,7 +158,7 @@ def _box_planes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.f
 def _round() -> Stress:
     rng = np.random.default_rng(1)
     cloud = _cloud(rng, 600, 0.05 * np.exp(rng.normal(0.0, 0.4, (600, 3))))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 600, "raised_scales": 0})
 
 
@@ -166,7 +166,7 @@ def _round() -> Stress:
 def _quartic() -> Stress:
     rng = np.random.default_rng(2)
     cloud = _cloud(rng, 600, 0.05 * np.exp(rng.normal(0.0, 0.4, (600, 3))))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, response_degree=4)
 
 
@@ -174,7 +174,7 @@ def _quartic() -> Stress:
 def _needles() -> Stress:
     rng = np.random.default_rng(3)
     cloud = _cloud(rng, 400, (0.1, 1.001e-5, 1.001e-5))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
 
 
@@ -182,7 +182,7 @@ def _needles() -> Stress:
 def _thinner_needles() -> Stress:
     rng = np.random.default_rng(4)
     cloud = _cloud(rng, 400, (0.1, 1e-7, 1e-7))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 400})
 
 
@@ -201,7 +201,7 @@ def _along_needles() -> Stress:
 def _discs() -> Stress:
     rng = np.random.default_rng(6)
     cloud = _cloud(rng, 400, (0.1, 0.1, 1.001e-5), opacities=(0.02, 0.4))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
 
 
@@ -209,7 +209,7 @@ def _discs() -> Stress:
 def _flat() -> Stress:
     rng = np.random.default_rng(7)
     cloud = _cloud(rng, 400, (0.1, 0.1, 0.0), opacities=(0.02, 0.4))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 400})
 
 
@@ -230,7 +230,7 @@ def _grazing() -> Stress:
 def _tiny() -> Stress:
     rng = np.random.default_rng(9)
     cloud = _cloud(rng, 400, 1e-6 * np.exp(rng.uniform(0.0, 2.0, (400, 3))))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
 
 
@@ -238,7 +238,7 @@ def _tiny() -> Stress:
 def _points() -> Stress:
     rng = np.random.default_rng(10)
     cloud = _cloud(rng, 200, 0.0)
-    origins, directions = _aimed(rng, cloud, 200)
+    origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 200})
 
 
@@ -247,7 +247,7 @@ def _far_away() -> Stress:
     rng = np.random.default_rng(11)
     cloud = _cloud(rng, 500, 0.05 * np.exp(rng.normal(0.0, 0.4, (500, 3))))
     cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 500})
 
 
@@ -256,7 +256,7 @@ def _far_away_thin() -> Stress:
     rng = np.random.default_rng(12)
     cloud = _cloud(rng, 500, (0.05, 0.05, 4e-4))
     cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
 
 
@@ -264,7 +264,7 @@ def _far_away_thin() -> Stress:
 def _long_rays() -> Stress:
     rng = np.random.default_rng(13)
     cloud = _cloud(rng, 400, 0.1 * np.exp(rng.normal(0.0, 0.3, (400, 3))), opacities=(0.05, 0.5))
-    origins, directions = _aimed(rng, cloud, 300, distance=(1.9e3, 2.1e3))
+    origins, directions = aimed_rays(rng, cloud, 300, distance=(1.9e3, 2.1e3))
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -274,7 +274,7 @@ def _clusters() -> Stress:
     cloud = _cloud(rng, 400, 1e-3 * np.exp(rng.normal(0.0, 0.3, (400, 3))), side=0.01, opacities=(0.05, 0.6))
     side = np.where(np.arange(400) % 2 == 0, 500.0, -500.0)[:, None] * np.array([1.0, 0.3, -0.7])
     cloud = cloud.with_arrays(positions=cloud.positions + side)
-    origins, directions = _aimed(rng, cloud, 300, distance=(0.0, 0.05))
+    origins, directions = aimed_rays(rng, cloud, 300, distance=(0.0, 0.05))
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -282,7 +282,7 @@ def _clusters() -> Stress:
 def _parallel() -> Stress:
     rng = np.random.default_rng(14)
     cloud = _cloud(rng, 500, 0.08 * np.exp(rng.normal(0.0, 0.4, (500, 3))), opacities=(0.05, 0.6))
-    origins, directions = _aimed(rng, cloud, 300, directions=_axis_parallel(rng, 300))
+    origins, directions = aimed_rays(rng, cloud, 300, directions=_axis_parallel(rng, 300))
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -301,7 +301,7 @@ def _on_planes() -> Stress:
         opacities=(0.05, 0.6),
     )
     count = 900
-    planes = np.stack(_box_planes(cloud))
+    planes = np.stack(box_planes(cloud))
     origins = planes[rng.integers(0, 2, (count, 3)), rng.integers(0, 125, (count, 3)), np.arange(3)]
     nudge = rng.integers(-1, 2, (count, 3))
     origins = np.where(nudge < 0, np.nextafter(origins, np.float32(-9.0)), origins)
@@ -317,7 +317,7 @@ def _denormal() -> Stress:
     d = _axis_parallel(rng, 400)
     tiny = np.float32(10.0) ** rng.uniform(-44.0, -9.0, (400, 3)).astype(np.float32)
     d = np.where(d == 0.0, tiny * rng.choice(np.array([-1.0, 1.0], np.float32), (400, 3)), d).astype(np.float32)
-    origins, directions = _aimed(rng, cloud, 400, directions=d)
+    origins, directions = aimed_rays(rng, cloud, 400, directions=d)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -332,7 +332,7 @@ def _coincident() -> Stress:
         orientations=np.tile([0.0, 0.0, 0.0, 1.0], (10_000, 1)),
         opacities=np.full(10_000, 1.0 / 250.0),
     )
-    origins, directions = _aimed(rng, cloud, 30, spread=0.3)
+    origins, directions = aimed_rays(rng, cloud, 30, spread=0.3)
     origins[:10] += 1.0  # these miss all
     known = np.full(30, np.nan)
     known[:10] = 1.0
@@ -350,7 +350,7 @@ def _chain() -> Stress:
         positions=place[:, None] * np.array([1.0, 0.5, 0.25]),
         opacities=(0.02, 0.2),
     )
-    origins, directions = _aimed(rng, cloud, 200)
+    origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 800})
 
 
@@ -359,7 +359,7 @@ def _line() -> Stress:
     rng = np.random.default_rng(19)
     positions = rng.uniform(-1.0, 1.0, (500, 1)) * np.array([1.0, 0.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
-    origins, directions = _aimed(rng, cloud, 200)
+    origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -368,7 +368,7 @@ def _plane() -> Stress:
     rng = np.random.default_rng(20)
     positions = rng.uniform(-1.0, 1.0, (500, 3)) * np.array([1.0, 1.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
-    origins, directions = _aimed(rng, cloud, 200)
+    origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -378,7 +378,7 @@ def _one_place() -> Stress:
     cloud = _cloud(
         rng, 300, rng.uniform(0.01, 0.2, (300, 3)), positions=np.tile([3.0, 1.0, 2.0], (300, 1)), opacities=(0.01, 0.05)
     )
-    origins, directions = _aimed(rng, cloud, 200)
+    origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -388,7 +388,7 @@ def _opacities() -> Stress:
     cut = np.float32(1.0 / 255.0)
     levels = np.array([0.0, cut, np.nextafter(cut, np.float32(1.0)), 1.001 * cut, 0.99, 1.0], np.float32)
     cloud = _cloud(rng, 600, 0.05, opacities=np.repeat(levels, 100))
-    origins, directions = _aimed(rng, cloud, 400, spread=0.5)
+    origins, directions = aimed_rays(rng, cloud, 400, spread=0.5)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"dropped": 200, "traced": 400})
 
 
@@ -404,7 +404,7 @@ def _broken() -> Stress:
     arrays["scales"][300:320:2, 1] = -0.1
     arrays["orientations"][400:420:2] = 0.0
     cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays)
-    origins, directions = _aimed(rng, cloud, 300)
+    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(
         cloud=cloud,
         origins=origins,
@@ -419,7 +419,7 @@ def _broken() -> Stress:
 def _inside_peak() -> Stress:
     rng = np.random.default_rng(24)
     cloud = _cloud(rng, 300, rng.uniform(0.1, 0.4, (300, 3)), opacities=(0.02, 0.3))
-    origins, directions = _aimed(rng, cloud, 300, distance=(-0.1, 0.1))
+    origins, directions = aimed_rays(rng, cloud, 300, distance=(-0.1, 0.1))
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -427,7 +427,7 @@ def _inside_peak() -> Stress:
 def _inside_entry() -> Stress:
     rng = np.random.default_rng(25)
     cloud = _cloud(rng, 300, rng.uniform(0.1, 0.4, (300, 3)), opacities=(0.02, 0.3))
-    origins, directions = _aimed(rng, cloud, 300, distance=(-0.1, 0.6))
+    origins, directions = aimed_rays(rng, cloud, 300, distance=(-0.1, 0.6))
     return Stress(cloud=cloud, origins=origins, directions=directions, options=TraceOptions(front="entry"))
 
 
@@ -470,7 +470,7 @@ def _ratios() -> Stress:
     scales = 10.0 ** rng.uniform(-4.6, 2.0, (800, 1)) * rng.uniform(0.5, 1.0, (800, 3))
     opacities = np.where(scales.max(axis=1) > 0.3, 0.01, rng.uniform(0.1, 1.0, 800))
     cloud = _cloud(rng, 800, scales, opacities=opacities)
-    origins, directions = _aimed(rng, cloud.select(np.flatnonzero(opacities > 0.01)), 300)
+    origins, directions = aimed_rays(rng, cloud.select(np.flatnonzero(opacities > 0.01)), 300)
     return Stress(cloud=cloud, origins=origins, directions=directions)
 
 
@@ -478,7 +478,7 @@ def _ratios() -> Stress:
 def _reach() -> Stress:
     rng = np.random.default_rng(28)
     cloud = _cloud(rng, 400, rng.uniform(0.05, 0.3, (400, 3)), opacities=(0.02, 0.3))
-    origins, directions = _aimed(rng, cloud, 400, distance=(0.5, 0.5))
+    origins, directions = aimed_rays(rng, cloud, 400, distance=(0.5, 0.5))
     t_max = 0.5 + 0.1 * rng.normal(size=400)
     t_max[:20], t_max[20:40] = 0.0, np.inf
     known = np.full(400, np.nan)
@@ -551,7 +551,7 @@ def _none() -> Stress:
 def _invisible() -> Stress:
     rng = np.random.default_rng(32)
     cloud = _cloud(rng, 100, 0.1, opacities=np.full(100, 1.0 / 300.0))
-    origins, directions = _aimed(rng, cloud, 50)
+    origins, directions = aimed_rays(rng, cloud, 50)
     return Stress(
         cloud=cloud, origins=origins, directions=directions, known=np.ones(50), expected={"traced": 0, "dropped": 100}
     )
@@ -572,5 +572,5 @@ def _two_million() -> Stress:
     positions = direction * (1.0 + 0.01 * rng.normal(size=(count, 1)))
     scales = 0.001 * np.exp(rng.normal(0.0, 0.3, (count, 3)))
     cloud = _cloud(rng, count, scales, positions=positions, opacities=(0.02, 0.6))
-    origins, directions = _aimed(rng, cloud, 192, distance=(0.05, 1.5))
+    origins, directions = aimed_rays(rng, cloud, 192, distance=(0.05, 1.5))
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": count})

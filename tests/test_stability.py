@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from shapes import random_cloud, random_rays
 
-from beam_warp import GaussianCloud, Scene, stability, visibility
+from beam_warp import GaussianCloud, Scene, stability, stress_cases, visibility
 from beam_warp.kernels.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, launch_pack_gaussians
 from beam_warp.kernels.gaussian import Gaussians
 from beam_warp.reference import rotation_matrices, visibility_enclosure, visibility_reference
@@ -36,7 +36,7 @@ class TestCases:
         rng = np.random.default_rng(seed)
         cloud = random_cloud(rng, 300, scale=[(-3.5, 0.8), (-5.0, 1.5), (-3.0, 2.5), (-7.0, 1.0)][seed % 4])
         cloud = cloud.with_arrays(opacities=0.6 * cloud.opacities)
-        rays = stability._aimed(rng, cloud, 300, distance=(-0.1, 2.0))
+        rays = stress_cases.aimed_rays(rng, cloud, 300, distance=(-0.1, 2.0))
         degree, front = (2, 2, 4)[seed % 3], ("peak", "entry")[seed // 2 % 2]
         t_max = rng.uniform(0.0, 2.0, 300).astype(np.float32) if seed % 5 == 0 else np.inf
         scene = scene_under(hierarchy, cloud, device, degree)
@@ -340,7 +340,7 @@ class TestNaiveForms:
         makes what remains, rays that leave along the plane, miss nothing that they would meet.
         """
         stress = case_of("axis-parallel rays on box planes").build()
-        lower, upper = stability._box_planes(stress.cloud)
+        lower, upper = stress_cases.box_planes(stress.cloud)
         bvh = wp.Bvh(*(wp.array(plane, dtype=wp.vec3, device="cpu") for plane in (lower, upper)), leaf_size=1)
         d = stress.directions
         found = []
