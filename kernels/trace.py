@@ -17,7 +17,8 @@ from beam_warp.kernels.sampling import hash_combine, unit_float
 from beam_warp.kernels.trace_settings import TraceSettings
 from beam_warp.kernels.wide_tree import Stack, WideTree, lowest_bit, meet_leaf_by_default, meet_node, reciprocal
 
-# Fast math: divisions and the exponential of a hit within 2 ulp; 9 % more rays a second on an H200.
+# Fast math: divisions and the exponential of a hit within 2 ulp; 9 % more rays a second on an H200. The stability suite
+# holds with it on both devices.
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 RAYS_A_LANE = 8
