@@ -15,7 +15,7 @@ class RayBatch:
     """Surface points, in the order that they are worked through; the ``sample_count`` rays of a point are neighbours.
 
     Groups of points whose rays of one stratum are neighbours, so that a warp's rays share a direction, were tried: on
-    an H200 groups of 32 to 4,096 are 4 to 9 % slower (879 to 915 against 958 Mray/s), on the CPU up to 26 %.
+    an H200 groups of 32 to 4,096 are 4 to 9 % slower (878 to 915 against 958 Mray/s), on the CPU up to 26 %.
     """
 
     positions: wp.array[wp.vec3]

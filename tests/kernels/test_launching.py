@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shapes import random_cloud, random_rays
 
 from beam_warp import Scene, visibility
 from beam_warp.kernels import launching
@@ -39,8 +40,6 @@ def test_kernels_with_atomics_are_launched_in_order(path):
 
 
 def test_a_scene_is_the_same_with_many_threads(monkeypatch, rng):
-    from shapes import random_cloud, random_rays
-
     cloud, rays = random_cloud(rng, 20_000, scale=(-5.0, 0.5)), random_rays(rng, 2_000)
     monkeypatch.setenv("BEAM_WARP_THREADS", "1")
     alone = visibility(Scene.from_gaussians(cloud, "cpu"), *rays)
