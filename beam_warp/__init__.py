@@ -31,8 +31,12 @@ if TYPE_CHECKING:
     from beam_warp.pipeline import RunOptions as RunOptions
     from beam_warp.pipeline import RunResult as RunResult
     from beam_warp.pipeline import run as run
+    from beam_warp.rasterizer import GaussianArrays as GaussianArrays
+    from beam_warp.rasterizer import Rasterizer as Rasterizer
+    from beam_warp.rasterizer import RasterOptions as RasterOptions
     from beam_warp.rasterizing import GBuffer as GBuffer
     from beam_warp.rasterizing import rasterize as rasterize
+    from beam_warp.rasterizing import rasterize_backward as rasterize_backward
     from beam_warp.scene import Scene as Scene
     from beam_warp.schema.validator import validate as validate
     from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
@@ -46,11 +50,14 @@ _HOMES = {
     "Capture": "captures",
     "EnvironmentMap": "environments",
     "GBuffer": "rasterizing",
+    "GaussianArrays": "rasterizer",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
     "Irradiance": "incident_light",
     "MaterialOptions": "materials",
     "Observability": "assets",
+    "RasterOptions": "rasterizer",
+    "Rasterizer": "rasterizer",
     "RunOptions": "pipeline",
     "RunResult": "pipeline",
     "Scene": "scene",
@@ -63,6 +70,7 @@ _HOMES = {
     "estimate_normals": "surfaces",
     "irradiance": "incident_light",
     "rasterize": "rasterizing",
+    "rasterize_backward": "rasterizing",
     "read": "converters",
     "run": "pipeline",
     "validate": "schema.validator",

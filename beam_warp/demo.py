@@ -26,6 +26,7 @@ from beam_warp.images import display_image, linear_to_srgb, write_exr, write_png
 from beam_warp.material_mesh import MaterialMesh
 from beam_warp.mesh_path_tracing import TracedChannels, TracedMesh, outgoing_radiance, trace_channels, trace_radiance
 from beam_warp.pipeline import OverviewOptions, Progress, RunOptions, RunResult, no_progress, run
+from beam_warp.rasterizer import RasterOptions
 from beam_warp.rasterizing import GBuffer, rasterize
 from beam_warp.reporting import write_report
 from beam_warp.spherical_harmonics import sh_basis
@@ -276,7 +277,8 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress =
         write_exr(folder / f"{name}.exr", {c: light.radiance[..., i] for i, c in enumerate("RGB")})
     cloud = result.sequence[scene.truth_frame]
     # The stand-in was not trained against a widening filter, so the one that keeps energy is the fair one.
-    buffers = [rasterize(cloud, truth.camera, device=options.device, antialiased=True) for truth in scene.truth]
+    cameras = [truth.camera for truth in scene.truth]
+    buffers = rasterize(cloud, cameras, options=RasterOptions(antialiased=True), device=options.device)
     lightings = {
         name: EnvironmentLighting.from_environment(light, device=options.device) for name, light in scene.lights.items()
     }

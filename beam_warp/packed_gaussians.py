@@ -28,7 +28,7 @@ class PackedGaussians:
     Attributes:
         device: Where everything is.
         gaussians: What kernels read, relative to ``origin``.
-        orientations, scales: As given, to which gradients refer, ``(N,)`` quat and vec3.
+        positions, orientations, scales: As given, to which gradients refer, ``(N,)`` vec3, quat and vec3.
         opacities: ``(N,)``.
         lowers, uppers: Bounds relative to ``origin``, ``(N,)`` vec3; a point where nothing can be seen.
         fates: What becomes of each Gaussian (see `kernels.bounds`), ``(N,)`` int32.
@@ -40,6 +40,7 @@ class PackedGaussians:
 
     device: Any
     gaussians: Gaussians
+    positions: wp.array
     orientations: wp.array
     scales: wp.array
     opacities: wp.array
@@ -70,6 +71,7 @@ class PackedGaussians:
         packed = cls(
             device,
             gaussians,
+            wp.empty(count, dtype=wp.vec3, device=device),
             wp.empty(count, dtype=wp.quat, device=device),
             wp.empty(count, dtype=wp.vec3, device=device),
             upload(cloud.opacities, float, device),
@@ -92,6 +94,7 @@ class PackedGaussians:
 
     def place(self, positions: wp.array, orientations: wp.array, scales: wp.array) -> None:
         """Write rows and bounds of Gaussians at these world positions; device arrays of vec3, quat and vec3."""
+        wp.copy(self.positions, positions)
         wp.copy(self.orientations, orientations)
         wp.copy(self.scales, scales)
         launch_pack_gaussians(

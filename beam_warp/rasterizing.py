@@ -1,10 +1,10 @@
-"""What a camera sees of a cloud: alpha, depth and any per-Gaussian channel on every pixel (a G-buffer)."""
+"""What cameras see of a cloud: alpha, depth and any per-Gaussian channel of every pixel (a G-buffer); and its adjoint."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import warp as wp
@@ -13,19 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.assets import ATTRIBUTES, WORLD_AXES, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.checks import require_array, require_choice, require_finite, require_same_length
-from beam_warp.devices import resolve_device
+from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.bin_tiles import (
-    Band,
-    count_pairs_kernel,
-    emit_pairs_kernel,
-    find_ranges_kernel,
-    make_depth_keys_kernel,
-)
-from beam_warp.kernels.composite import CHANNEL_COUNTS, channel_vector, composite_kernel
-from beam_warp.kernels.launching import launch
-from beam_warp.kernels.project import Gaussians, Pinhole, Splats, project_gaussians_kernel
-from beam_warp.spherical_harmonics import sh_color
+from beam_warp.rasterizer import GaussianArrays, GaussianGradients, RasterImages, Rasterizer, RasterOptions
+from beam_warp.scene import Scene
 
 MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
 """The channels that relighting reads."""
@@ -33,41 +24,50 @@ MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
 RADIANCE = "radiance"
 """The channel that is evaluated towards the camera before it is composited."""
 
+SURFACE_NORMALS = "surface_normals"
+"""The channel of normals that geometry alone gives: of the surface of largest response, towards the camera."""
+
 CHANNELS = (
     RADIANCE,
+    SURFACE_NORMALS,
     *(a.name for a in ATTRIBUTES.values() if a.dtype == "float32" and not a.required and a.name != RADIANCE),
 )
 """Every channel that `rasterize` knows; a cloud may lack some."""
 
-TILE = 8
-"""Side of a tile [pixel]. A pixel reads the whole list of its tile: small tiles waste less of it on small splats."""
+UNIT_CHANNELS = ("normals", SURFACE_NORMALS)
+"""Channels of directions: their mean is brought to unit length."""
 
-MAX_BAND_PAIRS = 2**25
-"""Most (tile, splat) pairs held at a time, 16 bytes each: beyond it the image is drawn in bands of tile rows."""
+MAX_SPLATS = 2**23
+"""Most splats, Gaussians times cameras, projected at a time unless one camera has more: 1.2 GB with 11 channels."""
 
-MAX_ROW_PAIRS = 2**30
-"""Most pairs in one row of tiles, the least that can be drawn: positions in their list are 32-bit."""
+MAX_PIXELS = 2**25
+"""Most pixels drawn at a time unless one camera has more: 2.6 GB with 11 channels."""
 
 
 @dataclass(frozen=True, eq=False)
 class GBuffer:
-    """What every pixel sees.
+    """What every pixel of a camera sees.
 
     Attributes:
         camera: The camera that sees it.
         alpha: Coverage in [0, 1], ``(H, W)`` float32.
         depth: Expected distance along the optical axis [m], ``(H, W)`` float32.
+        median_depth: Distance of the last splat that more than half of the light passes before [m], ``(H, W)``
+            float32: it jumps where the expected one blurs.
+        gaussian_ids: The last Gaussian that was seen, -1 for none, ``(H, W)`` int32.
         channels: By name, the mean over what the pixel sees, weighted by visibility and *not* multiplied by alpha:
             ``(H, W)`` or ``(H, W, C)`` float32 in the units and colour space of the cloud's array of that name.
-            ``normals`` are of unit length; ``radiance`` is the captured colour towards the camera, composited in its
-            own colour space, as viewers do.
+            ``normals`` and ``surface_normals`` are of unit length; ``radiance`` is the captured colour towards the
+            camera, composited in its own colour space, as viewers do.
 
-    Depth and channels are 0 where alpha is 0.
+    Depths and channels are 0 where alpha is 0.
     """
 
     camera: Camera
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
+    median_depth: NDArray[np.float32]
+    gaussian_ids: NDArray[np.int32]
     channels: Mapping[str, NDArray[np.float32]]
 
     def layers(self) -> dict[str, NDArray[np.float32]]:
@@ -90,52 +90,81 @@ _LAYER_PARTS = {"normals": ("normal", "XYZ")}
 """Channels whose layers are named otherwise than NAME.R, NAME.G and NAME.B."""
 
 
+class ValueImages(NamedTuple):
+    """Sums over what every pixel of a camera sees, weighted by visibility.
+
+    Attributes:
+        alpha: Sum of the weights, ``(H, W)`` float32; at most 1 but for rounding.
+        depth: Mean depth [m], ``(H, W)`` float32; 0 where nothing is seen.
+        median_depth: See `GBuffer`.
+        gaussian_ids: See `GBuffer`.
+        values: Sums of values, ``(H, W, K)`` float32.
+    """
+
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    median_depth: NDArray[np.float32]
+    gaussian_ids: NDArray[np.int32]
+    values: NDArray[np.float32]
+
+
+@overload
 def rasterize(
-    cloud: GaussianCloud,
-    camera: Camera,
+    source: GaussianCloud | Scene,
+    cameras: Camera,
+    *,
+    channels: Sequence[str] = ...,
+    options: RasterOptions | None = ...,
+    device: Any = ...,
+) -> GBuffer: ...
+
+
+@overload
+def rasterize(
+    source: GaussianCloud | Scene,
+    cameras: Sequence[Camera],
+    *,
+    channels: Sequence[str] = ...,
+    options: RasterOptions | None = ...,
+    device: Any = ...,
+) -> list[GBuffer]: ...
+
+
+def rasterize(
+    source: GaussianCloud | Scene,
+    cameras: Camera | Sequence[Camera],
     *,
     channels: Sequence[str] = MATERIAL_CHANNELS,
+    options: RasterOptions | None = None,
     device: Any = None,
-    antialiased: bool = False,
-) -> GBuffer:
+) -> GBuffer | list[GBuffer]:
     """Draw a cloud.
 
-    Splats are composited front to back in the order of their centres' depth, with the constants of 3DGS: low-pass
-    0.3 pixel^2, near plane 0.01 m, alpha at most 0.99 and at least 1/255. Same device, same input: same bits.
+    Splats are composited front to back in the order of their centres' depth, ties in the order of the cloud, with the
+    constants of 3DGS: alpha at most 0.99 and at least 1/255. Same device, same input: same bits.
 
     Args:
-        cloud: Gaussians in the internal world (axes ``rfu``).
-        camera: The camera.
+        source: Gaussians in the internal world (axes ``rfu``); or a `Scene`, drawn where it is on its device, which
+            has no channels but ``surface_normals``.
+        cameras: A camera, or any number of them, of any sizes.
         channels: What to draw, of `CHANNELS`.
-        device: Warp device; the first GPU without, or the CPU where there is none.
-        antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
-            views from further away than the training views.
+        options: How splats are drawn; see `RasterOptions`.
+        device: Warp device; the first GPU without, or the CPU where there is none. A scene has its own.
+
+    Returns:
+        What the camera sees; for a sequence of cameras, what each one sees.
 
     Raises:
         InvalidOptionError: A channel is unknown, or the cloud is in other axes.
-        InvalidArrayError: The cloud lacks a channel, or it covers the image too often to be drawn.
+        InvalidArrayError: The cloud lacks a channel, or it covers an image too often to be drawn.
         DeviceError: The device is not there.
 
-    Source: Zwicker et al. 2001; Kerbl et al. 2023, Section 6; Yu et al. 2024, Eq. 9 (``antialiased``).
+    Source: Zwicker et al. 2001; Kerbl et al. 2023, Section 6; Zhang et al. 2024 (depth and normals).
     """
-    columns = [_channel(cloud, camera, name) for name in channels]
-    widths = [column.shape[1] for column in columns]
-    values = np.concatenate(columns, axis=1) if columns else np.zeros((len(cloud), 0), np.float32)
-    alpha, depth, image = rasterize_values(cloud, camera, values, device=device, antialiased=antialiased)
-    covered = alpha > 0.0
-    drawn = {}
-    for name, start, width in zip(channels, np.cumsum([0, *widths]), widths, strict=False):
-        layer = image[..., start : start + width]
-        if name == "normals":
-            length = np.linalg.norm(layer, axis=-1, keepdims=True)
-            layer = np.divide(layer, length, out=np.zeros_like(layer), where=length > 0.0)
-        else:
-            layer = np.divide(layer, alpha[..., None], out=np.zeros_like(layer), where=covered[..., None])
-            # A mean stays in the range of what it averages, but for the last bit.
-            layer = np.clip(layer, ATTRIBUTES[name].low, ATTRIBUTES[name].high, dtype=np.float32)
-        drawn[name] = layer[..., 0] if ATTRIBUTES[name].trailing == () else layer
-    depth = np.divide(depth, alpha, out=np.zeros_like(depth), where=covered)
-    return GBuffer(camera, np.minimum(alpha, np.float32(1.0)), depth, drawn)
+    drawn = _Source.of(source, channels, device)
+    if isinstance(cameras, Camera):
+        return next(drawn.draw([cameras], options))
+    return list(drawn.draw(list(cameras), options))
 
 
 def rasterize_values(
@@ -143,21 +172,17 @@ def rasterize_values(
     camera: Camera,
     values: ArrayLike,
     *,
+    options: RasterOptions | None = None,
     device: Any = None,
-    antialiased: bool = False,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> ValueImages:
     """Draw any per-Gaussian values: the linear map from values to pixels that `rasterize` rests on.
 
     Args:
         cloud: Gaussians in the internal world (axes ``rfu``).
         camera: The camera.
         values: ``(N, K)`` finite float32, K at least 0.
+        options: See `rasterize`.
         device: See `rasterize`.
-        antialiased: See `rasterize`.
-
-    Returns:
-        Alpha ``(H, W)``, the sum of the weights of what a pixel sees and so at most 1 but for rounding; and the sums
-        of depth [m] ``(H, W)`` and of values ``(H, W, K)`` with the same weights; float32.
 
     Raises:
         InvalidOptionError: The cloud is in other axes.
@@ -167,161 +192,316 @@ def rasterize_values(
     rows = require_array("values", values, (None, None))
     require_same_length("values", rows, "positions", len(cloud))
     require_finite("values", rows)
+    _require_world_axes(cloud)
+    target = resolve_device(device)
+    rasterizer = Rasterizer(len(cloud), [camera], value_count=rows.shape[1], options=options, device=target)
+    images = rasterizer.draw(upload_gaussians(cloud, target, values=rows))
+    return _view_images(rasterizer, images, 0, camera)
+
+
+@dataclass(frozen=True, eq=False)
+class CloudGradients:
+    """Derivatives of a loss with respect to a cloud's arrays, float32 and of their shapes.
+
+    Attributes:
+        positions, scales: [1/m].
+        orientations: To the quaternions xyzw as given, orthogonal to them.
+        opacities: To the opacities.
+        channels: By name, to the arrays of the channels that were drawn; ``surface_normals`` have none of their own,
+            what they say is in ``orientations``, ``scales`` and ``positions``.
+    """
+
+    positions: NDArray[np.float32]
+    orientations: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    channels: Mapping[str, NDArray[np.float32]]
+
+
+def rasterize_backward(
+    cloud: GaussianCloud,
+    cameras: Camera | Sequence[Camera],
+    adjoints: Mapping[str, ArrayLike] | Sequence[Mapping[str, ArrayLike]],
+    *,
+    channels: Sequence[str] = MATERIAL_CHANNELS,
+    options: RasterOptions | None = None,
+    device: Any = None,
+) -> CloudGradients:
+    """Return how a loss changes with a cloud, from how it changes with what `rasterize` returns for it.
+
+    The cloud is drawn again: a loop that draws and differentiates holds a `Rasterizer` instead. What is discrete is
+    held still: which splats count, their order, the cap of alpha, the pick of the median. The bits depend on the device
+    alone.
+
+    Args:
+        cloud: See `rasterize`.
+        cameras: See `rasterize`.
+        adjoints: By name of an attribute of `GBuffer` (``alpha``, ``depth``, ``median_depth``) or of a channel, the
+            derivatives of the loss to that image; what is left out is 0. One mapping for a camera, as many as cameras
+            for a sequence.
+        channels: See `rasterize`.
+        options: See `rasterize`.
+        device: See `rasterize`.
+
+    Raises:
+        InvalidOptionError: A name is neither an image nor a channel drawn, or their number is not that of the cameras;
+            else as for `rasterize`.
+        InvalidArrayError: A derivative has another shape than its image, or is not finite; else as for `rasterize`.
+        DeviceError: The device is not there.
+
+    Source: see `Rasterizer.backward`.
+    """
+    views = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    given = [adjoints] if isinstance(adjoints, Mapping) else list(adjoints)
+    if len(given) != len(views):
+        raise InvalidOptionError(
+            f"adjoints must hold one mapping for each of {len(views)} cameras, got {len(given)}. Pass an empty one "
+            "where nothing changes."
+        )
+    drawn = _Source.of(cloud, channels, device)
+    for mapping in given:
+        for name in mapping:
+            require_choice("adjoints", name, (*IMAGES, *drawn.channels))
+    totals: dict[str, Any] = {}
+    for rasterizer, images, part in drawn.draw_groups(views, options):
+        for place, index in enumerate(part):
+            drawn.set_adjoints(rasterizer, images, place, given[index])
+        for name, array in drawn.gradients(rasterizer.backward()).items():
+            totals[name] = totals[name] + array if name in totals else array
+    if not totals:  # no camera
+        raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
+    return CloudGradients(**{name: totals.pop(name) for name in GEOMETRY}, channels=totals)
+
+
+IMAGES = ("alpha", "depth", "median_depth")
+"""Images besides channels that a loss may depend on."""
+
+GEOMETRY = ("positions", "orientations", "scales", "opacities")
+"""Arrays of a cloud that every image depends on."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Gaussians on a device, and which of their arrays are drawn."""
+
+    gaussians: GaussianArrays
+    channels: tuple[str, ...]
+    device: Any
+
+    @classmethod
+    def of(cls, source: GaussianCloud | Scene, channels: Sequence[str], device: Any) -> _Source:
+        """Bring what is drawn to the device."""
+        names = tuple(channels)
+        for name in names:
+            require_choice("channels", name, CHANNELS)
+        if isinstance(source, Scene):
+            return cls(_scene_arrays(source, names), names, source.device)
+        _require_world_axes(source)
+        target = resolve_device(device)
+        columns = [_require_channel(source, name) for name in _own(names)]
+        values = (
+            np.concatenate([c.reshape(len(source), _width(c.shape[1:])) for c in columns], axis=1) if columns else None
+        )
+        radiance = _require_channel(source, RADIANCE) if RADIANCE in names else None
+        return cls(upload_gaussians(source, target, values=values, radiance=radiance), names, target)
+
+    def draw(self, cameras: Sequence[Camera], options: RasterOptions | None) -> Iterator[GBuffer]:
+        """Draw for cameras, some at a time."""
+        for rasterizer, images, part in self.draw_groups(cameras, options):
+            for place, index in enumerate(part):
+                yield self._buffer(_view_images(rasterizer, images, place, cameras[index]), rasterizer, cameras[index])
+
+    def draw_groups(
+        self, cameras: Sequence[Camera], options: RasterOptions | None
+    ) -> Iterator[tuple[Rasterizer, RasterImages, range]]:
+        """Draw for as many cameras at a time as memory allows: what drew them, the images, and which ones."""
+        first = 0
+        while first < len(cameras):
+            end = first + 1
+            pixels = cameras[first].width * cameras[first].height
+            while end < len(cameras):
+                pixels += cameras[end].width * cameras[end].height
+                if pixels > MAX_PIXELS or (end + 1 - first) * len(self.gaussians.positions) > MAX_SPLATS:
+                    break
+                end += 1
+            rasterizer = Rasterizer(
+                len(self.gaussians.positions),
+                cameras[first:end],
+                value_count=0 if self.gaussians.values is None else self.gaussians.values.shape[1],
+                radiance=RADIANCE in self.channels,
+                normals=SURFACE_NORMALS in self.channels,
+                options=options,
+                device=self.device,
+            )
+            yield rasterizer, rasterizer.draw(self.gaussians), range(first, end)
+            first = end
+
+    def _places(self, rasterizer: Rasterizer) -> dict[str, slice]:
+        """Return where each channel is among those of a rasteriser."""
+        places = {}
+        start = rasterizer.value_channels.start
+        for name in _own(self.channels):
+            width = _width(ATTRIBUTES[name].trailing)
+            places[name] = slice(start, start + width)
+            start += width
+        places[RADIANCE] = slice(rasterizer.color_channels.start, rasterizer.color_channels.stop)
+        places[SURFACE_NORMALS] = slice(rasterizer.normal_channels.start, rasterizer.normal_channels.stop)
+        return {name: places[name] for name in self.channels}
+
+    def _buffer(self, images: ValueImages, rasterizer: Rasterizer, camera: Camera) -> GBuffer:
+        """Turn sums into means."""
+        alpha = images.alpha
+        drawn = {}
+        for name, place in self._places(rasterizer).items():
+            layer = images.values[..., place]
+            if name in UNIT_CHANNELS:
+                length = np.linalg.norm(layer, axis=-1, keepdims=True)
+                layer = np.divide(layer, length, out=np.zeros_like(layer), where=length > 0.0)
+            else:
+                layer = np.divide(layer, alpha[..., None], out=np.zeros_like(layer), where=alpha[..., None] > 0.0)
+                # A mean stays in the range of what it averages, but for the last bit.
+                layer = np.clip(layer, ATTRIBUTES[name].low, ATTRIBUTES[name].high, dtype=np.float32)
+            drawn[name] = layer if name == SURFACE_NORMALS or ATTRIBUTES[name].trailing else layer[..., 0]
+        return GBuffer(
+            camera, np.minimum(alpha, np.float32(1.0)), images.depth, images.median_depth, images.gaussian_ids, drawn
+        )
+
+    def set_adjoints(
+        self, rasterizer: Rasterizer, images: RasterImages, place: int, given: Mapping[str, ArrayLike]
+    ) -> None:
+        """Turn derivatives to the means of one view into those to its sums, and write them where they are read."""
+        camera = rasterizer.cameras[place]
+        shape = (camera.height, camera.width)
+        drawn = _view_images(rasterizer, images, place, camera)
+        arrays = {}
+        for name in IMAGES:
+            array = require_array(name, given.get(name, np.zeros(shape)), shape, np.float64).copy()
+            require_finite(name, array)
+            arrays[name] = array
+        to_sums = np.zeros(drawn.values.shape)
+        alpha = drawn.alpha.astype(np.float64)[..., None]
+        for name, columns in self._places(rasterizer).items():
+            layer = drawn.values[..., columns].astype(np.float64)
+            trailing = () if name != SURFACE_NORMALS and not ATTRIBUTES[name].trailing else (layer.shape[-1],)
+            array = require_array(name, given.get(name, np.zeros(shape + trailing)), shape + trailing, np.float64)
+            require_finite(name, array)
+            array = array.reshape(layer.shape)
+            if name in UNIT_CHANNELS:
+                length = np.linalg.norm(layer, axis=-1, keepdims=True)
+                unit = np.divide(layer, length, out=np.zeros_like(layer), where=length > 0.0)
+                across = array - unit * (unit * array).sum(axis=-1, keepdims=True)
+                to_sums[..., columns] = np.divide(across, length, out=np.zeros_like(layer), where=length > 0.0)
+            else:
+                per_weight = np.divide(array, alpha, out=np.zeros_like(layer), where=alpha > 0.0)
+                mean = np.divide(layer, alpha, out=np.zeros_like(layer), where=alpha > 0.0)
+                to_sums[..., columns] = per_weight
+                arrays["alpha"] -= (per_weight * mean).sum(axis=-1)
+        target = rasterizer.adjoints()
+        first, end = rasterizer.first_pixels[place : place + 2]
+        for name in IMAGES:
+            getattr(target, name)[first:end].assign(arrays[name].reshape(-1).astype(np.float32))
+        start = 0
+        for rows in target.channels:
+            columns = to_sums[..., start : start + rows.shape[1]].reshape(end - first, -1).astype(np.float32)
+            padded = np.zeros((end - first, rows.shape[1]), np.float32)
+            padded[:, : columns.shape[1]] = columns
+            rows[first:end].assign(padded)
+            start += rows.shape[1]
+
+    def gradients(self, found: GaussianGradients) -> dict[str, NDArray[np.float32]]:
+        """Bring gradients back, by name of the cloud's array."""
+        arrays = {name: getattr(found, name).numpy() for name in GEOMETRY}
+        start = 0
+        for name in _own(self.channels):
+            trailing = ATTRIBUTES[name].trailing
+            width = _width(trailing)
+            columns = found.values.numpy()[:, start : start + width]
+            arrays[name] = np.ascontiguousarray(columns if trailing else columns[:, 0])
+            start += width
+        if RADIANCE in self.channels:
+            arrays[RADIANCE] = found.radiance.numpy()
+        return arrays
+
+
+def upload_gaussians(
+    cloud: GaussianCloud,
+    device: Any,
+    *,
+    values: NDArray[np.float32] | None = None,
+    radiance: NDArray[np.float32] | None = None,
+) -> GaussianArrays:
+    """Bring a cloud's geometry, and what of it is drawn, to a device.
+
+    Args:
+        cloud: Gaussians.
+        device: A Warp device.
+        values: ``(N, K)`` float32, or None.
+        radiance: ``(N, B, 3)`` float32 spherical harmonics, or None.
+    """
+    return GaussianArrays(
+        upload(cloud.positions, wp.vec3, device),
+        upload(cloud.orientations, wp.quat, device),
+        upload(cloud.scales, wp.vec3, device),
+        upload(cloud.opacities, float, device),
+        None if values is None else upload(values, float, device),
+        None if radiance is None else upload(radiance, wp.vec3, device),
+    )
+
+
+def _own(channels: Sequence[str]) -> list[str]:
+    """Return the channels that are Gaussians' own values: neither seen towards a camera nor of geometry."""
+    return [name for name in channels if name not in (RADIANCE, SURFACE_NORMALS)]
+
+
+def _width(trailing: tuple[int, ...]) -> int:
+    """Return how many columns an array of rows of this shape takes."""
+    return int(np.prod(trailing, dtype=int))
+
+
+def _scene_arrays(scene: Scene, channels: Sequence[str]) -> GaussianArrays:
+    """Return a scene's arrays as they are on its device."""
+    packed = scene.packed
+    own = _own(channels)
+    if RADIANCE in channels or own not in ([], ["normals"]) or (own and not scene.has_normals):
+        raise InvalidArrayError(
+            f"channels of a scene must be of {SURFACE_NORMALS} and, where its cloud has them, normals, got "
+            f"{', '.join(channels)}. Draw the cloud instead."
+        )
+    normals = packed.gaussians.normals
+    values = None
+    if own:
+        values = wp.array(ptr=normals.ptr, shape=(len(normals), 3), dtype=float, device=scene.device)
+    return GaussianArrays(packed.positions, packed.orientations, packed.scales, packed.opacities, values)
+
+
+def _view_images(rasterizer: Rasterizer, images: RasterImages, place: int, camera: Camera) -> ValueImages:
+    """Bring one view's images back; of its channels only those that there are, without padding."""
+    first, end = rasterizer.first_pixels[place : place + 2]
+    shape = (camera.height, camera.width)
+    passes = [rows[first:end].numpy().reshape(*shape, -1) for rows in images.channels]
+    values = passes[0] if len(passes) == 1 else np.concatenate(passes, axis=-1)
+    return ValueImages(
+        *(image[first:end].numpy().reshape(shape) for image in (images.alpha, images.depth, images.median_depth)),
+        rasterizer.gaussian_ids[first:end].numpy().reshape(shape),
+        values[..., : rasterizer.value_channels.stop],
+    )
+
+
+def _require_world_axes(cloud: GaussianCloud) -> None:
+    """Refuse a cloud in other axes than the world's."""
     if cloud.axes != WORLD_AXES:
         raise InvalidOptionError(
             f"cloud must be in the axes {WORLD_AXES!r}, got {cloud.axes!r}. Convert it with "
             f"beam_warp.axes.change_axes(cloud, {WORLD_AXES!r})."
         )
-    target = resolve_device(device)
-    with wp.ScopedDevice(target):
-        return _draw(cloud, camera, rows, antialiased, target)
 
 
-def _draw(
-    cloud: GaussianCloud, camera: Camera, values: NDArray[np.float32], antialiased: bool, device: Any
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Run the pipeline: project, sort by depth, and composite band by band and pass by pass."""
-    shape = (camera.height, camera.width)
-    pinhole = _pinhole(camera)
-    splats = _project(cloud, pinhole, antialiased, device)
-    order = _depth_order(splats, device)
-    alpha = wp.zeros(camera.height * camera.width, dtype=float)
-    depth = wp.zeros_like(alpha)
-    passes = _passes(values)
-    images = [wp.zeros(len(alpha), dtype=channels.dtype) for channels in passes]
-    for band in _bands(splats.boxes.numpy(), camera):
-        pairs, ranges = _bin(splats, order, band, device)
-        for channels, image in zip(passes, images, strict=True):
-            launch(
-                composite_kernel(channels.dtype._length_),
-                (band.end_row - band.first_row) * band.columns * band.tile**2,
-                inputs=[splats, pairs, ranges, channels, pinhole, band],
-                outputs=[image, alpha, depth],
-                device=device,
-            )
-    layers = [image.numpy().reshape(*shape, -1) for image in images]
-    image = np.concatenate(layers, axis=-1)[..., : values.shape[1]]
-    return alpha.numpy().reshape(shape), depth.numpy().reshape(shape), image
-
-
-def _pinhole(camera: Camera) -> Pinhole:
-    """Describe a camera to the kernels."""
-    pinhole = Pinhole()
-    pinhole.world_to_camera = wp.mat33(camera.world_to_camera[:3, :3].astype(np.float32))
-    pinhole.position = wp.vec3(*camera.position)
-    pinhole.focal = wp.vec2(camera.focal_x, camera.focal_y)
-    pinhole.center = wp.vec2(camera.center_x, camera.center_y)
-    pinhole.width = camera.width
-    pinhole.height = camera.height
-    return pinhole
-
-
-def _project(cloud: GaussianCloud, pinhole: Pinhole, antialiased: bool, device: Any) -> Splats:
-    """Project every Gaussian; those on no pixel have an empty box and infinite depth."""
-    count = len(cloud)
-    gaussians = Gaussians()
-    gaussians.positions = wp.array(cloud.positions, dtype=wp.vec3)
-    gaussians.orientations = wp.array(cloud.orientations, dtype=wp.quat)
-    gaussians.scales = wp.array(cloud.scales, dtype=wp.vec3)
-    gaussians.opacities = wp.array(cloud.opacities, dtype=float)
-    splats = Splats()
-    splats.centers = wp.zeros(count, dtype=wp.vec2)
-    splats.shapes = wp.zeros(count, dtype=wp.vec4)
-    splats.planes = wp.zeros(count, dtype=wp.vec3)
-    splats.depth_ranges = wp.zeros(count, dtype=wp.vec2)
-    splats.depths = wp.zeros(count, dtype=float)
-    splats.boxes = wp.zeros(count, dtype=wp.vec4i)
-    launch(
-        project_gaussians_kernel,
-        count,
-        inputs=[gaussians, pinhole, int(antialiased)],
-        outputs=[splats],
-        device=device,
-    )
-    return splats
-
-
-def _depth_order(splats: Splats, device: Any) -> wp.array[int]:
-    """Return the indices of all splats, nearest first and ties by index; those on no pixel come last."""
-    count = len(splats.depths)
-    keys = wp.zeros(2 * count, dtype=int)  # the sort wants room for as many again
-    order = wp.zeros(2 * count, dtype=int)
-    launch(make_depth_keys_kernel, count, inputs=[splats.depths], outputs=[keys, order], device=device)
-    if count:
-        wp.utils.radix_sort_pairs(keys, order, count)
-    return order
-
-
-def _bands(boxes: NDArray[np.int32], camera: Camera) -> Iterator[Band]:
-    """Cut the image into bands of tile rows whose pairs fit in memory: usually one."""
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    drawn = boxes[boxes[:, 2] > boxes[:, 0]].astype(np.int64)
-    across = (drawn[:, 2] - 1) // TILE + 1 - drawn[:, 0] // TILE
-    begins = np.bincount(drawn[:, 1] // TILE, across, rows + 1)
-    ends = np.bincount((drawn[:, 3] - 1) // TILE + 1, across, rows + 1)
-    pairs = np.cumsum(begins - ends)[:rows]
-    if pairs.max() > MAX_ROW_PAIRS:
-        raise InvalidArrayError(
-            f"positions and scales must cover a row of tiles at most {MAX_ROW_PAIRS} times, got {int(pairs.max())} "
-            f"at tile row {int(pairs.argmax())}. Drop Gaussians that are larger than the scene."
-        )
-    first = 0
-    while first < rows:
-        total = np.cumsum(pairs[first:])
-        end = first + max(1, int(np.searchsorted(total, MAX_BAND_PAIRS, side="right")))
-        band = Band()
-        band.tile, band.columns, band.first_row, band.end_row = TILE, columns, first, end
-        yield band
-        first = end
-
-
-def _bin(splats: Splats, order: wp.array[int], band: Band, device: Any) -> tuple[wp.array[int], wp.array[wp.vec2i]]:
-    """Return the splats of all tiles of a band, tile by tile and nearest first, and each tile's range in that list."""
-    tiles = (band.end_row - band.first_row) * band.columns
-    ranges = wp.zeros(tiles, dtype=wp.vec2i)
-    count = len(splats.depths)
-    if not count:
-        return order, ranges
-    counts = wp.zeros(count, dtype=int)
-    launch(count_pairs_kernel, count, inputs=[order, splats.boxes, band], outputs=[counts], device=device)
-    ends = wp.zeros(count, dtype=int)
-    wp.utils.array_scan(counts, ends, inclusive=True)
-    total = int(ends[count - 1 :].numpy()[0])  # waits for the device: the number of pairs sizes what follows
-    keys = wp.zeros(2 * total, dtype=int)
-    pairs = wp.zeros(2 * total, dtype=int)
-    if total:
-        launch(emit_pairs_kernel, count, inputs=[order, splats.boxes, ends, band], outputs=[keys, pairs], device=device)
-        wp.utils.radix_sort_pairs(keys, pairs, total, end_bit=max(1, (tiles - 1).bit_length()))
-        launch(find_ranges_kernel, total, inputs=[keys, total], outputs=[ranges], device=device)
-    return pairs, ranges
-
-
-def _passes(values: NDArray[np.float32]) -> list[wp.array]:
-    """Cut channels into vectors of the lengths there are kernels for, padded with zeros; at least one."""
-    count, channel_count = values.shape
-    passes = []
-    for start in range(0, max(channel_count, 1), CHANNEL_COUNTS[-1]):
-        chunk = values[:, start : start + CHANNEL_COUNTS[-1]]
-        length = next(length for length in CHANNEL_COUNTS if length >= chunk.shape[1])
-        padded = np.zeros((count, length), np.float32)
-        padded[:, : chunk.shape[1]] = chunk
-        passes.append(wp.array(padded, dtype=channel_vector(length)))
-    return passes
-
-
-def _channel(cloud: GaussianCloud, camera: Camera, name: str) -> NDArray[np.float32]:
-    """Return what a channel composites, ``(N, C)``."""
-    require_choice("channels", name, CHANNELS)
+def _require_channel(cloud: GaussianCloud, name: str) -> NDArray[np.float32]:
+    """Return the array of a channel."""
     array = getattr(cloud, name)
     if array is None:
         raise InvalidArrayError(
             f"channels must name arrays that the cloud holds, got {name!r}, which it lacks "
             f"(it has {', '.join(cloud.arrays())}). Add it, or leave the channel out."
         )
-    if name == RADIANCE:
-        toward = cloud.positions - camera.position
-        length = np.linalg.norm(toward, axis=1, keepdims=True)
-        # A Gaussian around the very pinhole has no direction and is not drawn.
-        toward = np.divide(toward, length, out=np.zeros_like(toward), where=length > 0.0)
-        return sh_color(array, toward).astype(np.float32)
-    return array[:, None] if array.ndim == 1 else array
+    return array

@@ -1,24 +1,87 @@
 """What each pixel shows: its tile's splats, front to back. One thread a pixel: the readable form, on CPU and CUDA.
 
-Channels come as rows of a vector whose length is fixed at compile time; there are four lengths, so four small modules.
+`composite_cpu` and `composite_cuda` do the same sums in the same order, faster. Channels come as rows of a vector whose
+length is fixed at compile time; there are four lengths, so four small modules.
 """
 
 from functools import cache
 
 import warp as wp
 
-from beam_warp.kernels.bin_tiles import Band
-from beam_warp.kernels.project import LOG_CUT, Pinhole, Splats
+from beam_warp.kernels.bin_tiles import SIDE, Band, TileLists
+from beam_warp.kernels.launching import launch
+from beam_warp.kernels.project import LOG_CUT, Splats, View
+from beam_warp.kernels.row_loads import load_row
+from beam_warp.kernels.splat_rows import (
+    ALPHA_CAP,
+    MEDIAN,
+    TRANSMITTANCE_STOP,
+    exact_depth_at,
+    log_alpha_at,
+    plane_depth_at,
+)
 
 CHANNEL_COUNTS = (4, 8, 12, 16)
 """Lengths of channel vectors there are kernels for; more channels take more passes."""
 
-ALPHA_CAP = wp.constant(0.99)
-"""Largest alpha of one splat (Kerbl et al. 2023): light behind an opaque one keeps a gradient."""
 
-TRANSMITTANCE_STOP = wp.constant(1.0e-4)
-"""A pixel is done once less than this passes. The splat that gets it there still counts: leaving it out, as 3DGS does,
-can drop 1 % of a pixel; what is left out here is below this number."""
+@wp.struct
+class Frame:
+    """What is drawn: splats, the lists of tiles, and the views they are seen from."""
+
+    splats: Splats
+    lists: TileLists
+    views: wp.array[View]
+    tile_views: wp.array[int]  # which view each tile belongs to
+    band: Band
+    gaussian_count: int
+    near: float
+
+
+@wp.struct
+class Images:
+    """What pixels see besides channels, view by view and row by row; depths in metres along the optical axis."""
+
+    alpha: wp.array[float]  # sum of the weights
+    transmittance: wp.array[float]  # what passes all
+    depth: wp.array[float]  # mean; 0 where nothing is seen
+    median_depth: wp.array[float]  # 0 where nothing is seen
+    gaussians: wp.array[int]  # the last that was seen, -1 for none
+    ends: wp.array[int]  # end of what was looked at, in the lists
+    medians: wp.array[int]  # place of the median's splat in the lists, -1 for none
+
+
+@wp.struct
+class PixelPlace:
+    """Where a pixel is in its view and in the images; ``index`` -1 for outside."""
+
+    index: int
+    position: wp.vec2
+
+
+@wp.func
+def pixel_place(view: View, tile: int, within: int) -> PixelPlace:
+    """Place of a tile's pixel, counted row by row."""
+    local = tile - view.first_tile
+    x = (local % view.columns) * SIDE + within % SIDE
+    y = (local / view.columns) * SIDE + within / SIDE
+    place = PixelPlace()
+    place.position = wp.vec2(float(x) + 0.5, float(y) + 0.5)
+    place.index = -1
+    if x < view.width and y < view.height:
+        place.index = view.first_pixel + y * view.width + x
+    return place
+
+
+@wp.func
+def offset_from(center: wp.vec4, position: wp.vec2) -> wp.vec2:
+    return wp.vec2(position[0] - center[0], position[1] - center[1])
+
+
+@wp.func
+def alpha_of(log_alpha: float) -> float:
+    """Alpha of what passes the cut."""
+    return wp.min(wp.exp(log_alpha), ALPHA_CAP)
 
 
 @cache
@@ -28,59 +91,89 @@ def channel_vector(channel_count: int):
 
 
 @cache
-def composite_kernel(channel_count: int):
+def depth_function(exact: bool):
+    """Return the function (splats, splat, center, shape, near, offset) that gives a splat's depth at a pixel."""
+    if exact:
+
+        @wp.func
+        def exact_depth(splats: Splats, splat: int, center: wp.vec4, shape: wp.vec4, near: float, offset: wp.vec2):
+            return exact_depth_at(center, shape, load_row(splats.slopes, splat), splats.bends[splat], near, offset)
+
+        return exact_depth
+
+    @wp.func
+    def plane_depth(splats: Splats, splat: int, center: wp.vec4, shape: wp.vec4, near: float, offset: wp.vec2):
+        return plane_depth_at(center, shape, load_row(splats.slopes, splat), near, offset)
+
+    return plane_depth
+
+
+@cache
+def composite_kernel(channel_count: int, exact: bool):
     """Return the kernel that composites ``channel_count`` channels, one of `CHANNEL_COUNTS`."""
     Channels = channel_vector(channel_count)
+    depth_at = depth_function(exact)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_pixels_kernel(
-        first: int,
-        splats: Splats,
-        pairs: wp.array[int],
-        ranges: wp.array[wp.vec2i],
-        channels: wp.array[Channels],
-        camera: Pinhole,
-        band: Band,
-        out_channels: wp.array[Channels],
-        out_alpha: wp.array[float],
-        out_depth: wp.array[float],
+        first: int, frame: Frame, channels: wp.array[Channels], out_channels: wp.array[Channels], out_images: Images
     ):
         # Items go tile by tile, so that neighbours walk the same list.
         item = first + wp.tid()
-        area = band.tile * band.tile
-        tile = item / area
-        x = (tile % band.columns) * band.tile + item % band.tile
-        y = (tile / band.columns + band.first_row) * band.tile + (item % area) / band.tile
-        if x >= camera.width or y >= camera.height:
+        listed = item / (SIDE * SIDE)
+        tile = frame.band.first_tile + listed
+        place = pixel_place(frame.views[frame.tile_views[tile]], tile, item % (SIDE * SIDE))
+        pixel = place.index
+        if pixel < 0:
             return
-        pixel = wp.vec2(float(x) + 0.5, float(y) + 0.5)
         total = Channels()
         depth = float(0.0)
         weight_sum = float(0.0)
         transmittance = float(1.0)
-        pairs_of_tile = ranges[tile]
-        for pair in range(pairs_of_tile[0], pairs_of_tile[1]):
-            splat = pairs[pair]
-            offset = pixel - splats.centers[splat]
-            shape = splats.shapes[splat]
-            e0 = offset[0] * shape[0]
-            e1 = (offset[1] - shape[1] * offset[0]) * shape[2]
-            log_alpha = shape[3] - 0.5 * (e0 * e0 + e1 * e1)
+        median_depth = float(0.0)
+        median = int(-1)
+        last = int(-1)
+        listed_range = frame.lists.ranges[listed]
+        end = listed_range[0]
+        for k in range(listed_range[0], listed_range[1]):
+            splat = frame.lists.splats[k]
+            center = frame.splats.centers[splat]
+            shape = frame.splats.shapes[splat]
+            offset = offset_from(center, place.position)
+            log_alpha = log_alpha_at(center, shape, offset)
             if log_alpha >= -LOG_CUT:
-                alpha = wp.min(wp.exp(log_alpha), ALPHA_CAP)
+                alpha = alpha_of(log_alpha)
                 weight = alpha * transmittance
+                z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
                 total += channels[splat] * weight
-                plane = splats.planes[splat]
-                reach = splats.depth_ranges[splat]
-                inverse = plane[0] + plane[1] * offset[0] + plane[2] * offset[1]
-                depth += weight / wp.clamp(inverse, reach[0], reach[1])
+                depth += z * weight
                 weight_sum += weight
+                if transmittance > MEDIAN:
+                    median_depth = z
+                    median = k
+                last = splat % frame.gaussian_count
+                end = k + 1
                 transmittance *= 1.0 - alpha
                 if transmittance < TRANSMITTANCE_STOP:
                     break
-        out = y * camera.width + x
-        out_channels[out] = total
-        out_alpha[out] = weight_sum
-        out_depth[out] = depth
+        out_channels[pixel] = total
+        out_images.alpha[pixel] = weight_sum
+        out_images.transmittance[pixel] = transmittance
+        out_images.depth[pixel] = wp.where(weight_sum > 0.0, depth / weight_sum, 0.0)
+        out_images.median_depth[pixel] = median_depth
+        out_images.gaussians[pixel] = last
+        out_images.ends[pixel] = end
+        out_images.medians[pixel] = median
 
     return composite_pixels_kernel
+
+
+def launch_composite_pixels(frame, channels, exact, out_channels, out_images, device):
+    """Composite a band, one thread a pixel."""
+    launch(
+        composite_kernel(channels.dtype._length_, exact),
+        (frame.band.end_tile - frame.band.first_tile) * SIDE * SIDE,
+        inputs=[frame, channels],
+        outputs=[out_channels, out_images],
+        device=device,
+    )

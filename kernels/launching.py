@@ -8,7 +8,7 @@ share outputs by atomics are launched ``in_order``.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -38,6 +38,7 @@ def launch(
     device: Any,
     block_dim: int = 256,
     in_order: bool = False,
+    min_chunk: int | None = None,
 ) -> None:
     """Run ``kernel`` for items 0 … count - 1.
 
@@ -50,33 +51,74 @@ def launch(
         block_dim: CUDA block size.
         in_order: Use one thread on the CPU. Kernels with atomics need it: there Warp's atomics are plain additions,
             made for its own launches of one thread.
+        min_chunk: Fewest items of one launch on the CPU, less for items of much work; None for the usual.
     """
-    if count <= 0:
-        return
     target = wp.get_device(device)
-    if target.is_cuda:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=target, block_dim=block_dim)
-        return
-    threads = 1 if in_order else thread_count()
-    chunk = max(MIN_CHUNK, -(-count // (threads * CHUNKS_PER_THREAD)))
-    starts = range(0, count, chunk)
 
-    def run(start: int) -> None:
+    def run(start: int, length: int) -> None:
         wp.launch(
             kernel,
-            dim=min(chunk, count - start),
+            dim=length,
             inputs=[start, *inputs],
             outputs=list(outputs),
+            device=target,
+            block_dim=block_dim,
+            record_tape=False,
+        )
+
+    _run_in_chunks(run, range(count), target, 1 if in_order else thread_count(), min_chunk or MIN_CHUNK)
+
+
+def launch_adjoint(
+    kernel: Any,
+    items: range,
+    *,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    input_gradients: Sequence[Any],
+    output_gradients: Sequence[Any],
+    device: Any,
+) -> None:
+    """Run the adjoint that Warp makes of ``kernel`` for some items; it adds to ``input_gradients``.
+
+    Warp's adjoint adds to gradients by atomics, which are plain additions on the CPU: no two items of one call may read
+    the same element of an input that has a gradient. Then sums have one order, and the same bits every time.
+    """
+    target = wp.get_device(device)
+
+    def run(start: int, length: int) -> None:
+        wp.launch(
+            kernel,
+            dim=length,
+            inputs=[start, *inputs],
+            outputs=list(outputs),
+            adj_inputs=[None, *input_gradients],
+            adj_outputs=list(output_gradients),
+            adjoint=True,
             device=target,
             record_tape=False,
         )
 
-    run(starts[0])  # alone, so that compiling and loading the module is not raced
-    if len(starts) == 1:
+    _run_in_chunks(run, items, target, thread_count(), MIN_CHUNK)
+
+
+def _run_in_chunks(run: Callable[[int, int], None], items: range, device: Any, threads: int, min_chunk: int) -> None:
+    """Call ``run(first, count)`` over ``items``: once on CUDA, for chunks over threads on the CPU."""
+    if not items:
         return
+    if device.is_cuda:
+        run(items.start, len(items))
+        return
+    chunk = max(min_chunk, -(-len(items) // (threads * CHUNKS_PER_THREAD)))
+    starts = range(items.start, items.stop, chunk)
+
+    def run_chunk(start: int) -> None:
+        run(start, min(chunk, items.stop - start))
+
+    run_chunk(starts[0])  # alone, so that compiling and loading the module is not raced
     if threads == 1:
         for start in starts[1:]:
-            run(start)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(run, starts[1:]))
+            run_chunk(start)
+    elif len(starts) > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run_chunk, starts[1:]))

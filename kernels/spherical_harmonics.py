@@ -77,3 +77,10 @@ def captured_radiance(coefficients: wp.array2d[wp.vec3], row: int, direction: wp
         if display_srgb == 1:
             color[c] = srgb_to_linear(wp.min(color[c], 1.0))
     return color
+
+
+@wp.func
+def seen_color(coefficients: wp.array2d[wp.vec3], row: int, direction: wp.vec3) -> wp.vec3:
+    """Colour seen along ``direction`` (from camera to Gaussian) in the coefficients' own colour space, at least 0."""
+    color = sh_sum(coefficients, row, direction)
+    return wp.vec3(wp.max(color[0] + 0.5, 0.0), wp.max(color[1] + 0.5, 0.0), wp.max(color[2] + 0.5, 0.0))

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from reference import rasterizing as reference
 
-from beam_warp import rasterizing
+from beam_warp import rasterizer, rasterizing
 from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
+from beam_warp.rasterizer import RasterOptions
 from beam_warp.rasterizing import rasterize, rasterize_values
 from beam_warp.spherical_harmonics import sh_color
 
@@ -43,6 +44,11 @@ def still(positions, scales, opacities, **more):
     )
 
 
+def sums(images):
+    """Alpha, and the sums of depth and values, as the reference gives them."""
+    return images.alpha, images.depth * images.alpha, images.values
+
+
 def front(width=40, height=40):
     """At (0, -2, 0), looking along +y."""
     return Camera.orbit((0, 0, 0), 2.0, 0.0, 0.0, width=width, height=height, vertical_fov=50.0)
@@ -55,7 +61,7 @@ def around(width=40, height=40):
 def test_one_gaussian_is_its_closed_form(device):
     camera = front()
     cloud = still([[0.0, 0.0, 0.0]], 0.1, 0.8)
-    alpha, depth, value = rasterize_values(cloud, camera, [[3.0]], device=device)
+    alpha, depth, value = sums(rasterize_values(cloud, camera, [[3.0]], device=device))
     y, x = np.mgrid[:40, :40] + 0.5
     variance = (camera.focal_x * 0.1 / 2.0) ** 2 + 0.3
     expected = 0.8 * np.exp(-((x - 20) ** 2 + (y - 20) ** 2) / (2 * variance))
@@ -69,7 +75,8 @@ def test_one_gaussian_is_its_closed_form(device):
 def test_against_brute_force(device, rng, antialiased):
     cloud, camera = make_cloud(rng, 300), around()
     values = rng.uniform(0, 1, (300, 5)).astype(np.float32)
-    got = rasterize_values(cloud, camera, values, device=device, antialiased=antialiased)
+    options = RasterOptions(antialiased=antialiased)
+    got = sums(rasterize_values(cloud, camera, values, device=device, options=options))
     expected = reference.rasterize(cloud, camera, values, antialiased=antialiased)
     assert expected[0].mean() > 0.5
     for actual, wanted, magnitude in zip(got, expected, (1.0, 4.0, 1.0), strict=True):
@@ -80,7 +87,7 @@ def test_against_brute_force(device, rng, antialiased):
 def test_sizes_that_are_no_multiple_of_the_tile(device, rng, width, height):
     cloud, camera = make_cloud(rng, 40), around(width, height)
     values = rng.uniform(0, 1, (40, 1)).astype(np.float32)
-    got = rasterize_values(cloud, camera, values, device=device)
+    got = sums(rasterize_values(cloud, camera, values, device=device))
     expected = reference.rasterize(cloud, camera, values)
     assert got[0].shape == (height, width)
     for actual, wanted, magnitude in zip(got, expected, (1.0, 4.0, 1.0), strict=True):
@@ -92,7 +99,8 @@ def test_order_of_the_gaussians_does_not_matter(device, rng):
     shuffled = rng.permutation(300)
     first = rasterize_values(cloud, around(), values, device=device)
     second = rasterize_values(cloud.select(shuffled), around(), values[shuffled], device=device)
-    for a, b in zip(first, second, strict=True):
+    np.testing.assert_array_equal(first.gaussian_ids, shuffled[second.gaussian_ids])
+    for a, b in zip(sums(first), sums(second), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -105,7 +113,7 @@ def test_same_bits_every_run_thread_count_and_band(device, rng, monkeypatch):
         for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
             np.testing.assert_array_equal(a, b)
     for limit in (1, 2000):
-        monkeypatch.setattr(rasterizing, "MAX_BAND_PAIRS", limit)
+        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
         for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -149,9 +157,9 @@ def test_opaque_plane_has_its_exact_depth_everywhere(device, rng):
 
 def test_opacity_one_is_capped_and_two_layers_saturate(device):
     camera = front(1, 1)
-    one = rasterize_values(still([[0, 0, 0]], 1.0, 1.0), camera, [[1.0]], device=device)
+    one = sums(rasterize_values(still([[0, 0, 0]], 1.0, 1.0), camera, [[1.0]], device=device))
     assert one[0][0, 0] == np.float32(0.99)
-    two = rasterize_values(still([[0, 0, 0], [0, 1, 0]], 1.0, 1.0), camera, [[1.0], [0.0]], device=device)
+    two = sums(rasterize_values(still([[0, 0, 0], [0, 1, 0]], 1.0, 1.0), camera, [[1.0], [0.0]], device=device))
     np.testing.assert_allclose(two[0], 0.9999, atol=WEIGHT_ROUNDING)
     np.testing.assert_allclose(two[2], 0.99, atol=WEIGHT_ROUNDING)
 
@@ -165,13 +173,13 @@ def test_a_point_is_a_splat_of_the_low_pass_and_vanishes_antialiased(device):
     expected[expected < 1 / 255] = 0.0
     np.testing.assert_allclose(buffer.alpha, expected, atol=WEIGHT_ROUNDING)
     np.testing.assert_allclose(buffer.depth[buffer.alpha > 0], 2.0, rtol=DEPTH_ROUNDING)
-    assert not rasterize(cloud, camera, channels=(), device=device, antialiased=True).alpha.any()
+    assert not rasterize(cloud, camera, channels=(), options=RasterOptions(antialiased=True), device=device).alpha.any()
 
 
 def test_ten_thousand_splats_on_one_tile(device, rng):
     depth = rng.uniform(-1, 1, 10_000)
     cloud = still(np.stack([0 * depth, depth, 0 * depth], axis=-1), 50.0, 2.0 / 255.0)
-    alpha, _, value = rasterize_values(cloud, front(8, 8), np.ones((10_000, 1)), device=device)
+    alpha, _, value = sums(rasterize_values(cloud, front(8, 8), np.ones((10_000, 1)), device=device))
     # The wide splats differ from their peak by less than their extent in pixels squared over twice their variance.
     remaining = (1 - 2 / 255) ** np.ceil(np.log(1e-4) / np.log(1 - 2 / 255))
     np.testing.assert_allclose(alpha, 1 - remaining, atol=WEIGHT_ROUNDING)
@@ -195,7 +203,8 @@ def test_extreme_gaussians_stay_finite(device, rng):
     scales = [[1e-30, 1e-30, 1e-30], [1e20, 1e20, 1e20], [5, 5, 5], [1e15, 1, 1e15], [1e4, 0, 0], [10, 1e-6, 1]]
     cloud = still(np.asarray(positions, float), np.asarray(scales, float), 0.9)
     for antialiased in (False, True):
-        for array in rasterize_values(cloud, front(), np.ones((6, 2)), device=device, antialiased=antialiased):
+        options = RasterOptions(antialiased=antialiased)
+        for array in rasterize_values(cloud, front(), np.ones((6, 2)), device=device, options=options):
             assert np.isfinite(array).all()
 
 
@@ -254,9 +263,9 @@ def test_channels_are_means_whatever_the_coverage(device, rng):
 
 def test_more_channels_than_one_pass(device, rng):
     cloud, values = make_cloud(rng, 50), rng.uniform(0, 1, (50, 37)).astype(np.float32)
-    together = rasterize_values(cloud, around(), values, device=device)[2]
+    together = rasterize_values(cloud, around(), values, device=device).values
     for start in (0, 16, 36):
-        alone = rasterize_values(cloud, around(), values[:, start : start + 1], device=device)[2]
+        alone = rasterize_values(cloud, around(), values[:, start : start + 1], device=device).values
         np.testing.assert_array_equal(together[..., start], alone[..., 0])
 
 
@@ -274,7 +283,9 @@ def test_errors_name_the_contract(rng):
     cloud = make_cloud(rng, 3)
     with pytest.raises(InvalidArrayError, match="cloud holds, got 'base_color', which it lacks"):
         rasterize(cloud, front())
-    with pytest.raises(InvalidOptionError, match=r"channels must be one of radiance, base_color, .* got 'colour'"):
+    with pytest.raises(
+        InvalidOptionError, match=r"channels must be one of radiance, surface_normals, base_color, .* got 'colour'"
+    ):
         rasterize(cloud, front(), channels=("colour",))
     with pytest.raises(InvalidOptionError, match="cloud must be in the axes 'rfu', got 'rub'"):
         rasterize(cloud.with_arrays(axes="rub"), front(), channels=())
@@ -285,6 +296,6 @@ def test_errors_name_the_contract(rng):
 
 
 def test_a_row_of_tiles_that_cannot_be_listed_is_refused(rng, monkeypatch):
-    monkeypatch.setattr(rasterizing, "MAX_ROW_PAIRS", 10)
+    monkeypatch.setattr(rasterizer, "MAX_ROW_PAIRS", 10)
     with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 10 times, got"):
         rasterize(make_cloud(rng, 300), front(), channels=(), device="cpu")

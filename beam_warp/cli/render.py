@@ -269,9 +269,11 @@ def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianClou
 def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting) -> None:
     """Draw one image and write it."""
     from beam_warp.deferred import relight
+    from beam_warp.rasterizer import RasterOptions
     from beam_warp.rasterizing import rasterize
 
-    buffer = rasterize(cloud, view.camera, device=args.device, antialiased=args.antialiased)
+    options = RasterOptions(antialiased=args.antialiased)
+    buffer = rasterize(cloud, view.camera, options=options, device=args.device)
     radiance = relight(buffer, lighting)
     alpha = buffer.alpha
     if args.background != "transparent":

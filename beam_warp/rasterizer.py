@@ -1,0 +1,613 @@
+"""The rasteriser on a device: what a frame is drawn from and into, kept from frame to frame, and the way back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from beam_warp.cameras import Camera
+from beam_warp.checks import require_choice, require_number
+from beam_warp.devices import resolve_device
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.bin_tiles import (
+    Band,
+    TileLists,
+    launch_count_pairs,
+    launch_emit_pairs,
+    launch_find_ranges,
+    launch_key_splats,
+)
+from beam_warp.kernels.channel_rows import (
+    ChannelBlocks,
+    launch_evaluate_colors,
+    launch_evaluate_colors_adjoint,
+    launch_gather_channels,
+    launch_scatter_channels,
+)
+from beam_warp.kernels.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
+from beam_warp.kernels.composite_adjoint import Adjoints, pair_vector
+from beam_warp.kernels.composite_adjoint_cpu import launch_composite_adjoint_cpu
+from beam_warp.kernels.composite_adjoint_cuda import launch_composite_adjoint_cuda
+from beam_warp.kernels.composite_cpu import launch_composite_cpu
+from beam_warp.kernels.composite_cuda import launch_composite_cuda
+from beam_warp.kernels.pair_sums import Pairs, SplatGradients, launch_add_pairs
+from beam_warp.kernels.project import Projection, Splats, View, launch_project, launch_project_adjoint
+from beam_warp.raster_layout import Rows, ViewLayout, as_matrix, channel_rows
+
+MAX_BAND_PAIRS = 2**25
+"""Most (tile, splat) pairs held at a time, 24 bytes each: beyond it the images are drawn in bands of tile rows."""
+
+MAX_ROW_PAIRS = 2**30
+"""Most pairs in one row of tiles, the least that can be drawn: positions in their list are 32-bit."""
+
+SPARE_CAPACITY = 1.25
+"""Room for pairs over what the first frame needs: the next ones need a little more."""
+
+DEPTH_MODES = ("plane", "exact")
+
+DepthMode = Literal["plane", "exact"]
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """How splats are drawn.
+
+    Attributes:
+        antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
+            views from further away than the training views (Yu et al. 2024, Eq. 9).
+        low_pass: Variance of the pixel filter that every splat is widened by [pixel^2], above 0.
+        near: Depth before which a Gaussian's centre is not drawn [m], above 0: perspective explodes there.
+        depth: ``"plane"``: a splat's depth is its tangent plane's, exact for flat Gaussians. ``"exact"``: that of the
+            largest response on every ray, for thick ones and grazing views; costs a few operations a pixel.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    antialiased: bool = False
+    low_pass: float = 0.3
+    near: float = 0.01
+    depth: DepthMode = "plane"
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_number("low_pass", self.low_pass, 1e-6, 1e6)
+        require_number("near", self.near, 1e-9, 1e9)
+        require_choice("depth", self.depth, DEPTH_MODES)
+
+
+class GaussianArrays(NamedTuple):
+    """Gaussians on a device.
+
+    Attributes:
+        positions: ``(N,)`` vec3 [m].
+        orientations: ``(N,)`` quat xyzw; normalised where they are used.
+        scales: ``(N,)`` vec3 [m].
+        opacities: ``(N,)`` float in [0, 1].
+        values: ``(N, K)`` float: whatever is to be composited; None for nothing.
+        radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B 1, 4, 9, 16 or 25; None for none.
+    """
+
+    positions: wp.array
+    orientations: wp.array
+    scales: wp.array
+    opacities: wp.array
+    values: wp.array | None = None
+    radiance: wp.array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RasterImages:
+    """Images of all views, one view after the other and row by row, on the device; or a loss's derivatives to them.
+
+    Attributes:
+        channels: Sums of channels weighted by visibility, ``(P, K)`` float each: passes of 16 channels, the last of 4,
+            8, 12 or 16, padded with zeros.
+        alpha: Sum of the weights, ``(P,)`` float, at most 1 but for rounding.
+        depth: Mean depth along the optical axis [m], ``(P,)``; 0 where nothing is seen.
+        median_depth: Depth of the last splat that more than half of the light passes before [m], ``(P,)``.
+    """
+
+    channels: tuple[wp.array, ...]
+    alpha: wp.array
+    depth: wp.array
+    median_depth: wp.array
+
+    def zero_(self) -> None:
+        """Set everything to 0."""
+        for array in (*self.channels, self.alpha, self.depth, self.median_depth):
+            array.zero_()
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianGradients:
+    """Derivatives of a loss with respect to Gaussians, on the device; attributes as in `GaussianArrays`.
+
+    ``orientations`` are to the quaternions as given, and orthogonal to them.
+    """
+
+    positions: wp.array
+    orientations: wp.array
+    scales: wp.array
+    opacities: wp.array
+    values: wp.array | None
+    radiance: wp.array | None
+
+
+class Rasterizer:
+    """Draws some number of Gaussians for some cameras, again and again.
+
+    All arrays stay on the device and where they are. `draw` waits for the device, to learn how much room the frame
+    takes; `redraw`, and `backward` from its second call on, wait for nothing and allocate nothing, so that they can be
+    captured in a CUDA graph.
+
+    Attributes:
+        device: Where everything is.
+        cameras: Pinhole cameras of any sizes.
+        options: How splats are drawn.
+        images: What was drawn last.
+        gaussian_ids: The last Gaussian that each pixel saw, -1 for none, ``(P,)`` int.
+        color_channels: Where the captured colour is among the channels; empty for none.
+        normal_channels: Where the normals are, of the surfaces of largest response, in the world and towards the
+            camera; empty for none.
+        value_channels: Where the Gaussians' own values are.
+    """
+
+    def __init__(
+        self,
+        gaussian_count: int,
+        cameras: Sequence[Camera],
+        *,
+        value_count: int = 0,
+        radiance: bool = False,
+        normals: bool = False,
+        options: RasterOptions | None = None,
+        device: Any = None,
+        readable: bool = False,
+    ) -> None:
+        """Allocate what every frame needs.
+
+        Args:
+            gaussian_count: N.
+            cameras: At least one.
+            value_count: K, the number of the Gaussians' own values that are composited.
+            radiance: Whether the captured colour is.
+            normals: Whether the normal of the geometry is.
+            options: How splats are drawn.
+            device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+            readable: Composite with the readable kernel, the oracle of the fast ones.
+
+        Raises:
+            DeviceError: There is no such device.
+            InvalidOptionError: There is no camera.
+        """
+        if not cameras:
+            raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
+        self.device = resolve_device(device)
+        self.cameras = tuple(cameras)
+        self.options = options or RasterOptions()
+        self.color_channels = range(3 * radiance)
+        self.normal_channels = range(self.color_channels.stop, self.color_channels.stop + 3 * normals)
+        self.value_channels = range(self.normal_channels.stop, self.normal_channels.stop + value_count)
+        self._count = gaussian_count
+        self._exact = self.options.depth == "exact"
+        fast = launch_composite_cuda if self.device.is_cuda else launch_composite_cpu
+        self._launch_composite = launch_composite_pixels if readable else fast
+        self._layout = ViewLayout.of(self.cameras)
+        with wp.ScopedDevice(self.device):
+            self._allocate()
+            self._reserve(0)
+        self._gaussians: GaussianArrays | None = None
+        self._bands: list[tuple[int, int]] = []
+        self._back: _BackwardBuffers | None = None
+
+    def _allocate(self) -> None:
+        """Allocate everything but what depends on the number of pairs."""
+        splat_count = self._count * len(self.cameras)
+        pixel_count = int(self._layout.first_pixels[-1])
+        channel_count = self.value_channels.stop
+        self._splats = _zero_splats(splat_count)
+        self._rows = channel_rows(splat_count, channel_count, self.device)
+        self._blocks = ChannelBlocks()
+        self._blocks.values = wp.zeros((0, 0), dtype=float)
+        self._blocks.colors = wp.zeros(splat_count if self.color_channels else 0, dtype=wp.vec3)
+        self._blocks.normals = self._splats.normals if self.normal_channels else wp.zeros(0, dtype=wp.vec3)
+        self._keys = wp.zeros(2 * splat_count, dtype=int)  # the sort wants room for as many again
+        self._order = wp.zeros(2 * splat_count, dtype=int)
+        self._counts = wp.zeros(splat_count, dtype=int)
+        self._ends = wp.zeros(splat_count, dtype=int)
+        self._drawn = Images()
+        for name in ("alpha", "transmittance", "depth", "median_depth"):
+            setattr(self._drawn, name, wp.zeros(pixel_count, dtype=float))
+        for name in ("gaussians", "ends", "medians"):
+            setattr(self._drawn, name, wp.zeros(pixel_count, dtype=int))
+        self._channel_images = channel_rows(pixel_count, channel_count, self.device)
+        self.images = RasterImages(
+            tuple(image.matrix for image in self._channel_images),
+            self._drawn.alpha,
+            self._drawn.depth,
+            self._drawn.median_depth,
+        )
+        self.gaussian_ids = self._drawn.gaussians
+        self._views = wp.array(self._layout.views, dtype=View)
+        self._projection = Projection()
+        self._projection.low_pass = self.options.low_pass
+        self._projection.near = self.options.near
+        self._projection.antialiased = int(self.options.antialiased)
+        self._frame = Frame()
+        self._frame.splats = self._splats
+        self._frame.views = self._views
+        self._frame.tile_views = wp.array(self._layout.tile_views, dtype=int)
+        self._frame.gaussian_count = self._count
+        self._frame.near = self.options.near
+
+    def _reserve(self, capacity: int) -> None:
+        """Make room for pairs."""
+        self._tiles = wp.zeros(2 * capacity, dtype=int)  # the sort wants room for as many again
+        self._slots = wp.zeros(2 * capacity, dtype=int)
+        self._owners = wp.zeros(capacity, dtype=int)
+        lists = TileLists()
+        lists.ranges = wp.zeros(int(self._layout.first_tiles[-1]), dtype=wp.vec2i)
+        lists.splats = wp.zeros(capacity, dtype=int)
+        lists.slots = self._slots
+        self._lists = lists
+        self._frame.lists = lists
+        self._back = None
+
+    def set_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Move cameras or change their lenses; their number and sizes stay.
+
+        Raises:
+            InvalidOptionError: A number or size differs.
+        """
+        sizes = [(camera.width, camera.height) for camera in self.cameras]
+        given = [(camera.width, camera.height) for camera in cameras]
+        if given != sizes:
+            raise InvalidOptionError(f"cameras must have the sizes {sizes}, got {given}. Make another Rasterizer.")
+        self.cameras = tuple(cameras)
+        self._layout = ViewLayout.of(self.cameras)
+        self._views.assign(wp.array(self._layout.views, dtype=View, device="cpu"))
+
+    @property
+    def first_pixels(self) -> tuple[int, ...]:
+        """Where each view's pixels begin in the images, and where the last one's end."""
+        return tuple(self._layout.first_pixels.tolist())
+
+    @property
+    def pair_capacity(self) -> int:
+        """Number of (tile, splat) pairs there is room for."""
+        return len(self._owners)
+
+    def pair_count(self) -> int:
+        """Return how many pairs the last frame has, or the last of its bands; waits for the device.
+
+        More than `pair_capacity` after `redraw`: the images lack splats. Call `draw`.
+        """
+        return int(self._counts.numpy().sum(dtype=np.int64))
+
+    def draw(self, gaussians: GaussianArrays) -> RasterImages:
+        """Draw Gaussians, however much room they take.
+
+        Args:
+            gaussians: Arrays on the device, of the shapes and parts this was made for; they are kept for `redraw` and
+                `backward`.
+
+        Returns:
+            `images`.
+
+        Raises:
+            InvalidArrayError: An array has another shape or place, or the Gaussians cover a row of tiles too often to
+                be listed.
+        """
+        self._check(gaussians)
+        self._gaussians = gaussians
+        with wp.ScopedDevice(self.device):
+            self._project(gaussians)
+            self._bands = self._plan_bands()
+            for band in self._bands:
+                self._bin(band)
+                self._composite()
+        return self.images
+
+    def redraw(self) -> RasterImages:
+        """Draw the arrays of the last `draw` again, after their contents or the cameras changed, without waiting.
+
+        Pairs beyond `pair_capacity` are left out: ask `pair_count` from time to time. A frame that needed several bands
+        is drawn by `draw`.
+
+        Raises:
+            InvalidOptionError: Nothing was drawn.
+        """
+        gaussians = self._drawn_gaussians("redraw")
+        if len(self._bands) > 1:
+            return self.draw(gaussians)
+        with wp.ScopedDevice(self.device):
+            self._project(gaussians)
+            self._bin(self._bands[0])
+            self._composite()
+        return self.images
+
+    def adjoints(self) -> RasterImages:
+        """Return the buffers of a loss's derivatives to `images`, zeros at first; fill them, then call `backward`."""
+        with wp.ScopedDevice(self.device):
+            return self._backward_buffers().images
+
+    def backward(self) -> GaussianGradients:
+        """Return the derivatives to the Gaussians of what was drawn last, from those in `adjoints`.
+
+        What is discrete is held still: which splats count, their order, the cap of alpha, the pick of the median.
+
+        Returns:
+            The same arrays every time, overwritten by the next call.
+
+        Raises:
+            InvalidOptionError: Nothing was drawn.
+
+        Source: Kerbl et al. 2023, Section 6; per-pair sums without atomics as in ``kernels/composite_adjoint_cuda.py``.
+        """
+        gaussians = self._drawn_gaussians("backward")
+        with wp.ScopedDevice(self.device):
+            back = self._backward_buffers()
+            back.zero_()
+            for band in self._bands:
+                if len(self._bands) > 1:
+                    self._bin(band)
+                self._composite_adjoint(back)
+            return self._project_adjoint(gaussians, back)
+
+    def _drawn_gaussians(self, caller: str) -> GaussianArrays:
+        """Return what was drawn last."""
+        if self._gaussians is None:
+            raise InvalidOptionError(f"{caller} must follow draw, got no draw before it. Call draw first.")
+        return self._gaussians
+
+    def _check(self, gaussians: GaussianArrays) -> None:
+        """Refuse arrays that kernels would misread."""
+        count = self._count
+        values = len(self.value_channels)
+        wanted = {
+            "positions": (wp.vec3, (count,)),
+            "orientations": (wp.quat, (count,)),
+            "scales": (wp.vec3, (count,)),
+            "opacities": (wp.float32, (count,)),
+            "values": (wp.float32, (count, values)) if values else None,
+            "radiance": (wp.vec3, (count, None)) if self.color_channels else None,
+        }
+        for name, contract in wanted.items():
+            array = getattr(gaussians, name)
+            if contract is None:
+                continue
+            dtype, shape = contract
+            fits = array is not None and array.dtype is dtype and array.device == self.device
+            fits = fits and array.ndim == len(shape)
+            if not (fits and all(want is None or want == got for want, got in zip(shape, array.shape, strict=True))):
+                got = "none" if array is None else f"{array.dtype.__name__} {array.shape} on {array.device}"
+                size = " x ".join("B" if side is None else str(side) for side in shape)
+                raise InvalidArrayError(
+                    f"{name} must be a warp array of {dtype.__name__}, {size}, on {self.device}, got {got}. Convert it."
+                )
+
+    def _project(self, gaussians: GaussianArrays) -> None:
+        """Make splats of the Gaussians, their rows of channels and their order in depth."""
+        launch_project(gaussians[:4], self._views, self._projection, self._splats, self.device)
+        if self.color_channels:
+            launch_evaluate_colors(
+                gaussians.positions, gaussians.radiance, self._views, self._blocks.colors, self.device
+            )
+        if self.value_channels:
+            self._blocks.values = gaussians.values
+        for i, rows in enumerate(self._rows):
+            launch_gather_channels(self._blocks, i * CHANNEL_COUNTS[-1], rows.matrix, self.device)
+        launch_key_splats(self._splats, self._views, self._count, self._keys, self._order, self.device)
+        if len(self._counts):
+            wp.utils.radix_sort_pairs(self._keys, self._order, len(self._counts))
+
+    def _plan_bands(self) -> list[tuple[int, int]]:
+        """Cut the tiles into runs of rows whose pairs fit, usually one, and make room for the largest."""
+        first_tiles = self._layout.first_tiles
+        bands, most = [], 0
+        waiting = [(0, len(first_tiles) - 1)]
+        while waiting:
+            first, end = waiting.pop()
+            band = (int(first_tiles[first]), int(first_tiles[end]))
+            self._count_pairs(band)
+            pairs = self.pair_count()
+            if pairs > MAX_BAND_PAIRS and end - first > 1:
+                middle = (first + end) // 2
+                waiting += [(middle, end), (first, middle)]
+                continue
+            if pairs > MAX_ROW_PAIRS:
+                raise InvalidArrayError(
+                    f"positions and scales must cover a row of tiles at most {MAX_ROW_PAIRS} times, got {pairs} "
+                    f"at tile row {first}. Drop Gaussians that are larger than the scene."
+                )
+            bands.append(band)
+            most = max(most, pairs)
+        if most > self.pair_capacity:
+            self._reserve(int(SPARE_CAPACITY * most))
+        return bands
+
+    def _count_pairs(self, band: tuple[int, int]) -> None:
+        """Count the pairs of a band, splat by splat in depth order."""
+        self._frame.band = _band(band)
+        launch_count_pairs(
+            self._order, self._keys, self._splats, self._views, self._count, self._frame.band, self._counts, self.device
+        )
+
+    def _bin(self, band: tuple[int, int]) -> None:
+        """List the splats of every tile of a band."""
+        self._count_pairs(band)
+        tile_count = band[1] - band[0]
+        self._lists.ranges.zero_()
+        if not self.pair_capacity:
+            return
+        wp.utils.array_scan(self._counts, self._ends, inclusive=True)
+        self._tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
+        launch_emit_pairs(
+            self._order,
+            self._counts,
+            self._ends,
+            self._splats,
+            self._views,
+            self._count,
+            self._frame.band,
+            self._tiles,
+            self._slots,
+            self._owners,
+            self.device,
+        )
+        wp.utils.radix_sort_pairs(self._tiles, self._slots, self.pair_capacity, end_bit=tile_count.bit_length())
+        launch_find_ranges(self._tiles, self._slots, self._owners, tile_count, self._lists, self.device)
+
+    def _composite(self) -> None:
+        """Draw the tiles of the band at hand."""
+        for rows, image in zip(self._rows, self._channel_images, strict=True):
+            self._launch_composite(self._frame, rows.vectors, self._exact, image.vectors, self._drawn, self.device)
+
+    def _backward_buffers(self) -> _BackwardBuffers:
+        """Return what the way back needs, made when first asked for."""
+        if self._back is None:
+            self._back = _BackwardBuffers.of(self)
+        return self._back
+
+    def _composite_adjoint(self, back: _BackwardBuffers) -> None:
+        """Add what the band at hand says to the gradients of splats and of their rows."""
+        if not self.pair_capacity:
+            return
+        upstream = Adjoints()
+        upstream.alpha, upstream.depth = back.images.alpha, back.images.depth
+        upstream.median_depth = back.images.median_depth
+        for rows, adjoint, gradient in zip(self._rows, back.channel_adjoints, back.rows, strict=True):
+            pairs = back.pairs[rows.vectors.dtype._length_]
+            pairs.matrix.zero_()
+            arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
+            if self.device.is_cuda:
+                launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
+            else:
+                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, self.device)
+            upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
+            summed = Pairs()
+            summed.rows = pairs.matrix
+            summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
+            summed.channel_count, summed.exact = rows.vectors.dtype._length_, int(self._exact)
+            launch_add_pairs(summed, back.splat_gradients(gradient), self.device)
+
+    def _project_adjoint(self, gaussians: GaussianArrays, back: _BackwardBuffers) -> GaussianGradients:
+        """Turn gradients of splats and rows into those of Gaussians."""
+        found = back.gaussians
+        for i, rows in enumerate(back.rows):
+            launch_scatter_channels(
+                rows.matrix, i * CHANNEL_COUNTS[-1], len(self.cameras), back.blocks, self._count, self.device
+            )
+        if self.color_channels:
+            launch_evaluate_colors_adjoint(
+                gaussians.positions,
+                gaussians.radiance,
+                self._views,
+                self._blocks.colors,
+                back.blocks.colors,
+                found.positions,
+                found.radiance,
+                self.device,
+            )
+        launch_project_adjoint(
+            gaussians[:4],
+            self._views,
+            self._projection,
+            self._splats,
+            [back.splats.centers, back.splats.shapes, back.splats.slopes, back.splats.bends, back.splats.normals],
+            [found.positions, found.orientations, found.scales, found.opacities],
+            self.device,
+        )
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _BackwardBuffers:
+    """What the way back needs besides what was drawn."""
+
+    images: RasterImages
+    channel_adjoints: list[Rows]
+    states: wp.array
+    pairs: dict[int, Rows]
+    splats: Splats
+    rows: list[Rows]
+    blocks: ChannelBlocks
+    gaussians: GaussianGradients
+
+    @classmethod
+    def of(cls, rasterizer: Rasterizer) -> _BackwardBuffers:
+        """Allocate for what a rasteriser draws, on the current device."""
+        device, count = rasterizer.device, rasterizer._count
+        splat_count, pixel_count = count * len(rasterizer.cameras), rasterizer.first_pixels[-1]
+        channel_count, exact = rasterizer.value_channels.stop, rasterizer._exact
+        adjoints = channel_rows(pixel_count, channel_count, device)
+        lengths = {rows.vectors.dtype._length_ for rows in adjoints}
+        has_colors, value_count = bool(rasterizer.color_channels), len(rasterizer.value_channels)
+        gaussians = rasterizer._gaussians
+        bands = gaussians.radiance.shape[1] if has_colors and gaussians is not None else 0
+        splats = _zero_splats(splat_count)
+        blocks = ChannelBlocks()
+        blocks.values = wp.zeros((count, value_count), dtype=float)
+        blocks.colors = wp.zeros(splat_count if has_colors else 0, dtype=wp.vec3)
+        blocks.normals = splats.normals if rasterizer.normal_channels else wp.zeros(0, dtype=wp.vec3)
+        return cls(
+            RasterImages(
+                tuple(rows.matrix for rows in adjoints), *(wp.zeros(pixel_count, dtype=float) for _ in range(3))
+            ),
+            adjoints,
+            wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
+            {n: Rows.zeros(rasterizer.pair_capacity, pair_vector(n, exact), device) for n in lengths},
+            splats,
+            channel_rows(splat_count, channel_count, device),
+            blocks,
+            GaussianGradients(
+                wp.zeros(count, dtype=wp.vec3),
+                wp.zeros(count, dtype=wp.quat),
+                wp.zeros(count, dtype=wp.vec3),
+                wp.zeros(count, dtype=float),
+                blocks.values if value_count else None,
+                wp.zeros((count, bands), dtype=wp.vec3) if has_colors else None,
+            ),
+        )
+
+    def zero_(self) -> None:
+        """Begin a new sum."""
+        found = self.gaussians
+        for array in (found.positions, found.orientations, found.scales, found.opacities, found.radiance):
+            if array is not None:
+                array.zero_()
+        for array in (self.splats.centers, self.splats.shapes, self.splats.slopes, self.splats.bends):
+            array.zero_()
+        for rows in self.rows:
+            rows.matrix.zero_()
+
+    def splat_gradients(self, rows: Rows) -> SplatGradients:
+        """Return where the sums over the pairs of one pass go."""
+        gradients = SplatGradients()
+        gradients.centers = as_matrix(self.splats.centers)
+        gradients.shapes = as_matrix(self.splats.shapes)
+        gradients.slopes = as_matrix(self.splats.slopes)
+        gradients.bends = self.splats.bends
+        gradients.channels = rows.matrix
+        return gradients
+
+
+def _zero_splats(count: int) -> Splats:
+    """Allocate splats on the current device."""
+    splats = Splats()
+    for name, dtype in (("centers", wp.vec4), ("shapes", wp.vec4), ("slopes", wp.vec4), ("bends", float)):
+        setattr(splats, name, wp.zeros(count, dtype=dtype))
+    splats.normals = wp.zeros(count, dtype=wp.vec3)
+    return splats
+
+
+def _band(tiles: tuple[int, int]) -> Band:
+    """Describe a run of tiles to the kernels."""
+    band = Band()
+    band.first_tile, band.end_tile = tiles
+    return band

@@ -1,0 +1,106 @@
+"""How pixels change with the splats that they see, for the CPU: a tile's splats back to front, on their pixels."""
+
+from functools import cache
+
+import warp as wp
+
+from beam_warp.kernels.composite import Frame, Images, alpha_of, channel_vector, depth_function, offset_from
+from beam_warp.kernels.composite_adjoint import Adjoints, add_pair_function, pair_vector, pixel_adjoint
+from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
+from beam_warp.kernels.launching import launch
+from beam_warp.kernels.project import LOG_CUT
+from beam_warp.kernels.splat_rows import ALPHA_CAP, log_alpha_at
+
+
+@cache
+def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
+    """Return the kernel that writes the gradient of every pair, one tile an item."""
+    Channels = channel_vector(channel_count)
+    Pair = pair_vector(channel_count, exact)
+    depth_at = depth_function(exact)
+    add_pair = add_pair_function(channel_count, exact)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def composite_tiles_adjoint_kernel(
+        first: int,
+        frame: Frame,
+        channels: wp.array[Channels],
+        images: Images,
+        channel_adjoints: wp.array[Channels],
+        adjoints: Adjoints,
+        out_states: wp.array[wp.vec2],
+        out_pairs: wp.array[Pair],
+    ):
+        # A pixel's state: what passes before the splats still to come, and the sum R of those behind them.
+        listed = first + wp.tid()
+        tile = frame.band.first_tile + listed
+        view = frame.views[frame.tile_views[tile]]
+        box = tile_box(view, tile)
+        listed_range = frame.lists.ranges[listed]
+        end = listed_range[0]
+        for y in range(box[1], box[3]):
+            for x in range(box[0], box[2]):
+                pixel = view.first_pixel + y * view.width + x
+                out_states[pixel] = wp.vec2(images.transmittance[pixel], 0.0)
+                end = wp.max(end, images.ends[pixel])
+        for back in range(end - listed_range[0]):
+            k = end - 1 - back
+            splat = frame.lists.splats[k]
+            center = frame.splats.centers[splat]
+            shape = frame.splats.shapes[splat]
+            row = channels[splat]
+            total = Pair()
+            rows = rows_in(box, center, shape)
+            for y in range(rows[0], rows[1]):
+                columns = columns_in(box, center, shape, y)
+                for x in range(columns[0], columns[1]):
+                    pixel = view.first_pixel + y * view.width + x
+                    offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
+                    log_alpha = log_alpha_at(center, shape, offset)
+                    if k < images.ends[pixel] and log_alpha >= -LOG_CUT:
+                        state = out_states[pixel]
+                        alpha = alpha_of(log_alpha)
+                        open_share = 1.0 - alpha
+                        transmittance = state[0] / open_share
+                        weight = alpha * transmittance
+                        adjoint = pixel_adjoint(images, adjoints, pixel)
+                        to_channels = channel_adjoints[pixel]
+                        z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
+                        s = wp.dot(row, to_channels) + z * adjoint.depth + adjoint.alpha
+                        to_log_alpha = float(0.0)
+                        if alpha < ALPHA_CAP:
+                            to_log_alpha = alpha * (transmittance * s - state[1] / open_share)
+                        to_depth = weight * adjoint.depth
+                        if k == images.medians[pixel]:
+                            to_depth += adjoint.median_depth
+                        total = add_pair(
+                            total,
+                            frame.splats,
+                            splat,
+                            center,
+                            shape,
+                            frame.near,
+                            offset,
+                            weight,
+                            to_log_alpha,
+                            to_depth,
+                            to_channels,
+                        )
+                        out_states[pixel] = wp.vec2(transmittance, state[1] + weight * s)
+            out_pairs[frame.lists.slots[k]] = total
+
+    return composite_tiles_adjoint_kernel
+
+
+def launch_composite_adjoint_cpu(
+    frame, channels, exact, images, channel_adjoints, adjoints, out_states, out_pairs, device
+):
+    """Write the gradients of a band's pairs into their slots; those of no pixel keep what is there."""
+    launch(
+        composite_adjoint_cpu_kernel(channels.dtype._length_, exact),
+        frame.band.end_tile - frame.band.first_tile,
+        inputs=[frame, channels, images, channel_adjoints, adjoints],
+        outputs=[out_states, out_pairs],
+        device=device,
+        min_chunk=MIN_TILES,
+    )

@@ -1,0 +1,114 @@
+"""One splat at one pixel: its response, its depth there, and which pixels of a row it reaches."""
+
+import warp as wp
+
+from beam_warp.kernels.project import LOG_CUT
+
+EXTENT_MARGIN = wp.constant(0.01)
+"""Pixels added to an extent, so that rounding in it never hides a pixel that passes the alpha cut."""
+
+RELATIVE_MARGIN = wp.constant(1.0e-5)
+"""Part of an extent added to it: single precision, a few operations, a margin of ten."""
+
+ALPHA_CAP = wp.constant(0.99)
+"""Largest alpha of one splat (Kerbl et al. 2023): light behind an opaque one keeps a gradient."""
+
+TRANSMITTANCE_STOP = wp.constant(1.0e-4)
+"""A pixel is done once less than this passes. The splat that gets it there still counts: leaving it out, as 3DGS does,
+can drop 1 % of a pixel; what is left out here is below this number."""
+
+MEDIAN = wp.constant(0.5)
+"""The median depth is that of the last splat that more than this passes before."""
+
+SMALLEST_FACING = wp.constant(1.0e-6)
+"""Depth at a pixel whose ray runs along a Gaussian's surface, or away from it, is that of the ray that meets it so."""
+
+
+@wp.func
+def squared_extent(log_opacity: float) -> float:
+    """Squared number of standard deviations at which alpha falls to 1/255."""
+    return 2.0 * (LOG_CUT + log_opacity)
+
+
+@wp.func
+def reach_rows(shape: wp.vec4, squared: float) -> float:
+    """Largest distance along y from the centre to where alpha is 1/255 [pixel]."""
+    e = shape[1] * shape[2]
+    reach = wp.sqrt(squared * (shape[0] * shape[0] + e * e)) / (shape[0] * shape[2])
+    return reach * (1.0 + RELATIVE_MARGIN) + EXTENT_MARGIN
+
+
+@wp.func
+def reach_columns(shape: wp.vec4, squared: float, top: float, bottom: float) -> wp.vec2:
+    """Least and greatest x of the ellipse where alpha is 1/255 between two y, all from the centre [pixel].
+
+    The ellipse's ends along x lie at y = -s1 r and s1 r, r = reach / s0: if these are outside, the ends of what is
+    between the two y are on the nearer of them.
+    """
+    e = shape[1] * shape[2]
+    k = shape[0] * shape[0] + e * e
+    end = wp.sqrt(squared) * shape[1] / shape[0]
+    left_y = wp.clamp(-end, top, bottom)
+    right_y = wp.clamp(end, top, bottom)
+    c = shape[0] * shape[0] * shape[2] * shape[2]
+    left = e * shape[2] * left_y - wp.sqrt(wp.max(k * squared - c * left_y * left_y, 0.0))
+    right = e * shape[2] * right_y + wp.sqrt(wp.max(k * squared - c * right_y * right_y, 0.0))
+    margin = RELATIVE_MARGIN * wp.max(wp.abs(left), wp.abs(right)) / k + EXTENT_MARGIN
+    return wp.vec2(left / k - margin, right / k + margin)
+
+
+@wp.func
+def first_pixel_from(edge: float, limit: int) -> int:
+    """First of ``limit`` pixels whose centre is not before an edge; clamped as a float: no integer holds every one."""
+    return int(wp.clamp(wp.ceil(edge - 0.5), 0.0, float(limit)))
+
+
+@wp.func
+def end_pixel_at(edge: float, limit: int) -> int:
+    """End of those of ``limit`` pixels whose centre is not beyond an edge."""
+    return int(wp.clamp(wp.floor(edge - 0.5) + 1.0, 0.0, float(limit)))
+
+
+@wp.func
+def log_alpha_at(center: wp.vec4, shape: wp.vec4, offset: wp.vec2) -> float:
+    """Logarithm of opacity times response at an offset from the centre."""
+    e0 = offset[0] * shape[0]
+    e1 = (offset[1] - shape[1] * offset[0]) * shape[2]
+    return center[2] - 0.5 * (e0 * e0 + e1 * e1)
+
+
+@wp.func
+def facing_at(slope: wp.vec4, offset: wp.vec2) -> float:
+    """The factor l of `kernels.project` at an offset from the centre."""
+    return 1.0 + slope[0] * offset[0] + slope[1] * offset[1]
+
+
+@wp.func
+def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
+    """The form e of `kernels.project` at an offset from the centre."""
+    x = offset[0]
+    y = offset[1]
+    return slope[2] * x * x + 2.0 * slope[3] * x * y + bend * y * y
+
+
+@wp.func
+def clamp_depth(center: wp.vec4, shape: wp.vec4, near: float, inverse: float) -> float:
+    """Depth of a centre over ``inverse``, kept where the Gaussian is."""
+    far = center[3] + shape[3]
+    depth = far
+    if inverse > 0.0:
+        depth = wp.min(center[3] / inverse, far)
+    return wp.max(depth, wp.max(center[3] - shape[3], near))
+
+
+@wp.func
+def plane_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, near: float, offset: wp.vec2) -> float:
+    """Depth of the plane at an offset from the centre; beyond its horizon the far end."""
+    return clamp_depth(center, shape, near, facing_at(slope, offset))
+
+
+@wp.func
+def exact_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
+    """Depth of the largest response on the ray at an offset from the centre."""
+    facing = wp.max(facing_at(slope, offset), SMALLEST_FACING)
+    return clamp_depth(center, shape, near, facing + bend_at(slope, bend, offset) / facing)
