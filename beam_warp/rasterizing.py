@@ -1,4 +1,4 @@
-"""What cameras see of a cloud: alpha, depth and any per-Gaussian channel of every pixel (a G-buffer); and its adjoint."""
+"""What cameras see of a cloud: alpha, depth and any channel of every pixel (a G-buffer), and the way back."""
 
 from __future__ import annotations
 
