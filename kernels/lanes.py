@@ -53,28 +53,64 @@ def lowest_lane(bits: int) -> int:
     ...
 
 
-@cache
-def load_channels_function(Channels):
-    """Return the function that reads a row of channels, a multiple of 4, in 16-byte loads."""
-
-    @wp.func_native(f"""
+_LOAD_CHANNELS = """
 #if defined(__CUDA_ARCH__)
-    constexpr int rows = {Channels._length_ // 4};
-    const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(index) * rows;
-    wp::vec_t<{Channels._length_}, float> row;
+    const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(index) * (LENGTH / 4);
+    wp::vec_t<LENGTH, float> row;
     #pragma unroll
-    for (int i = 0; i < rows; ++i) {{
+    for (int i = 0; i < LENGTH / 4; ++i) {
         const float4 part = __ldg(source + i);
         row[4 * i] = part.x;
         row[4 * i + 1] = part.y;
         row[4 * i + 2] = part.z;
         row[4 * i + 3] = part.w;
-    }}
+    }
     return row;
 #else
     return channels.data[index];
 #endif
-""")
+"""
+
+_STORE_LANE_SUMS = """
+    float* target = reinterpret_cast<float*>(out_rows.data) + size_t(row) * LENGTH;
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31;
+    float held[WIDTH];
+    #pragma unroll
+    for (int i = 0; i < WIDTH; ++i)
+        held[i] = i < LENGTH ? numbers[i] : 0.0f;
+    int place = 0;
+    #pragma unroll
+    for (int step = 16; step > 0; step >>= 1) {
+        const int half = WIDTH * step / 32;
+        const bool upper = (lane & step) != 0;
+        if (half > 0) {
+            #pragma unroll
+            for (int i = 0; i < half; ++i) {
+                const float given = upper ? held[i] : held[i + half];
+                const float kept = upper ? held[i + half] : held[i];
+                held[i] = kept + __shfl_xor_sync(0xffffffffu, given, step);
+            }
+            place += upper ? half : 0;
+        } else {
+            held[0] += __shfl_xor_sync(0xffffffffu, held[0], step);
+        }
+    }
+    if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
+        target[place] = held[0];
+#else
+    for (int i = 0; i < LENGTH; ++i)
+        target[i] = numbers[i];
+#endif
+"""
+
+
+@cache
+def load_channels_function(Channels):
+    """Return the function that reads a row of channels, a multiple of 4, in 16-byte loads."""
+    snippet = _LOAD_CHANNELS.replace("LENGTH", str(Channels._length_))
+
+    @wp.func_native(snippet)
     def load_channels(channels: wp.array[Channels], index: int) -> Channels: ...
 
     return load_channels
@@ -88,39 +124,9 @@ def store_lane_sums_function(length: int):
     one sum after the other would take five each. The order of additions is fixed.
     """
     Numbers = wp.types.vector(length=length, dtype=float)
-    width = 16 if length <= 16 else 32
+    snippet = _STORE_LANE_SUMS.replace("LENGTH", str(length)).replace("WIDTH", "16" if length <= 16 else "32")
 
-    @wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31;
-    float held[{width}];
-    #pragma unroll
-    for (int i = 0; i < {width}; ++i)
-        held[i] = i < {length} ? numbers[i] : 0.0f;
-    int place = 0;
-    #pragma unroll
-    for (int half = {width} / 2, step = 16; step > 0; half >>= 1, step >>= 1) {{
-        const bool upper = (lane & step) != 0;
-        if (half > 0) {{
-            #pragma unroll
-            for (int i = 0; i < half; ++i) {{
-                const float given = upper ? held[i] : held[i + half];
-                const float kept = upper ? held[i + half] : held[i];
-                held[i] = kept + __shfl_xor_sync(0xffffffffu, given, step);
-            }}
-            place += upper ? half : 0;
-        }} else {{
-            held[0] += __shfl_xor_sync(0xffffffffu, held[0], step);
-        }}
-    }}
-    const bool mine = {width} == 32 || (lane & 1) == 0;
-    if (mine && place < {length})
-        reinterpret_cast<float*>(out_rows.data)[size_t(row) * {length} + place] = held[0];
-#else
-    for (int i = 0; i < {length}; ++i)
-        reinterpret_cast<float*>(out_rows.data)[size_t(row) * {length} + i] = numbers[i];
-#endif
-""")
+    @wp.func_native(snippet)
     def store_lane_sums(out_rows: wp.array[Numbers], row: int, numbers: Numbers): ...
 
     return store_lane_sums
