@@ -69,6 +69,11 @@ class Rows:
     matrix: wp.array
     vectors: wp.array
 
+    @property
+    def length(self) -> int:
+        """K."""
+        return self.matrix.shape[1]
+
     @classmethod
     def zeros(cls, count: int, dtype: Any, device: Any) -> Rows:
         """Allocate rows of a vector type."""
@@ -76,14 +81,6 @@ class Rows:
         if not count:
             return cls(matrix, wp.zeros(0, dtype=dtype, device=device))
         return cls(matrix, wp.array(ptr=matrix.ptr, shape=count, dtype=dtype, device=device))
-
-
-def as_matrix(vectors: wp.array) -> wp.array:
-    """Return the memory of ``(N,)`` vectors of K as an ``(N, K)`` float array."""
-    length = vectors.dtype._length_
-    if not len(vectors):
-        return wp.zeros((0, length), dtype=float, device=vectors.device)
-    return wp.array(ptr=vectors.ptr, shape=(len(vectors), length), dtype=float, device=vectors.device)
 
 
 def pass_lengths(channel_count: int) -> list[int]:

@@ -29,14 +29,14 @@ from beam_warp.kernels.channel_rows import (
     launch_scatter_channels,
 )
 from beam_warp.kernels.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
-from beam_warp.kernels.composite_adjoint import Adjoints, pair_vector
+from beam_warp.kernels.composite_adjoint import MOMENTS, Adjoints, pair_length, pair_vector
 from beam_warp.kernels.composite_adjoint_cpu import launch_composite_adjoint_cpu
 from beam_warp.kernels.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.composite_cuda import launch_composite_cuda
-from beam_warp.kernels.pair_sums import Pairs, SplatGradients, launch_add_pairs
+from beam_warp.kernels.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.project import Projection, Splats, View, launch_project, launch_project_adjoint
-from beam_warp.raster_layout import Rows, ViewLayout, as_matrix, channel_rows
+from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
 
 MAX_BAND_PAIRS = 2**25
 """Most (tile, splat) pairs held at a time, 24 bytes each: beyond it the images are drawn in bands of tile rows."""
@@ -481,9 +481,8 @@ class Rasterizer:
         upstream = Adjoints()
         upstream.alpha, upstream.depth = back.images.alpha, back.images.depth
         upstream.median_depth = back.images.median_depth
-        for rows, adjoint, gradient in zip(self._rows, back.channel_adjoints, back.rows, strict=True):
-            pairs = back.pairs[rows.vectors.dtype._length_]
-            pairs.matrix.zero_()
+        for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
+            pairs = back.pairs[rows.length]
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
             if self.device.is_cuda:
                 launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
@@ -493,16 +492,16 @@ class Rasterizer:
             summed = Pairs()
             summed.rows = pairs.matrix
             summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
-            summed.channel_count, summed.exact = rows.vectors.dtype._length_, int(self._exact)
-            launch_add_pairs(summed, back.splat_gradients(gradient), self.device)
+            launch_sum_pairs(summed, sums, self.device)
 
     def _project_adjoint(self, gaussians: GaussianArrays, back: _BackwardBuffers) -> GaussianGradients:
-        """Turn gradients of splats and rows into those of Gaussians."""
-        found = back.gaussians
-        for i, rows in enumerate(back.rows):
-            launch_scatter_channels(
-                rows.matrix, i * CHANNEL_COUNTS[-1], len(self.cameras), back.blocks, self._count, self.device
-            )
+        """Turn sums over pairs into the gradients of Gaussians."""
+        found, splats = back.gaussians, back.splats
+        for i, (rows, sums) in enumerate(zip(self._rows, back.sums, strict=True)):
+            launch_resolve_sums(sums, self._splats, rows.length, int(self._exact), splats, self.device)
+            columns = range(MOMENTS, MOMENTS + rows.length)
+            start = i * CHANNEL_COUNTS[-1]
+            launch_scatter_channels(sums, columns, start, len(self.cameras), back.blocks, self.device)
         if self.color_channels:
             launch_evaluate_colors_adjoint(
                 gaussians.positions,
@@ -519,7 +518,7 @@ class Rasterizer:
             self._views,
             self._projection,
             self._splats,
-            [back.splats.centers, back.splats.shapes, back.splats.slopes, back.splats.bends, back.splats.normals],
+            [splats.centers, splats.shapes, splats.slopes, splats.bends, splats.normals],
             [found.positions, found.orientations, found.scales, found.opacities],
             self.device,
         )
@@ -535,7 +534,7 @@ class _BackwardBuffers:
     states: wp.array
     pairs: dict[int, Rows]
     splats: Splats
-    rows: list[Rows]
+    sums: list[wp.array]
     blocks: ChannelBlocks
     gaussians: GaussianGradients
 
@@ -546,7 +545,7 @@ class _BackwardBuffers:
         splat_count, pixel_count = count * len(rasterizer.cameras), rasterizer.first_pixels[-1]
         channel_count, exact = rasterizer.value_channels.stop, rasterizer._exact
         adjoints = channel_rows(pixel_count, channel_count, device)
-        lengths = {rows.vectors.dtype._length_ for rows in adjoints}
+        lengths = {rows.length for rows in adjoints}
         has_colors, value_count = bool(rasterizer.color_channels), len(rasterizer.value_channels)
         gaussians = rasterizer._gaussians
         bands = gaussians.radiance.shape[1] if has_colors and gaussians is not None else 0
@@ -563,7 +562,7 @@ class _BackwardBuffers:
             wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
             {n: Rows.zeros(rasterizer.pair_capacity, pair_vector(n, exact), device) for n in lengths},
             splats,
-            channel_rows(splat_count, channel_count, device),
+            [wp.zeros((splat_count, pair_length(rows.length, exact)), dtype=float) for rows in adjoints],
             blocks,
             GaussianGradients(
                 wp.zeros(count, dtype=wp.vec3),
@@ -583,18 +582,8 @@ class _BackwardBuffers:
                 array.zero_()
         for array in (self.splats.centers, self.splats.shapes, self.splats.slopes, self.splats.bends):
             array.zero_()
-        for rows in self.rows:
-            rows.matrix.zero_()
-
-    def splat_gradients(self, rows: Rows) -> SplatGradients:
-        """Return where the sums over the pairs of one pass go."""
-        gradients = SplatGradients()
-        gradients.centers = as_matrix(self.splats.centers)
-        gradients.shapes = as_matrix(self.splats.shapes)
-        gradients.slopes = as_matrix(self.splats.slopes)
-        gradients.bends = self.splats.bends
-        gradients.channels = rows.matrix
-        return gradients
+        for sums in self.sums:
+            sums.zero_()
 
 
 def _zero_splats(count: int) -> Splats:

@@ -25,8 +25,9 @@ from beam_warp.kernels.splat_rows import (
 
 wp.set_module_options({"enable_backward": False})
 
-TILE = 8
-"""Side of a tile [pixel]. A pixel reads the whole list of its tile: small tiles waste less of it on small splats."""
+TILE = 16
+"""Side of a tile [pixel]. Fast composites look at a tile's list part by part, so that small tiles would only make more
+pairs to sort: 8 pixels make 2.5 times as many for a figure of 140,000 Gaussians at 1080p."""
 
 SIDE = wp.constant(TILE)
 LAST = wp.constant(float(TILE - 1))

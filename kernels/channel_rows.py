@@ -67,11 +67,16 @@ def gather_channels_kernel(first: int, blocks: ChannelBlocks, start: int, out_ro
 
 @wp.kernel(enable_backward=False)
 def scatter_channels_kernel(
-    first: int, rows: wp.array2d[float], start: int, view_count: int, out_gradients: ChannelBlocks
+    first: int,
+    rows: wp.array2d[float],
+    column: int,
+    length: int,
+    start: int,
+    view_count: int,
+    out_gradients: ChannelBlocks,
 ):
     """The adjoint of gathering, one Gaussian's channel an item: sums over the views in order."""
     item = first + wp.tid()
-    length = rows.shape[1]
     count = rows.shape[0] / view_count
     i = item / length
     channel = start + item % length
@@ -80,7 +85,7 @@ def scatter_channels_kernel(
     total = float(0.0)
     for view in range(view_count):
         splat = view * count + i
-        value = rows[splat, item % length]
+        value = rows[splat, column + item % length]
         if channel < colors_end:
             out_gradients.colors[splat][channel] = value
         elif channel < normals_end:
@@ -118,12 +123,15 @@ def launch_gather_channels(blocks, start, rows, device):
     launch(gather_channels_kernel, rows.shape[0] * rows.shape[1], inputs=[blocks, start], outputs=[rows], device=device)
 
 
-def launch_scatter_channels(rows, start, view_count, gradients, gaussian_count, device):
-    """Write what the gradients of the channels from ``start`` on say to those of the blocks."""
+def launch_scatter_channels(rows, columns, start, view_count, gradients, device):
+    """Write what gradients of channels say to those of the blocks.
+
+    The channels from ``start`` on are in the ``columns`` of ``rows``, one row a splat.
+    """
     launch(
         scatter_channels_kernel,
-        gaussian_count * rows.shape[1],
-        inputs=[rows, start, view_count],
+        rows.shape[0] // view_count * len(columns),
+        inputs=[rows, columns.start, len(columns), start, view_count],
         outputs=[gradients],
         device=device,
     )

@@ -11,14 +11,14 @@ import warp as wp
 from beam_warp.kernels.bin_tiles import SIDE, Band, TileLists
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT, Splats, View
-from beam_warp.kernels.row_loads import load_row
 from beam_warp.kernels.splat_rows import (
-    ALPHA_CAP,
     MEDIAN,
     TRANSMITTANCE_STOP,
-    exact_depth_at,
-    log_alpha_at,
-    plane_depth_at,
+    alpha_of,
+    depth_function,
+    log_alpha_of,
+    offset_from,
+    whiten,
 )
 
 CHANNEL_COUNTS = (4, 8, 12, 16)
@@ -73,39 +73,10 @@ def pixel_place(view: View, tile: int, within: int) -> PixelPlace:
     return place
 
 
-@wp.func
-def offset_from(center: wp.vec4, position: wp.vec2) -> wp.vec2:
-    return wp.vec2(position[0] - center[0], position[1] - center[1])
-
-
-@wp.func
-def alpha_of(log_alpha: float) -> float:
-    """Alpha of what passes the cut."""
-    return wp.min(wp.exp(log_alpha), ALPHA_CAP)
-
-
 @cache
 def channel_vector(channel_count: int):
     """Return the Warp type of a row of channels."""
     return wp.types.vector(length=channel_count, dtype=float)
-
-
-@cache
-def depth_function(exact: bool):
-    """Return the function (splats, splat, center, shape, near, offset) that gives a splat's depth at a pixel."""
-    if exact:
-
-        @wp.func
-        def exact_depth(splats: Splats, splat: int, center: wp.vec4, shape: wp.vec4, near: float, offset: wp.vec2):
-            return exact_depth_at(center, shape, load_row(splats.slopes, splat), splats.bends[splat], near, offset)
-
-        return exact_depth
-
-    @wp.func
-    def plane_depth(splats: Splats, splat: int, center: wp.vec4, shape: wp.vec4, near: float, offset: wp.vec2):
-        return plane_depth_at(center, shape, load_row(splats.slopes, splat), near, offset)
-
-    return plane_depth
 
 
 @cache
@@ -140,11 +111,12 @@ def composite_kernel(channel_count: int, exact: bool):
             center = frame.splats.centers[splat]
             shape = frame.splats.shapes[splat]
             offset = offset_from(center, place.position)
-            log_alpha = log_alpha_at(center, shape, offset)
+            log_alpha = log_alpha_of(center, whiten(shape, offset))
             if log_alpha >= -LOG_CUT:
                 alpha = alpha_of(log_alpha)
                 weight = alpha * transmittance
-                z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
+                slope = frame.splats.slopes[splat]
+                z = depth_at(center, shape, slope, frame.splats.bends[splat], frame.near, offset)
                 total += channels[splat] * weight
                 depth += z * weight
                 weight_sum += weight

@@ -7,8 +7,10 @@ the sums has s_k = f_k . v_f + z_k v_z + v_a, and back to front (Kerbl et al. 20
 
 Which splats count, the order, the cap of alpha and the pick of the median are held still.
 
-A pair's gradient is a row of numbers: `GEOMETRY` for the rows of `kernels.project.Splats`, the channels, and in exact
-mode the three of the form e.
+What a splat's rows get is linear in a few moments over its pixels, of the whitened offset e: with d the derivative to
+ln alpha, those of 1, e0, e1, e0^2, e0 e1, e1^2 under d; the sums of the derivatives to depth and reach; the moments of
+1, e0, e1 under f, the derivative to the factor l; the channels; and in exact mode the moments of e0, e1, e0^2, e0 e1,
+e1^2 under b, the derivative to the form e. Whitened, nothing cancels for a needle, and a pixel costs no chain rule.
 """
 
 from functools import cache
@@ -16,22 +18,23 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.composite import Images, channel_vector
-from beam_warp.kernels.project import Splats
-from beam_warp.kernels.row_loads import load_row
 from beam_warp.kernels.splat_rows import SMALLEST_FACING, bend_at, facing_at
 
-GEOMETRY = wp.constant(10)
-"""x, y, ln opacity, depth; s0, s1, s2, reach; gx, gy."""
+MOMENTS = wp.constant(11)
+"""Moments before the channels."""
+
+BEND_MOMENTS = wp.constant(5)
+"""Moments behind the channels, in exact mode."""
 
 
 def pair_length(channel_count: int, exact: bool) -> int:
-    """Return how many numbers a pair's gradient has, a multiple of 4."""
-    return -(-(GEOMETRY + channel_count + 3 * exact) // 4) * 4
+    """Return how many numbers a pair's moments and channels are, padded to a multiple of 4."""
+    return -(-(MOMENTS + channel_count + BEND_MOMENTS * exact) // 4) * 4
 
 
 @cache
 def pair_vector(channel_count: int, exact: bool):
-    """Return the Warp type of a pair's gradient."""
+    """Return the Warp type of a pair's moments and channels."""
     return wp.types.vector(length=pair_length(channel_count, exact), dtype=float)
 
 
@@ -53,6 +56,16 @@ class PixelAdjoint:
     median_depth: float
 
 
+@wp.struct
+class DepthAdjoint:
+    """Derivatives with respect to what a splat's depth at a pixel is made of."""
+
+    depth: float
+    reach: float
+    facing: float
+    bend: float
+
+
 @wp.func
 def pixel_adjoint(images: Images, adjoints: Adjoints, pixel: int) -> PixelAdjoint:
     """Take the derivative to the mean depth apart into those to its numerator and denominator."""
@@ -69,83 +82,69 @@ def pixel_adjoint(images: Images, adjoints: Adjoints, pixel: int) -> PixelAdjoin
 
 
 @cache
-def add_pair_function(channel_count: int, exact: bool):
-    """Return the function that adds one pixel's part to a pair's gradient."""
-    Channels = channel_vector(channel_count)
-    Pair = pair_vector(channel_count, exact)
-    bend = GEOMETRY + channel_count
+def depth_adjoint_function(exact: bool):
+    """Return the function that takes the derivative ``v`` to a splat's depth ``z`` at a pixel apart."""
 
     @wp.func
-    def add_pair(
-        total: Pair,
-        splats: Splats,
-        splat: int,
-        center: wp.vec4,
-        shape: wp.vec4,
-        near: float,
-        offset: wp.vec2,
-        weight: float,
-        log_alpha_gradient: float,
-        depth_gradient: float,
-        channel_gradient: Channels,
-    ) -> Pair:
-        x = offset[0]
-        y = offset[1]
-        along = y - shape[1] * x
-        to_e0 = -(x * shape[0]) * log_alpha_gradient
-        to_e1 = -(along * shape[2]) * log_alpha_gradient
-        to_x = shape[0] * to_e0 - shape[1] * shape[2] * to_e1
-        to_y = shape[2] * to_e1
-        to_z = float(0.0)
-        to_reach = float(0.0)
-        if depth_gradient != 0.0:
-            slope = load_row(splats.slopes, splat)
-            facing = facing_at(slope, offset)
-            inverse = facing
+    def depth_adjoint(
+        center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2, z: float, v: float
+    ) -> DepthAdjoint:
+        found = DepthAdjoint()
+        if z >= center[3] + shape[3]:
+            found.depth = v
+            found.reach = v
+        elif z > wp.max(center[3] - shape[3], near):
+            found.depth = v * z / center[3]
+            found.facing = -found.depth * z
             if wp.static(exact):
-                facing = wp.max(facing, SMALLEST_FACING)
-                inverse = facing + bend_at(slope, splats.bends[splat], offset) / facing
-            far = center[3] + shape[3]
-            least = center[3] - shape[3]
-            z = far
-            if inverse > 0.0:
-                z = center[3] / inverse
-            if not (inverse > 0.0) or z > far:
-                to_z = depth_gradient
-                to_reach = depth_gradient
-            elif z < wp.max(least, near):
-                if least > near:
-                    to_z = depth_gradient
-                    to_reach = -depth_gradient
-            else:
-                to_z = depth_gradient / inverse
-                to_facing = -depth_gradient * z / inverse
-                if wp.static(exact):
-                    to_bend = to_facing / facing
-                    bend_y = splats.bends[splat]
-                    if facing > SMALLEST_FACING:
-                        to_facing *= 1.0 - bend_at(slope, bend_y, offset) / (facing * facing)
-                    else:
-                        to_facing = 0.0
-                    total[bend] = total[bend] + to_bend * x * x
-                    total[bend + 1] = total[bend + 1] + 2.0 * to_bend * x * y
-                    total[bend + 2] = total[bend + 2] + to_bend * y * y
-                    to_x += 2.0 * to_bend * (slope[2] * x + slope[3] * y)
-                    to_y += 2.0 * to_bend * (slope[3] * x + bend_y * y)
-                to_x += to_facing * slope[0]
-                to_y += to_facing * slope[1]
-                total[8] = total[8] + to_facing * x
-                total[9] = total[9] + to_facing * y
-        total[0] = total[0] - to_x
-        total[1] = total[1] - to_y
-        total[2] = total[2] + log_alpha_gradient
-        total[3] = total[3] + to_z
-        total[4] = total[4] + x * to_e0
-        total[5] = total[5] - x * shape[2] * to_e1
-        total[6] = total[6] + along * to_e1
-        total[7] = total[7] + to_reach
+                raw = facing_at(slope, offset)
+                facing = wp.max(raw, SMALLEST_FACING)
+                found.bend = found.facing / facing
+                found.facing *= 1.0 - bend_at(slope, bend, offset) / (facing * facing)
+                if raw < SMALLEST_FACING:
+                    found.facing = 0.0
+        elif center[3] - shape[3] > near:
+            found.depth = v
+            found.reach = -v
+        return found
+
+    return depth_adjoint
+
+
+@cache
+def add_moments_function(channel_count: int, exact: bool):
+    """Return the function that adds one pixel's part to a pair's moments and channels."""
+    Channels = channel_vector(channel_count)
+    Pair = pair_vector(channel_count, exact)
+    bend = MOMENTS + channel_count
+
+    @wp.func
+    def add_moments(
+        total: Pair, e: wp.vec2, d: float, depth: DepthAdjoint, weight: float, to_channels: Channels
+    ) -> Pair:
+        d0 = d * e[0]
+        d1 = d * e[1]
+        total[0] = total[0] + d
+        total[1] = total[1] + d0
+        total[2] = total[2] + d1
+        total[3] = total[3] + d0 * e[0]
+        total[4] = total[4] + d0 * e[1]
+        total[5] = total[5] + d1 * e[1]
+        total[6] = total[6] + depth.depth
+        total[7] = total[7] + depth.reach
+        total[8] = total[8] + depth.facing
+        total[9] = total[9] + depth.facing * e[0]
+        total[10] = total[10] + depth.facing * e[1]
         for i in range(wp.static(channel_count)):
-            total[wp.static(GEOMETRY) + i] = total[wp.static(GEOMETRY) + i] + weight * channel_gradient[i]
+            total[wp.static(MOMENTS) + i] = total[wp.static(MOMENTS) + i] + weight * to_channels[i]
+        if wp.static(exact):
+            b0 = depth.bend * e[0]
+            b1 = depth.bend * e[1]
+            total[wp.static(bend)] = total[wp.static(bend)] + b0
+            total[wp.static(bend + 1)] = total[wp.static(bend + 1)] + b1
+            total[wp.static(bend + 2)] = total[wp.static(bend + 2)] + b0 * e[0]
+            total[wp.static(bend + 3)] = total[wp.static(bend + 3)] + b0 * e[1]
+            total[wp.static(bend + 4)] = total[wp.static(bend + 4)] + b1 * e[1]
         return total
 
-    return add_pair
+    return add_moments

@@ -4,21 +4,29 @@ from functools import cache
 
 import warp as wp
 
-from beam_warp.kernels.composite import Frame, Images, alpha_of, channel_vector, depth_function, offset_from
-from beam_warp.kernels.composite_adjoint import Adjoints, add_pair_function, pair_vector, pixel_adjoint
+from beam_warp.kernels.composite import Frame, Images, channel_vector
+from beam_warp.kernels.composite_adjoint import (
+    Adjoints,
+    DepthAdjoint,
+    add_moments_function,
+    depth_adjoint_function,
+    pair_vector,
+    pixel_adjoint,
+)
 from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
-from beam_warp.kernels.splat_rows import ALPHA_CAP, log_alpha_at
+from beam_warp.kernels.splat_rows import ALPHA_CAP, alpha_of, depth_function, log_alpha_of, offset_from, whiten
 
 
 @cache
 def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
-    """Return the kernel that writes the gradient of every pair, one tile an item."""
+    """Return the kernel that writes the moments and channels of every pair, one tile an item."""
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     depth_at = depth_function(exact)
-    add_pair = add_pair_function(channel_count, exact)
+    depth_adjoint = depth_adjoint_function(exact)
+    add_moments = add_moments_function(channel_count, exact)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_adjoint_kernel(
@@ -43,11 +51,15 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                 pixel = view.first_pixel + y * view.width + x
                 out_states[pixel] = wp.vec2(images.transmittance[pixel], 0.0)
                 end = wp.max(end, images.ends[pixel])
+        for k in range(end, listed_range[1]):
+            out_pairs[frame.lists.slots[k]] = Pair()
         for back in range(end - listed_range[0]):
             k = end - 1 - back
             splat = frame.lists.splats[k]
             center = frame.splats.centers[splat]
             shape = frame.splats.shapes[splat]
+            slope = frame.splats.slopes[splat]
+            bend = frame.splats.bends[splat]
             row = channels[splat]
             total = Pair()
             rows = rows_in(box, center, shape)
@@ -56,7 +68,8 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                 for x in range(columns[0], columns[1]):
                     pixel = view.first_pixel + y * view.width + x
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
-                    log_alpha = log_alpha_at(center, shape, offset)
+                    e = whiten(shape, offset)
+                    log_alpha = log_alpha_of(center, e)
                     if k < images.ends[pixel] and log_alpha >= -LOG_CUT:
                         state = out_states[pixel]
                         alpha = alpha_of(log_alpha)
@@ -65,27 +78,18 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                         weight = alpha * transmittance
                         adjoint = pixel_adjoint(images, adjoints, pixel)
                         to_channels = channel_adjoints[pixel]
-                        z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
+                        z = depth_at(center, shape, slope, bend, frame.near, offset)
                         s = wp.dot(row, to_channels) + z * adjoint.depth + adjoint.alpha
-                        to_log_alpha = float(0.0)
+                        d = float(0.0)
                         if alpha < ALPHA_CAP:
-                            to_log_alpha = alpha * (transmittance * s - state[1] / open_share)
+                            d = alpha * (transmittance * s - state[1] / open_share)
                         to_depth = weight * adjoint.depth
                         if k == images.medians[pixel]:
                             to_depth += adjoint.median_depth
-                        total = add_pair(
-                            total,
-                            frame.splats,
-                            splat,
-                            center,
-                            shape,
-                            frame.near,
-                            offset,
-                            weight,
-                            to_log_alpha,
-                            to_depth,
-                            to_channels,
-                        )
+                        taken = DepthAdjoint()
+                        if to_depth != 0.0:
+                            taken = depth_adjoint(center, shape, slope, bend, frame.near, offset, z, to_depth)
+                        total = add_moments(total, e, d, taken, weight, to_channels)
                         out_states[pixel] = wp.vec2(transmittance, state[1] + weight * s)
             out_pairs[frame.lists.slots[k]] = total
 
@@ -95,7 +99,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
 def launch_composite_adjoint_cpu(
     frame, channels, exact, images, channel_adjoints, adjoints, out_states, out_pairs, device
 ):
-    """Write the gradients of a band's pairs into their slots; those of no pixel keep what is there."""
+    """Write the moments and channels of a band's pairs into their slots."""
     launch(
         composite_adjoint_cpu_kernel(channels.dtype._length_, exact),
         frame.band.end_tile - frame.band.first_tile,

@@ -1,44 +1,60 @@
-"""How pixels change with the splats that they see, for CUDA: a tile a warp, two pixels a lane, back to front.
+"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
 
-The lanes fetch 32 splats at once and then go through them together. The sum over a tile's pixels never leaves the warp:
-no atomics, one order of additions, the same bits every run.
+The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
+pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
+atomics, one order of additions, the same bits every run.
 """
 
 from functools import cache
 
 import warp as wp
 
-from beam_warp.kernels.composite import (
-    Frame,
-    Images,
-    PixelPlace,
-    alpha_of,
-    channel_vector,
-    depth_function,
-    offset_from,
-    pixel_place,
-)
+from beam_warp.kernels.bin_tiles import SIDE
+from beam_warp.kernels.composite import Frame, Images, PixelPlace, channel_vector, pixel_place
 from beam_warp.kernels.composite_adjoint import (
     Adjoints,
+    DepthAdjoint,
     PixelAdjoint,
-    add_pair_function,
+    add_moments_function,
+    depth_adjoint_function,
     pair_length,
     pair_vector,
     pixel_adjoint,
 )
+from beam_warp.kernels.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
 from beam_warp.kernels.lanes import (
+    ADD_TO_SUMS,
+    BEGIN_SUMS,
+    END_SUMS,
     ballot,
-    from_lane,
+    greatest_of_block,
     greatest_of_lanes,
-    load_channels_function,
-    store_lane_sums_function,
+    lowest_lane,
+    share_channels_function,
+    share_row_function,
+    sum_block_function,
+    wait_for_block,
 )
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
 from beam_warp.kernels.row_loads import load_row
-from beam_warp.kernels.splat_rows import ALPHA_CAP, log_alpha_at
+from beam_warp.kernels.splat_rows import (
+    ALPHA_CAP,
+    alpha_of,
+    depth_function,
+    log_alpha_of,
+    offset_from,
+    quick_divide,
+    whiten,
+)
 
-LANES = wp.constant(32)
+PART = wp.constant(8)
+"""Side of the pixels of a warp."""
+
+WARPS = 4
+"""Warps of a block: a tile is 16 x 16 pixels."""
+
+THREADS = wp.constant(32 * WARPS)
 
 
 @wp.struct
@@ -73,49 +89,54 @@ def begin_pixel(images: Images, adjoints: Adjoints, place: PixelPlace) -> Traced
 
 @cache
 def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
-    """Return the kernel that writes the gradient of every pair, 32 items a tile."""
+    """Return the kernel that writes the moments and channels of every pair, a block a tile."""
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     depth_at = depth_function(exact)
-    add_pair = add_pair_function(channel_count, exact)
-    load_channels = load_channels_function(Channels)
-    store_lane_sums = store_lane_sums_function(pair_length(channel_count, exact))
+    depth_adjoint = depth_adjoint_function(exact)
+    add_moments = add_moments_function(channel_count, exact)
+    share_row = share_row_function(4 if exact else 3, 1)
+    share_channels = share_channels_function(Channels, 1)
+    sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
 
     @wp.func
     def add_pixel(
         total: Pair,
         pixel: TracedPixel,
         to_channels: Channels,
-        frame: Frame,
-        splat: int,
+        near: float,
         k: int,
         center: wp.vec4,
         shape: wp.vec4,
+        slope: wp.vec4,
+        bend: float,
         offset: wp.vec2,
+        e: wp.vec2,
         log_alpha: float,
         row: Channels,
     ):
         alpha = alpha_of(log_alpha)
         open_share = 1.0 - alpha
-        transmittance = pixel.transmittance / open_share
+        transmittance = quick_divide(pixel.transmittance, open_share)
         weight = alpha * transmittance
-        z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
+        z = depth_at(center, shape, slope, bend, near, offset)
         s = wp.dot(row, to_channels) + z * pixel.adjoint.depth + pixel.adjoint.alpha
-        to_log_alpha = float(0.0)
+        d = float(0.0)
         if alpha < ALPHA_CAP:
-            to_log_alpha = alpha * (transmittance * s - pixel.behind / open_share)
+            d = alpha * (transmittance * s - quick_divide(pixel.behind, open_share))
         to_depth = weight * pixel.adjoint.depth
         if k == pixel.median:
             to_depth += pixel.adjoint.median_depth
-        total = add_pair(
-            total, frame.splats, splat, center, shape, frame.near, offset, weight, to_log_alpha, to_depth, to_channels
-        )
+        taken = DepthAdjoint()
+        if to_depth != 0.0:
+            taken = depth_adjoint(center, shape, slope, bend, near, offset, z, to_depth)
+        total = add_moments(total, e, d, taken, weight, to_channels)
         pixel.transmittance = transmittance
         pixel.behind += weight * s
         return total, pixel
 
     @wp.kernel(enable_backward=False, module="unique")
-    def composite_warps_adjoint_kernel(
+    def composite_blocks_adjoint_kernel(
         first: int,
         frame: Frame,
         channels: wp.array[Channels],
@@ -125,62 +146,126 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         out_pairs: wp.array[Pair],
     ):
         item = first + wp.tid()
+        thread = item % THREADS
         lane = item % LANES
-        listed = item / LANES
+        part = thread / LANES
+        listed = item / THREADS
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        begin = frame.lists.ranges[listed][0]
-        upper = begin_pixel(images, adjoints, pixel_place(view, tile, lane))
-        lower = begin_pixel(images, adjoints, pixel_place(view, tile, lane + LANES))
+        listed_range = frame.lists.ranges[listed]
+        corner = (part / 2) * PART * SIDE + (part % 2) * PART
+        box = pixel_place(view, tile, corner)
+        own = corner + (lane / PART) * SIDE + lane % PART
+        upper = begin_pixel(images, adjoints, pixel_place(view, tile, own))
+        lower = begin_pixel(images, adjoints, pixel_place(view, tile, own + SIDE * PART / 2))
         to_upper = Channels()
         to_lower = Channels()
         if upper.index >= 0:
-            to_upper = load_channels(channel_adjoints, upper.index)
+            to_upper = channel_adjoints[upper.index]
         if lower.index >= 0:
-            to_lower = load_channels(channel_adjoints, lower.index)
-        end = greatest_of_lanes(wp.max(upper.end, lower.end))
-        while end > begin:
+            to_lower = channel_adjoints[lower.index]
+        own_end = greatest_of_lanes(wp.max(upper.end, lower.end))
+        end = greatest_of_block(own_end)
+        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
+            out_pairs[frame.lists.slots[k]] = Pair()
+        while end > listed_range[0]:
             mine = end - 1 - lane
-            splat = int(0)
-            slot = int(0)
-            if mine >= begin:
-                splat = frame.lists.splats[mine]
+            slot = int(-1)
+            splat = int(-1)
+            if mine >= listed_range[0]:
                 slot = frame.lists.slots[mine]
-            for i in range(wp.min(end - begin, LANES)):
+                splat = frame.lists.splats[mine]
+                if part == 0:
+                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
+                if part == 1:
+                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
+                if part == 2:
+                    share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+                if part == 3:
+                    share_channels(1, lane, channels, splat)
+                    if wp.static(exact):
+                        share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+            sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
+            wait_for_block()
+            wanted = int(0)
+            if splat >= 0 and mine < own_end:
+                wanted = reaches(
+                    share_row(0, CENTER, lane, wp.vec4()),
+                    share_row(0, SHAPE, lane, wp.vec4()),
+                    box.position,
+                    PART,
+                    PART,
+                )
+            waiting = ballot(wanted)
+            while waiting != 0:
+                i = lowest_lane(waiting)
+                waiting = waiting & (waiting - 1)
                 k = end - 1 - i
-                drawn = from_lane(splat, i)
-                center = load_row(frame.splats.centers, drawn)
-                shape = load_row(frame.splats.shapes, drawn)
+                center = share_row(0, CENTER, i, wp.vec4())
+                shape = share_row(0, SHAPE, i, wp.vec4())
                 upper_offset = offset_from(center, upper.position)
                 lower_offset = offset_from(center, lower.position)
-                upper_log_alpha = log_alpha_at(center, shape, upper_offset)
-                lower_log_alpha = log_alpha_at(center, shape, lower_offset)
+                upper_e = whiten(shape, upper_offset)
+                lower_e = whiten(shape, lower_offset)
+                upper_log_alpha = log_alpha_of(center, upper_e)
+                lower_log_alpha = log_alpha_of(center, lower_e)
                 in_upper = k < upper.end and upper_log_alpha >= -LOG_CUT
                 in_lower = k < lower.end and lower_log_alpha >= -LOG_CUT
                 if ballot(wp.where(in_upper or in_lower, 1, 0)) != 0:
                     total = Pair()
-                    row = load_channels(channels, drawn)
+                    slope = share_row(0, SLOPE, i, wp.vec4())
+                    bend = float(0.0)
+                    if wp.static(exact):
+                        bend = share_row(0, BEND, i, wp.vec4())[0]
+                    row = share_channels(0, i, channels, 0)
                     if in_upper:
                         total, upper = add_pixel(
-                            total, upper, to_upper, frame, drawn, k, center, shape, upper_offset, upper_log_alpha, row
+                            total,
+                            upper,
+                            to_upper,
+                            frame.near,
+                            k,
+                            center,
+                            shape,
+                            slope,
+                            bend,
+                            upper_offset,
+                            upper_e,
+                            upper_log_alpha,
+                            row,
                         )
                     if in_lower:
                         total, lower = add_pixel(
-                            total, lower, to_lower, frame, drawn, k, center, shape, lower_offset, lower_log_alpha, row
+                            total,
+                            lower,
+                            to_lower,
+                            frame.near,
+                            k,
+                            center,
+                            shape,
+                            slope,
+                            bend,
+                            lower_offset,
+                            lower_e,
+                            lower_log_alpha,
+                            row,
                         )
-                    store_lane_sums(out_pairs, from_lane(slot, i), total)
+                    sum_block(ADD_TO_SUMS, i, total, out_pairs)
+            wait_for_block()
+            sum_block(END_SUMS, 0, Pair(), out_pairs)
+            wait_for_block()
             end -= LANES
 
-    return composite_warps_adjoint_kernel
+    return composite_blocks_adjoint_kernel
 
 
 def launch_composite_adjoint_cuda(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
-    """Write the gradients of a band's pairs into their slots; those of no pixel keep what is there."""
+    """Write the moments and channels of a band's pairs into their slots."""
     launch(
         composite_adjoint_cuda_kernel(channels.dtype._length_, exact),
-        (frame.band.end_tile - frame.band.first_tile) * LANES,
+        (frame.band.end_tile - frame.band.first_tile) * THREADS,
         inputs=[frame, channels, images, channel_adjoints, adjoints],
         outputs=[out_pairs],
         device=device,
-        block_dim=64,
+        block_dim=32 * WARPS,
     )

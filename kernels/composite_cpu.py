@@ -9,21 +9,25 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.bin_tiles import SIDE
-from beam_warp.kernels.composite import Frame, Images, alpha_of, channel_vector, depth_function, offset_from
+from beam_warp.kernels.composite import Frame, Images, channel_vector
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT, View
 from beam_warp.kernels.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
+    alpha_of,
+    depth_function,
     end_pixel_at,
     first_pixel_from,
-    log_alpha_at,
+    log_alpha_of,
+    offset_from,
     reach_columns,
     reach_rows,
     squared_extent,
+    whiten,
 )
 
-MIN_TILES = 16
+MIN_TILES = 4
 """Fewest tiles of one launch."""
 
 
@@ -88,6 +92,8 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
             splat = frame.lists.splats[k]
             center = frame.splats.centers[splat]
             shape = frame.splats.shapes[splat]
+            slope = frame.splats.slopes[splat]
+            bend = frame.splats.bends[splat]
             row = channels[splat]
             rows = rows_in(box, center, shape)
             for y in range(rows[0], rows[1]):
@@ -96,11 +102,11 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                     pixel = view.first_pixel + y * view.width + x
                     transmittance = out_images.transmittance[pixel]
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
-                    log_alpha = log_alpha_at(center, shape, offset)
+                    log_alpha = log_alpha_of(center, whiten(shape, offset))
                     if transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT:
                         alpha = alpha_of(log_alpha)
                         weight = alpha * transmittance
-                        z = depth_at(frame.splats, splat, center, shape, frame.near, offset)
+                        z = depth_at(center, shape, slope, bend, frame.near, offset)
                         out_channels[pixel] = out_channels[pixel] + row * weight
                         out_images.depth[pixel] = out_images.depth[pixel] + z * weight
                         out_images.alpha[pixel] = out_images.alpha[pixel] + weight

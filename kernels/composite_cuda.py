@@ -1,7 +1,7 @@
-"""What each pixel shows, for CUDA: half a tile a warp, a lane for each pixel.
+"""What each pixel shows, for CUDA: 8 x 4 pixels a warp, a lane for each.
 
-The lanes look at 32 splats of the tile's list at once, a lane for each: which of them reach the warp's 8 x 4 pixels?
-Those the warp then composites, one after the other, on all its pixels. A warp is done when all its pixels are.
+The lanes look at 32 splats of the tile's list at once, a lane for each: which of them reach the warp's pixels? Those go
+to shared memory, and the warp composites them one after the other on all its pixels. It is done when all pixels are.
 """
 
 from functools import cache
@@ -9,55 +9,58 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.bin_tiles import SIDE
-from beam_warp.kernels.composite import (
-    Frame,
-    Images,
-    alpha_of,
-    channel_vector,
-    depth_function,
-    offset_from,
-    pixel_place,
-)
-from beam_warp.kernels.lanes import ballot, from_lane, load_channels_function, lowest_lane
+from beam_warp.kernels.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.lanes import ballot, lowest_lane, share_channels_function, share_row_function, wait_for_lanes
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
 from beam_warp.kernels.row_loads import load_row
 from beam_warp.kernels.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
-    log_alpha_at,
+    alpha_of,
+    depth_function,
+    log_alpha_of,
+    offset_from,
     reach_columns,
     reach_rows,
     squared_extent,
+    whiten,
 )
 
 LANES = wp.constant(32)
-HALF = wp.constant(4)
-"""Rows of pixels of a warp."""
+WIDTH = wp.constant(8)
+HEIGHT = wp.constant(4)
+"""Pixels of a warp."""
+
+WARPS = 4
+"""Warps of a block; they share nothing."""
+
+CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 
 
 @wp.func
-def reaches(center: wp.vec4, shape: wp.vec4, left: float, top: float) -> int:
-    """1 if a splat reaches the pixels from (left, top), the first pixel's centre, to the end of half a tile."""
+def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height: int) -> int:
+    """1 if a splat reaches a box of pixels, ``first`` being the centre of its first one."""
     squared = squared_extent(center[2])
-    y0 = top - center[1]
-    y1 = y0 + float(HALF - 1)
+    y0 = first[1] - center[1]
+    y1 = y0 + float(height - 1)
     rows = reach_rows(shape, squared)
     if y0 > rows or y1 < -rows:
         return 0
     columns = reach_columns(shape, squared, y0, y1)
-    x0 = left - center[0]
-    if x0 > columns[1] or x0 + float(SIDE - 1) < columns[0]:
+    x0 = first[0] - center[0]
+    if x0 > columns[1] or x0 + float(width - 1) < columns[0]:
         return 0
     return 1
 
 
 @cache
 def composite_cuda_kernel(channel_count: int, exact: bool):
-    """Return the kernel that composites ``channel_count`` channels, 32 items half a tile."""
+    """Return the kernel that composites ``channel_count`` channels, an item a pixel."""
     Channels = channel_vector(channel_count)
     depth_at = depth_function(exact)
-    load_channels = load_channels_function(Channels)
+    share_row = share_row_function(4 if exact else 3, WARPS)
+    share_channels = share_channels_function(Channels, WARPS)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_warps_kernel(
@@ -68,10 +71,11 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         listed = item / (SIDE * SIDE)
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        within = item % (SIDE * SIDE)
-        place = pixel_place(view, tile, within)
+        part = (item % (SIDE * SIDE)) / LANES
+        corner = ((part / (SIDE / WIDTH)) * HEIGHT) * SIDE + (part % (SIDE / WIDTH)) * WIDTH
+        box = pixel_place(view, tile, corner)
+        place = pixel_place(view, tile, corner + (lane / WIDTH) * SIDE + lane % WIDTH)
         pixel = place.index
-        corner = pixel_place(view, tile, within - lane)
         total = Channels()
         depth = float(0.0)
         weight_sum = float(0.0)
@@ -80,54 +84,63 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
             transmittance = 0.0
         median_depth = float(0.0)
         median = int(-1)
-        last = int(-1)
         listed_range = frame.lists.ranges[listed]
-        end = listed_range[0]
+        last = int(-1)
         begin = listed_range[0]
         while begin < listed_range[1]:
             mine = begin + lane
-            splat = int(0)
             wanted = int(0)
             if mine < listed_range[1]:
                 splat = frame.lists.splats[mine]
-                wanted = reaches(
-                    load_row(frame.splats.centers, splat),
-                    load_row(frame.splats.shapes, splat),
-                    corner.position[0],
-                    corner.position[1],
-                )
+                center = load_row(frame.splats.centers, splat)
+                shape = load_row(frame.splats.shapes, splat)
+                wanted = reaches(center, shape, box.position, WIDTH, HEIGHT)
+                if wanted != 0:
+                    share_row(1, CENTER, lane, center)
+                    share_row(1, SHAPE, lane, shape)
+                    share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+                    if wp.static(exact):
+                        share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+                    share_channels(1, lane, channels, splat)
             waiting = ballot(wanted)
+            wait_for_lanes()
             while waiting != 0:
                 bit = lowest_lane(waiting)
                 waiting = waiting & (waiting - 1)
-                drawn = from_lane(splat, bit)
-                center = load_row(frame.splats.centers, drawn)
-                shape = load_row(frame.splats.shapes, drawn)
-                offset = offset_from(center, place.position)
-                log_alpha = log_alpha_at(center, shape, offset)
+                drawn = share_row(0, CENTER, bit, wp.vec4())
+                drawn_shape = share_row(0, SHAPE, bit, wp.vec4())
+                offset = offset_from(drawn, place.position)
+                log_alpha = log_alpha_of(drawn, whiten(drawn_shape, offset))
                 if transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT:
                     alpha = alpha_of(log_alpha)
                     weight = alpha * transmittance
-                    z = depth_at(frame.splats, drawn, center, shape, frame.near, offset)
-                    total += load_channels(channels, drawn) * weight
+                    bend = float(0.0)
+                    if wp.static(exact):
+                        bend = share_row(0, BEND, bit, wp.vec4())[0]
+                    z = depth_at(drawn, drawn_shape, share_row(0, SLOPE, bit, wp.vec4()), bend, frame.near, offset)
+                    total += share_channels(0, bit, channels, 0) * weight
                     depth += z * weight
                     weight_sum += weight
+                    last = begin + bit
                     if transmittance > MEDIAN:
                         median_depth = z
-                        median = begin + bit
-                    last = drawn
-                    end = begin + bit + 1
+                        median = last
                     transmittance *= 1.0 - alpha
             begin += LANES
             if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
                 begin = listed_range[1]
         if pixel >= 0:
+            seen = int(-1)
+            end = listed_range[0]
+            if last >= 0:
+                seen = frame.lists.splats[last] % frame.gaussian_count
+                end = last + 1
             out_channels[pixel] = total
             out_images.alpha[pixel] = weight_sum
             out_images.transmittance[pixel] = transmittance
             out_images.depth[pixel] = wp.where(weight_sum > 0.0, depth / weight_sum, 0.0)
             out_images.median_depth[pixel] = median_depth
-            out_images.gaussians[pixel] = wp.where(last >= 0, last % frame.gaussian_count, -1)
+            out_images.gaussians[pixel] = seen
             out_images.ends[pixel] = end
             out_images.medians[pixel] = median
 
@@ -142,5 +155,5 @@ def launch_composite_cuda(frame, channels, exact, out_channels, out_images, devi
         inputs=[frame, channels],
         outputs=[out_channels, out_images],
         device=device,
-        block_dim=64,
+        block_dim=32 * WARPS,
     )

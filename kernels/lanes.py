@@ -1,4 +1,7 @@
-"""What the 32 lanes of a CUDA warp tell each other. On the CPU a thread is alone: it is its own lane 0."""
+"""What the threads of a CUDA block tell each other: by votes and exchanges in a warp of 32 lanes, by shared memory.
+
+Nothing here does anything sensible on the CPU, where a thread is alone; the kernels that call it are for CUDA.
+"""
 
 from functools import cache
 
@@ -19,18 +22,6 @@ def ballot(flag: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __shfl_sync(0xffffffffu, value, lane);
-#else
-    return value;
-#endif
-""")
-def from_lane(value: int, lane: int) -> int:
-    """The value of a lane. All lanes must call it together."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
     return __reduce_max_sync(0xffffffffu, value);
 #else
     return value;
@@ -38,6 +29,46 @@ def from_lane(value: int, lane: int) -> int:
 """)
 def greatest_of_lanes(value: int) -> int:
     """The greatest value of all lanes. All lanes must call it together."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def wait_for_lanes():
+    """Return when all lanes are here, and see what they wrote."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait_for_block():
+    """Return when all threads of the block are here, and see what they wrote."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ int greatest[32];
+    const int own = __reduce_max_sync(0xffffffffu, value);
+    if ((threadIdx.x & 31) == 0)
+        greatest[threadIdx.x >> 5] = own;
+    __syncthreads();
+    int found = greatest[0];
+    for (int i = 1; i < blockDim.x / 32; ++i)
+        found = max(found, greatest[i]);
+    return found;
+#else
+    return value;
+#endif
+""")
+def greatest_of_block(value: int) -> int:
+    """The greatest value of all threads of the block. All must call it together, once in a kernel."""
     ...
 
 
@@ -53,80 +84,144 @@ def lowest_lane(bits: int) -> int:
     ...
 
 
-_LOAD_CHANNELS = """
+_SHARE_ROW = """
 #if defined(__CUDA_ARCH__)
-    const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(index) * (LENGTH / 4);
+    __shared__ float4 shared[GROUPS * KINDS * 32];
+    float4* place = shared + ((threadIdx.x >> 5) % GROUPS * KINDS + kind) * 32 + index;
+    if (store) {
+        *place = make_float4(row[0], row[1], row[2], row[3]);
+        return row;
+    }
+    const float4 found = *place;
+    return wp::vec4(found.x, found.y, found.z, found.w);
+#else
+    return row;
+#endif
+"""
+
+_SHARE_CHANNELS = """
     wp::vec_t<LENGTH, float> row;
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 shared[GROUPS * 8 * LENGTH];
+    float4* place = shared + (threadIdx.x >> 5) % GROUPS * (8 * LENGTH) + index;
+    const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
     #pragma unroll
     for (int i = 0; i < LENGTH / 4; ++i) {
-        const float4 part = __ldg(source + i);
-        row[4 * i] = part.x;
-        row[4 * i + 1] = part.y;
-        row[4 * i + 2] = part.z;
-        row[4 * i + 3] = part.w;
-    }
-    return row;
-#else
-    return channels.data[index];
-#endif
-"""
-
-_STORE_LANE_SUMS = """
-    float* target = reinterpret_cast<float*>(out_rows.data) + size_t(row) * LENGTH;
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31;
-    float held[WIDTH];
-    #pragma unroll
-    for (int i = 0; i < WIDTH; ++i)
-        held[i] = i < LENGTH ? numbers[i] : 0.0f;
-    int place = 0;
-    #pragma unroll
-    for (int step = 16; step > 0; step >>= 1) {
-        const int half = WIDTH * step / 32;
-        const bool upper = (lane & step) != 0;
-        if (half > 0) {
-            #pragma unroll
-            for (int i = 0; i < half; ++i) {
-                const float given = upper ? held[i] : held[i + half];
-                const float kept = upper ? held[i + half] : held[i];
-                held[i] = kept + __shfl_xor_sync(0xffffffffu, given, step);
-            }
-            place += upper ? half : 0;
+        if (store) {
+            place[32 * i] = __ldg(source + i);
         } else {
-            held[0] += __shfl_xor_sync(0xffffffffu, held[0], step);
+            const float4 part = place[32 * i];
+            row[4 * i] = part.x;
+            row[4 * i + 1] = part.y;
+            row[4 * i + 2] = part.z;
+            row[4 * i + 3] = part.w;
         }
     }
-    if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
-        target[place] = held[0];
-#else
-    for (int i = 0; i < LENGTH; ++i)
-        target[i] = numbers[i];
+#endif
+    return row;
+"""
+
+_SUM_BLOCK = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32 * WARPS * LENGTH];
+    __shared__ int present[32 * WARPS];
+    __shared__ int slots[32];
+    const int warp = threadIdx.x >> 5;
+    const int lane = threadIdx.x & 31;
+    if (action == 0) {
+        present[threadIdx.x] = 0;
+        if (warp == 0)
+            slots[lane] = pair;
+    } else if (action == 1) {
+        float held[WIDTH];
+        #pragma unroll
+        for (int i = 0; i < WIDTH; ++i)
+            held[i] = i < LENGTH ? numbers[i] : 0.0f;
+        int place = 0;
+        #pragma unroll
+        for (int step = 16; step > 0; step >>= 1) {
+            const int half = WIDTH * step / 32;
+            const bool upper = (lane & step) != 0;
+            if (half > 0) {
+                #pragma unroll
+                for (int i = 0; i < half; ++i) {
+                    const float given = upper ? held[i] : held[i + half];
+                    const float kept = upper ? held[i + half] : held[i];
+                    held[i] = kept + __shfl_xor_sync(0xffffffffu, given, step);
+                }
+                place += upper ? half : 0;
+            } else {
+                held[0] += __shfl_xor_sync(0xffffffffu, held[0], step);
+            }
+        }
+        if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
+            parts[(pair * WARPS + warp) * LENGTH + place] = held[0];
+        if (lane == 0)
+            present[pair * WARPS + warp] = 1;
+    } else {
+        for (int i = threadIdx.x; i < 32 * LENGTH; i += 32 * WARPS) {
+            const int listed = i / LENGTH;
+            if (slots[listed] >= 0) {
+                float total = 0.0f;
+                #pragma unroll
+                for (int w = 0; w < WARPS; ++w)
+                    if (present[listed * WARPS + w])
+                        total += parts[(listed * WARPS + w) * LENGTH + i % LENGTH];
+                reinterpret_cast<float*>(out_rows.data)[size_t(slots[listed]) * LENGTH + i % LENGTH] = total;
+            }
+        }
+    }
 #endif
 """
 
 
 @cache
-def load_channels_function(Channels):
-    """Return the function that reads a row of channels, a multiple of 4, in 16-byte loads."""
-    snippet = _LOAD_CHANNELS.replace("LENGTH", str(Channels._length_))
+def share_row_function(kinds: int, groups: int):
+    """Return the function that puts a row into shared memory or, with ``store`` 0, takes it from there.
+
+    There are 32 rows of each of some kinds, for every warp of ``groups``, or for the whole block with 1.
+    """
+    snippet = _SHARE_ROW.replace("KINDS", str(kinds)).replace("GROUPS", str(groups))
 
     @wp.func_native(snippet)
-    def load_channels(channels: wp.array[Channels], index: int) -> Channels: ...
+    def share_row(store: int, kind: int, index: int, row: wp.vec4) -> wp.vec4: ...
 
-    return load_channels
+    return share_row
 
 
 @cache
-def store_lane_sums_function(length: int):
-    """Return the function that stores the sums over all lanes of ``length`` numbers, a multiple of 4, at most 32.
+def share_channels_function(Channels, groups: int):
+    """Return the function that copies a splat's channels to shared memory or, with ``store`` 0, takes them from there.
 
-    Lanes halve what they hold in each of five steps, as in a transpose: 16 numbers take 16 exchanges, 32 take 31, where
-    one sum after the other would take five each. The order of additions is fixed.
+    There are 32 rows for every warp of ``groups``, or for the whole block with 1.
     """
-    Numbers = wp.types.vector(length=length, dtype=float)
-    snippet = _STORE_LANE_SUMS.replace("LENGTH", str(length)).replace("WIDTH", "16" if length <= 16 else "32")
+    snippet = _SHARE_CHANNELS.replace("LENGTH", str(Channels._length_)).replace("GROUPS", str(groups))
 
     @wp.func_native(snippet)
-    def store_lane_sums(out_rows: wp.array[Numbers], row: int, numbers: Numbers): ...
+    def share_channels(store: int, index: int, channels: wp.array[Channels], splat: int) -> Channels: ...
 
-    return store_lane_sums
+    return share_channels
+
+
+BEGIN_SUMS, ADD_TO_SUMS, END_SUMS = (wp.constant(k) for k in range(3))
+
+
+@cache
+def sum_block_function(length: int, warps: int):
+    """Return the function that sums ``length`` numbers, at most 32, over a block, for 32 pairs at a time.
+
+    - `BEGIN_SUMS`: every lane of the first warp names the slot of its pair, -1 for none.
+    - `ADD_TO_SUMS`: the lanes of a warp bring their numbers for a pair. They halve what they hold in each of five
+      steps, as in a transpose: 16 numbers take 16 exchanges, where one sum after the other would take five each.
+    - `END_SUMS`: the sums of the warps that brought some, in their order, go to the rows of the slots; zeros for none.
+
+    All threads must wait for each other between the three. The order of additions is fixed.
+    """
+    Numbers = wp.types.vector(length=length, dtype=float)
+    snippet = _SUM_BLOCK.replace("LENGTH", str(length)).replace("WARPS", str(warps))
+    snippet = snippet.replace("WIDTH", "16" if length <= 16 else "32")
+
+    @wp.func_native(snippet)
+    def sum_block(action: int, pair: int, numbers: Numbers, out_rows: wp.array[Numbers]): ...
+
+    return sum_block
