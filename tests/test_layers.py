@@ -27,6 +27,8 @@ RANKS = {
     "beam_warp.frame_store": 4,
     "beam_warp.converters": 5,
     "beam_warp.devices": 4,
+    "beam_warp.device_arrays": 5,
+    "beam_warp.depth_normals": 6,
     "beam_warp.packed_gaussians": 5,
     "beam_warp.morton_order": 5,
     "beam_warp.wide_trees": 6,
