@@ -29,7 +29,7 @@ class DepthNormals:
 
     Nothing is allocated, nothing waits for the device: calls may be captured in a CUDA graph.
 
-    Source: Zhang et al. 2024 (RaDe-GS), Section 3.3, for the differences; masks are ours.
+    Source: Zhang et al. 2024, RaDe-GS (normals of depth), for the differences; the masks are ours.
     """
 
     def __init__(
