@@ -45,10 +45,14 @@ def device_array(name: str, value: Any, shape: tuple[int, ...], device: Any) -> 
 def float_rows(array: wp.array) -> wp.array:
     """Return a view ``(N, K)`` of float32 of an array of N rows: floats, vectors, quaternions, ``(N, K)`` floats.
 
+    ``(N, K)`` floats may be strided, such as some columns of wider rows; others are contiguous.
+
     Raises:
         InvalidArrayError: It is not made of float32, or not contiguous.
     """
     scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    if scalar is wp.float32 and array.dtype is scalar and array.ndim == 2:
+        return array
     if scalar is not wp.float32 or not array.is_contiguous or array.ndim == 0:
         raise InvalidArrayError(
             f"array must hold contiguous rows of float32, got dtype {array.dtype.__name__}, shape {array.shape}, "
@@ -72,9 +76,10 @@ def pixel_channels(rows: wp.array, height: int, width: int, first: int, count: i
         InvalidArrayError: The rows are not as many as the pixels, or have fewer channels.
     """
     floats = float_rows(rows)
-    if floats.shape[0] != height * width or not 0 <= first <= first + count <= floats.shape[1]:
+    fits = floats.shape[0] == height * width and 0 <= first <= first + count <= floats.shape[1]
+    if not (fits and floats.is_contiguous):
         raise InvalidArrayError(
-            f"rows must be {height} x {width} with channels {first} to {first + count}, got {floats.shape}. "
-            "Pass one row per pixel."
+            f"rows must be {height} x {width}, contiguous, with channels {first} to {first + count}, got "
+            f"{floats.shape} with strides {floats.strides}. Pass one row per pixel."
         )
     return floats.reshape((height, width, floats.shape[1]))[:, :, first : first + count]

@@ -276,7 +276,7 @@ class TestTerms:
 class TestChannels:
     def test_refusals(self):
         rows = wp.zeros(12, dtype=wp.vec4, device="cpu")
-        with pytest.raises(InvalidArrayError, match="rows must be 3 x 4 with channels 2 to 5, got"):
+        with pytest.raises(InvalidArrayError, match="rows must be 3 x 4, contiguous, with channels 2 to 5, got"):
             pixel_channels(rows, 3, 4, 2, 3)
         with pytest.raises(InvalidArrayError, match="array must hold contiguous rows of float32, got dtype int32"):
             pixel_channels(wp.zeros(12, dtype=int, device="cpu"), 3, 4, 0, 1)

@@ -30,6 +30,7 @@ RANKS = {
     "beam_warp.device_arrays": 5,
     "beam_warp.depth_normals": 6,
     "beam_warp.image_losses": 6,
+    "beam_warp.adam": 6,
     "beam_warp.packed_gaussians": 5,
     "beam_warp.morton_order": 5,
     "beam_warp.wide_trees": 6,
