@@ -70,22 +70,22 @@ def move_parameters_kernel(
     while item >= groups[index].end:
         start = groups[index].end
         index += 1
-    group = groups[index]
-    width = group.parameters.shape[1]
+    width = groups[index].parameters.shape[1]
     row = (item - start) / width
     column = (item - start) % width
     correction = corrections[row]
     if correction[0] == 0.0:
         return
-    gradient = group.gradients[row, column]
-    mean = group.means[row, column]
-    square = group.squares[row, column]
+    # Members one by one: a group as a whole would be copied, ten times what is read here.
+    gradient = groups[index].gradients[row, column]
+    mean = groups[index].means[row, column]
+    square = groups[index].squares[row, column]
     mean += options.fresh1 * (gradient - mean)
     square += options.fresh2 * (gradient * gradient - square)
-    group.means[row, column] = mean
-    group.squares[row, column] = square
+    groups[index].means[row, column] = mean
+    groups[index].squares[row, column] = square
     step = mean * correction[0] / (wp.sqrt(square * correction[1]) + options.epsilon)
-    group.parameters[row, column] = group.parameters[row, column] - rates[index] * step
+    groups[index].parameters[row, column] = groups[index].parameters[row, column] - rates[index] * step
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ bright and smooth. So that neither costs digits, the image x is compared with it
 and moments are taken about the pixel in the middle of the strip (exact: the window's weights add up to one):
 
     1 - S = l + s - l s,   l = mean(d)^2 / L,   s = var(d) / D,
-    L = mean(x)^2 + mean(y)^2 + C1,   D = var(x) + var(y) + C2
+    L = mean(x)^2 + mean(y)^2 + C1,   D = var(x) + var(y) + C2 = 2 cov(x, y) + var(d) + C2
 
 (Wang et al. 2004, Eq. 13, with L - 2 mean(x) mean(y) - C1 = mean(d)^2, and likewise for the variances). The slope of S
 with respect to a pixel x of the window is, up to the window's weight there,
@@ -51,19 +51,14 @@ _SHARES = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)
 Window = wp.types.vector(length=2 * RADIUS + 1, dtype=float)
 WINDOW = wp.constant(Window(*[share / sum(_SHARES) for share in _SHARES]))
 
-Moments = wp.types.vector(length=5, dtype=float)  # of x, d, x^2, d^2, x d
-MomentWindows = wp.types.matrix(shape=(2 * RADIUS + 1, 5), dtype=float)
+MomentWindows = wp.types.matrix(shape=(2 * RADIUS + 1, 4), dtype=float)
 SlopeWindows = wp.types.matrix(shape=(2 * RADIUS + 1, 3), dtype=float)
 
 
 @wp.func
-def row_moments(image: wp.array3d[float], target: wp.array3d[float], y: int, x: int, c: int, about: wp.vec2) -> Moments:
-    """Moments about ``about`` under one row of the window at x; 0 is the value beyond the image."""
-    m_x = float(0.0)
-    m_d = float(0.0)
-    m_xx = float(0.0)
-    m_dd = float(0.0)
-    m_xd = float(0.0)
+def row_moments(image: wp.array3d[float], target: wp.array3d[float], y: int, x: int, c: int, about: wp.vec2) -> wp.vec4:
+    """Moments of x, d, x y and d^2 about ``about`` under one row of the window; 0 is the value beyond the image."""
+    moments = wp.vec4(0.0, 0.0, 0.0, 0.0)
     inside_rows = y >= 0 and y < image.shape[0]
     for k in range(11):
         p = -about[0]
@@ -73,13 +68,8 @@ def row_moments(image: wp.array3d[float], target: wp.array3d[float], y: int, x: 
             value = image[y, column, c]
             p += value
             q += value - target[y, column, c]
-        share = WINDOW[k]
-        m_x += share * p
-        m_d += share * q
-        m_xx += share * p * p
-        m_dd += share * q * q
-        m_xd += share * p * q
-    return Moments(m_x, m_d, m_xx, m_dd, m_xd)
+        moments += WINDOW[k] * wp.vec4(p, q, p * (p - q), q * q)
+    return moments
 
 
 @wp.struct
@@ -89,16 +79,15 @@ class Dissimilarity:
 
 
 @wp.func
-def dissimilarity(m: Moments, about: wp.vec2) -> Dissimilarity:
+def dissimilarity(m: wp.vec4, about: wp.vec2) -> Dissimilarity:
     """One minus the similarity of a window, from its moments about ``about``."""
     mean_x = m[0] + about[0]
     mean_d = m[1] + about[1]
     mean_y = mean_x - mean_d
-    var_x = m[2] - m[0] * m[0]
+    cov_xy = m[2] - m[0] * (m[0] - m[1])
     var_d = m[3] - m[1] * m[1]
-    cov_xd = m[4] - m[0] * m[1]
     light = mean_x * mean_x + mean_y * mean_y + LUMINANCE_FLOOR
-    contrast = 2.0 * (var_x - cov_xd) + var_d + CONTRAST_FLOOR
+    contrast = 2.0 * cov_xy + var_d + CONTRAST_FLOOR
     less_light = mean_d * mean_d / light
     less_shape = var_d / contrast
     result = Dissimilarity()

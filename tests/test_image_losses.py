@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import warp as wp
 from reference import image_losses as twin
+from reference.depth_normals import depth_normals, has_normal
 from skimage.metrics import structural_similarity
 
+from beam_warp.cameras import Camera
+from beam_warp.depth_normals import DepthNormals
 from beam_warp.device_arrays import pixel_channels
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image_losses import L1Loss, NormalLoss, SsimLoss
@@ -185,6 +188,23 @@ class TestNormal:
         assert relative_error(to_expected.numpy(), slope) <= 1e-6
         assert (to_rendered.numpy()[~counted] == 0.0).all()
         assert (to_expected.numpy()[~counted] == 0.0).all()
+
+    def test_through_depth(self, device, rng):
+        """Depth, its normals and the loss of them: one chain, against differences of the float64 chain."""
+        camera = Camera(12, 11, 30.0, 30.0, 6.0, 5.0, np.eye(4))
+        depth = (2.0 + 0.02 * rng.standard_normal((11, 12))).astype(np.float32)
+        rendered = (unit(rng, 11, 12) * 0.8).astype(np.float32).astype(float)
+        alpha, found = np.ones((11, 12)), has_normal(depth, np.ones((11, 12)), largest_jump=0.1)
+        assert found.sum() > 80
+        chain = DepthNormals(camera, largest_jump=0.1, device=device)
+        normals, to_normals, to_depth = (zeros(shape, device) for shape in ((11, 12, 3), (11, 12, 3), (11, 12)))
+        chain.write(depth, alpha, normals)
+        NormalLoss(11, 12, device=device)(rendered, normals, expected_gradient=to_normals)
+        chain.add_gradients(depth, alpha, to_normals, to_depth)
+        slope = twin.slope(
+            lambda moved: twin.normal(rendered, depth_normals(moved, camera, found), alpha), depth.astype(float), 1e-6
+        )
+        assert relative_error(to_depth.numpy(), slope) <= 1e-6
 
     @pytest.mark.parametrize("broken", [0.0, 5e-4, np.nan])
     def test_pixels_without_a_direction(self, device, broken):
