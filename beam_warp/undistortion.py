@@ -44,6 +44,12 @@ GRID = 129
 """Points along each side of the photograph at which the lens is inverted to find what it sees: between them its edges
 bow by less than 1e-4 of what they bow in all."""
 
+Coverage = NDArray[np.float32] | np.float32
+"""Alpha of a plane, or 1 where there is none."""
+
+COLORS = ("R", "G", "B", "Y")
+"""Channels of an image that are colour."""
+
 MAX_MAPS = 16
 """Maps kept, 8 bytes a pixel: records of a capture that were taken by as many cameras share them."""
 
@@ -132,8 +138,8 @@ class Lens:
         rays = require_array("points", points, (None, 2), np.float64)
         radius = np.hypot(rays[:, 0], rays[:, 1])
         if self.model == "OPENCV":
-            bent, jacobian = self._brown(rays)
-            inside = (radius <= self.limit) & (np.linalg.det(jacobian) > 0.0)
+            bent, j = self._brown(rays)
+            inside = (radius <= self.limit) & (j[:, 0, 0] * j[:, 1, 1] > j[:, 0, 1] * j[:, 1, 0])
         else:
             angle = np.arctan(radius)
             grown = np.divide(self._radial(angle)[0], radius, out=np.ones_like(radius), where=radius > 0.0)
@@ -191,16 +197,17 @@ class Lens:
         """Return where the polynomial has a value, up to `limit`."""
         low, high = np.zeros_like(target), np.full_like(target, self.limit)
         found = np.minimum(target, self.limit)
-        for _ in range(64):  # halving alone reaches rounding in 53
+        for _ in range(64):  # halving alone reaches rounding in 53 turns
             value, slope = self._radial(found)
             over = value > target
             low, high = np.where(over, low, found), np.where(over, found, high)
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = found - (value - target) / slope
             following = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-            if np.array_equal(following, found, equal_nan=True):
-                break
+            moved = np.abs(following - found).max(initial=0.0, where=following > 0.0)
             found = following
+            if not moved > np.finfo(float).eps * self.limit:
+                break
         return found
 
     def _brown(self, rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -217,7 +224,7 @@ class Lens:
             ],
             axis=-1,
         )
-        jacobian = np.empty((len(rays), 2, 2))
+        jacobian = np.empty((len(x), 2, 2))
         jacobian[:, 0, 0] = grown + twice * x * x + 2.0 * p1 * y + 6.0 * p2 * x
         jacobian[:, 1, 1] = grown + twice * y * y + 6.0 * p1 * y + 2.0 * p2 * x
         jacobian[:, 0, 1] = jacobian[:, 1, 0] = twice * x * y + 2.0 * p1 * x + 2.0 * p2 * y
@@ -326,25 +333,22 @@ class Undistortion:
             return image
         resampling = _resampling(self)
         channels: dict[str, NDArray[Any]] = {}
-        weight = np.ones((image.height, image.width), np.float32) if image.alpha is None else image.alpha
-        colors = [name for name in image.channels if name in ("R", "G", "B", "Y")]
-        light = _premultiplied(image.stack(*colors) if colors else weight[..., None][..., :0], weight, image)
-        resampled = resampling.sample(np.concatenate([light, weight[..., None]], axis=-1), _catmull_rom)
-        alpha = resampled[..., -1]
-        encoded = _encoded(resampled[..., :-1], alpha, image)
-        channels.update({name: encoded[..., i] for i, name in enumerate(colors)})
+        weight: Coverage = np.float32(1.0)
+        smooth = mean = resampling.mask.astype(np.float32)
         if image.alpha is not None:
-            channels["A"] = alpha
-        data = [name for name, array in image.channels.items() if name not in channels and array.dtype.kind == "f"]
-        if data:
-            products = np.concatenate([image.stack(*data) * weight[..., None], weight[..., None]], axis=-1)
-            products = resampling.sample(products, _linear)
-            means = _divided(products[..., :-1], products[..., -1])
-            channels.update({name: means[..., i] for i, name in enumerate(data)})
-        for name in image.channels.keys() - channels.keys():
-            channels[name] = resampling.nearest(image.channels[name])
-        ordered = {name: np.ascontiguousarray(channels[name]) for name in image.channels}
-        return replace(image, channels=ordered)
+            weight = image.alpha
+            smooth, mean = (resampling.sample(weight, filter_by) for filter_by in (_catmull_rom, _linear))
+        for name, plane in image.channels.items():
+            if name == "A":
+                channels[name] = smooth
+            elif name in COLORS:
+                light = resampling.sample(_premultiplied(plane, weight, image), _catmull_rom)
+                channels[name] = _encoded(light, smooth, image)
+            elif plane.dtype.kind == "f":
+                channels[name] = _divided(resampling.sample(plane * weight, _linear), mean)
+            else:
+                channels[name] = resampling.nearest(plane)
+        return replace(image, channels=channels)
 
 
 @lru_cache(maxsize=1024)
@@ -394,10 +398,8 @@ def _seen_rays(lens: Lens, photograph: Intrinsics) -> NDArray[np.float64]:
             "Correct the calibration, or crop the photograph."
         )
     edge = float(np.tan(MAX_ANGLE))
-    rays = np.where(lost[:, None], seen, rays)
-    reach = np.where(lost, np.inf, np.hypot(rays[:, 0], rays[:, 1]))
-    far = reach > edge
-    rays[far] *= (edge / np.hypot(rays[far, 0], rays[far, 1]))[:, None]
+    far = ~(np.hypot(rays[:, 0], rays[:, 1]) <= edge)
+    rays[far] = seen[far] * (edge / radius[far])[:, None]
     return rays.reshape(GRID, GRID, 2)
 
 
@@ -415,7 +417,7 @@ class _Resampling:
             self.samples = min(MAX_SAMPLES, int(np.ceil(coarsest - 0.5)))
             self.positions, inside = self._locate(undistortion)
         n = self.samples
-        self.mask = inside.reshape(shape[0], n, shape[1], n).all(axis=(1, 3))
+        self.mask: NDArray[np.bool_] = np.asarray(inside.reshape(shape[0], n, shape[1], n).all(axis=(1, 3)))
         self.positions[~np.isfinite(self.positions)] = 0.0
 
     def _locate(self, undistortion: Undistortion) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -434,35 +436,36 @@ class _Resampling:
             inside[start : start + rows] = within.reshape(len(y), len(x))
         return positions, inside
 
-    def sample(self, planes: NDArray[np.float32], weigh: Callable[..., list[Any]]) -> NDArray[np.float32]:
-        """Filter planes ``(H, W, C)``; the outermost pixels go on beyond the edge."""
-        height, width, count = planes.shape
-        padded = np.pad(planes.astype(np.float32, copy=False), ((2, 2), (2, 2), (0, 0)), mode="edge")
-        stride, flat = width + 4, padded.reshape(-1, count)
-        n = self.samples
-        result = np.empty((*self.mask.shape, count), np.float32)
-        rows = max(1, BLOCK_PIXELS // (n * n * self.mask.shape[1]))
-        for start in range(0, len(result), rows):
-            at = self.positions[n * start : n * (start + rows)].reshape(-1, 2) - np.float32(0.5)
-            corner = np.clip(np.floor(at), -1.0, (width - 1, height - 1)).astype(np.int64)
+    def sample(
+        self, plane: NDArray[np.float32], weigh: Callable[[NDArray[np.float32]], list[NDArray[Any]]]
+    ) -> NDArray[np.float32]:
+        """Filter a plane ``(H, W)``, whose outermost pixels go on beyond the edge; 0 outside the mask."""
+        rows, columns = plane.shape
+        padded = np.pad(plane.astype(np.float32, copy=False), 2, mode="edge")
+        n, (height, width) = self.samples, (self.mask.shape[0], self.mask.shape[1])
+        result = np.zeros((height, width), np.float32)
+        step = max(1, BLOCK_PIXELS // (n * n * width))
+        for start in range(0, height, step):
+            at = self.positions[n * start : n * (start + step)].reshape(-1, 2) - np.float32(0.5)
+            corner = np.clip(np.floor(at), -1.0, (columns - 1, rows - 1))
             part = (at - corner).astype(np.float32)
-            across, down = weigh(part[:, :1]), weigh(part[:, 1:])
-            lead = 2 - (len(across) - 2) // 2  # of the first tap, in the padded planes
-            index = (corner[:, 1] + lead) * stride + corner[:, 0] + lead
-            total = np.zeros((len(index), count), np.float32)
+            across, down = weigh(part[:, 0].copy()), weigh(part[:, 1].copy())
+            lead = 2 - (len(across) - 2) // 2  # of the first tap, in the padded plane
+            index = (corner[:, 1].astype(np.int64) + lead) * (columns + 4) + corner[:, 0].astype(np.int64) + lead
+            total = np.zeros(len(index), np.float32)
             low, high = np.full_like(total, np.inf), np.full_like(total, -np.inf)
             for j, row_weight in enumerate(down):
                 for i, weight in enumerate(across):
-                    tap = flat[index + (j * stride + i)]
+                    tap = padded.take(index + (j * (columns + 4) + i), mode="clip")
                     np.minimum(low, tap, out=low)
                     np.maximum(high, tap, out=high)
                     tap *= row_weight * weight
                     total += tap
             np.clip(total, low, high, out=total)
-            blocks = total.reshape(-1, n, self.mask.shape[1], n, count)
-            result[start : start + rows] = blocks[:, 0, :, 0] if n == 1 else blocks.mean(axis=(1, 3))
-        result[~self.mask] = 0.0
-        return result
+            result[start : start + step] = (
+                total.reshape(-1, n, width, n).mean(axis=(1, 3)) if n > 1 else (total.reshape(-1, width))
+            )
+        return np.where(self.mask, result, np.float32(0.0))
 
     def nearest(self, plane: NDArray[Any]) -> NDArray[Any]:
         """Return the pixel of ``(H, W)`` that each pixel's centre falls in."""
@@ -476,12 +479,12 @@ def _resampling(undistortion: Undistortion) -> _Resampling:
     return _Resampling(undistortion)
 
 
-def _linear(t: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def _linear(t: NDArray[np.float32]) -> list[NDArray[Any]]:
     """Return the weights of the two neighbours of a point at ``t`` between them."""
-    return [1.0 - t, t]
+    return [np.float32(1.0) - t, t]
 
 
-def _catmull_rom(t: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def _catmull_rom(t: NDArray[np.float32]) -> list[NDArray[Any]]:
     """Return the weights of the four neighbours of a point at ``t`` between the inner two; Keys 1981, a = -1/2."""
     return [
         t * (-0.5 + t * (1.0 - 0.5 * t)),
@@ -491,22 +494,22 @@ def _catmull_rom(t: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     ]
 
 
-def _divided(product: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+def _divided(product: NDArray[np.float32], weight: Coverage) -> NDArray[np.float32]:
     """Return a product over its weight, 0 where that is 0."""
-    return np.divide(product, weight[..., None], out=np.zeros_like(product), where=weight[..., None] > 0.0)
+    return np.divide(product, weight, out=np.zeros_like(product), where=weight > 0.0)
 
 
-def _premultiplied(color: NDArray[np.float32], alpha: NDArray[np.float32], image: Image) -> NDArray[np.float32]:
+def _premultiplied(color: NDArray[np.float32], alpha: Coverage, image: Image) -> NDArray[np.float32]:
     """Return an image's colour as scene-linear light multiplied by alpha."""
     if image.color_space == DISPLAY_SRGB:  # the curve applies to the colour, not to its product
         color = srgb_to_linear(_divided(color, alpha) if image.premultiplied else color)
-        return color * alpha[..., None]
-    return color if image.premultiplied else color * alpha[..., None]
+        return color * alpha
+    return color if image.premultiplied else color * alpha
 
 
 def _encoded(light: NDArray[np.float32], alpha: NDArray[np.float32], image: Image) -> NDArray[np.float32]:
     """Undo `_premultiplied`."""
     if image.color_space == DISPLAY_SRGB:
         straight = linear_to_srgb(_divided(light, alpha))
-        return straight * alpha[..., None] if image.premultiplied else straight
+        return straight * alpha if image.premultiplied else straight
     return light if image.premultiplied else _divided(light, alpha)

@@ -153,7 +153,7 @@ class TestFit:
     def test_all_of_the_photograph(self, lens):
         undistortion = Undistortion.fit(lens, PHOTOGRAPH, 1.0)
         pixels = undistortion.pinhole.to_pixels(lens.undistort(edges_and_inside(PHOTOGRAPH)))
-        # Of the bow of an edge between grid points, 1e-4 of at most the image's size is missed.
+        # Of the bow of an edge, between grid points, 1e-4 of at most the image's size is missed.
         assert pixels.min() > -0.02
         assert (pixels < np.array(PHOTOGRAPH[:2]) + 0.02).all()
         assert not undistortion.mask().all()
@@ -357,12 +357,12 @@ class TestImage:
         pinhole = undistortion.pinhole
         found, bowed = [], []
         for values, off in ((result, found), (photo, bowed)):
-            for row in range(4, 116):
+            for row in range(8, 112):  # the blur of the test goes wrong at the borders
                 low = np.flatnonzero((values[row, :-1] < 0.5) != (values[row, 1:] < 0.5))
                 crossing = low + 0.5 + (0.5 - values[row, low]) / (values[row, low + 1] - values[row, low])
                 height = (row + 0.5 - pinhole.center_y) / pinhole.focal_y
                 expected = pinhole.focal_x * (edges - height * np.sin(tilt)) / np.cos(tilt) + pinhole.center_x
-                inside = crossing[(crossing > 4) & (crossing < 156)]
+                inside = crossing[(crossing > 8) & (crossing < 152)]
                 off.extend(np.abs(inside[:, None] - expected).min(axis=1))
         assert len(found) > 500
         assert max(found) < 0.1
