@@ -176,14 +176,17 @@ class Lens:
         """The distorted radius at `limit`."""
         return float(self._radial(np.array(self.limit))[0])
 
-    def fault(self) -> tuple[str, float]:
-        """Return the coefficient, and its value, that has most of the blame for the first fold."""
-        if np.isfinite(self.fold):
+    def fault(self, radius: float) -> str:
+        """Say which coefficient has most of the blame that no ray is seen at a distorted radius."""
+        if radius > self.largest_radius:
             terms = [(2 * i + 1) * k * self.fold ** (2 * i) for i, k in enumerate(self.coefficients[:4], start=1)]
-            index = int(np.argmin(terms))
-        else:
-            index = 4 + int(np.argmax(np.abs(self.coefficients[4:])))
-        return COEFFICIENT_NAMES[index], self.coefficients[index]
+            index, turn = int(np.argmin(terms)), f"radii stop growing at {self.fold:.4g}"
+        else:  # the radius has an inverse, the image has none
+            index, turn = 4 + int(np.argmax(np.abs(self.coefficients[4:]))), "the image folds over"
+        return (
+            f"{COEFFICIENT_NAMES[index]} must let the lens be inverted over the whole photograph, "
+            f"got {self.coefficients[index]:g}, with which {turn}"
+        )
 
     def _radial(self, argument: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the polynomial a (1 + k1 a^2 + ...) and its derivative."""
@@ -390,12 +393,9 @@ def _seen_rays(lens: Lens, photograph: Intrinsics) -> NDArray[np.float64]:
     folded = lost & ((radius <= lens.largest_radius) | (lens.fold_angle <= MAX_ANGLE))
     if folded.any():
         first = int(np.flatnonzero(folded)[np.argmin(radius[folded])])
-        name, value = lens.fault()
-        turn = f"radii stop growing at {lens.fold:.4g}" if np.isfinite(lens.fold) else "the image folds over"
         raise InvalidOptionError(
-            f"{name} must let the lens be inverted over the whole photograph, got {value:g}, with which {turn}, at "
-            f"pixel ({pixels[first, 0]:.0f}, {pixels[first, 1]:.0f}), whose distorted radius is {radius[first]:.4g}. "
-            "Correct the calibration, or crop the photograph."
+            f"{lens.fault(float(radius[first]))}, at pixel ({pixels[first, 0]:.0f}, {pixels[first, 1]:.0f}), whose "
+            f"distorted radius is {radius[first]:.4g}. Correct the calibration, or crop the photograph."
         )
     edge = float(np.tan(MAX_ANGLE))
     far = ~(np.hypot(rays[:, 0], rays[:, 1]) <= edge)
@@ -459,11 +459,12 @@ class _Resampling:
                     tap = padded.take(index + (j * (columns + 4) + i), mode="clip")
                     np.minimum(low, tap, out=low)
                     np.maximum(high, tap, out=high)
-                    tap *= row_weight * weight
-                    total += tap
+                    with np.errstate(invalid="ignore"):  # infinity times no weight
+                        tap *= row_weight * weight
+                        total += tap
             np.clip(total, low, high, out=total)
             result[start : start + step] = (
-                total.reshape(-1, n, width, n).mean(axis=(1, 3)) if n > 1 else (total.reshape(-1, width))
+                total.reshape(-1, n, width, n).mean(axis=(1, 3)) if n > 1 else total.reshape(-1, width)
             )
         return np.where(self.mask, result, np.float32(0.0))
 

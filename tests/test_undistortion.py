@@ -178,6 +178,8 @@ class TestFit:
         assert f"radii stop growing at {fold:.4g}, at pixel (" in message
         with pytest.raises(InvalidOptionError, match=r"p1 must let .*, got -2, with which the image folds over"):
             Undistortion.fit(Lens((0, 0, 0, 0, -2.0, 0.1)), PHOTOGRAPH)
+        with pytest.raises(InvalidOptionError, match=r"p1 must let .*, got -2, with which the image folds over"):
+            Undistortion.fit(Lens((-0.1, 0, 0, 0, -2.0, 0.1)), PHOTOGRAPH)  # radii fold too, far outside
 
     def test_a_fisheye_of_half_the_world_is_cut_at_the_largest_angle(self):
         photograph = Intrinsics(200, 200, 60.0, 60.0, 100.0, 100.0)  # 95 degrees at the sides: behind a pinhole
@@ -311,10 +313,11 @@ class TestImage:
         undistortion = Undistortion.fit(BARREL, PHOTOGRAPH, 1.0)
         values = np.ones((120, 160))
         values[60, 80] = np.nan
+        values[30, 40] = np.inf
         result = undistortion.image(image_of({"R": values, "G": values, "B": values})).channels["R"]
         assert (result[~undistortion.mask()] == 0.0).all()
-        assert 1 <= np.isnan(result).sum() <= 25
-        assert (result[undistortion.mask() & ~np.isnan(result)] == 1.0).all()
+        assert 2 <= (~np.isfinite(result)).sum() <= 50
+        assert (result[undistortion.mask() & np.isfinite(result)] == 1.0).all()
 
     def test_what_is_made_smaller_is_averaged(self):
         # A board of single pixels, drawn at half its size: every pixel is a mean, none is black or white.
