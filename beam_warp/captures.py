@@ -1,8 +1,9 @@
 """A multi-view capture on disk: its cameras, frames and images, read lazily.
 
 Reads nerfstudio's ``transforms.json``: intrinsics for all records or for each one, and a camera-to-world pose in
-OpenGL axes (x right, y up, looking down -z), turned here into `Camera`'s OpenCV axes. What nerfstudio does not have
-and a performance needs is read from further fields of a record: ``time``, ``frame``, ``camera``, ``split``, and, for
+OpenGL axes (x right, y up, looking down -z), turned here into `Camera`'s OpenCV axes. Photographs that a lens has bent
+are undistorted as they are read, and their cameras are pinholes like all others. What nerfstudio does not have and a
+performance needs is read from further fields of a record: ``time``, ``frame``, ``camera``, ``split``, and, for
 measuring errors, ``truth`` and ``relit``.
 """
 
@@ -20,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.cameras import Camera
+from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.images import Image, read_image
+from beam_warp.undistortion import COEFFICIENT_NAMES, MAX_COEFFICIENT, Intrinsics, Lens, Undistortion
 
 FILE_NAME = "transforms.json"
 """The file that makes a folder a capture."""
@@ -35,11 +38,11 @@ MAX_RECORDS = 2**22
 MAX_FRAME = 10**9
 """Largest frame number."""
 
-DISTORTION_NAMES = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Coefficients of OpenCV's distortion model, in the order of `CaptureRecord.distortion`."""
-
-PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-"""Camera models of nerfstudio whose projection is a pinhole (and the distortion above)."""
+LENS_MODELS = {
+    **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
+    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+}
+"""Camera models of nerfstudio that are read, and what undistorts them: all but the last one are the same to it too."""
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -53,11 +56,11 @@ class CaptureRecord:
         frame: Which frame of the performance it shows, from 0.
         time: When it was taken [s].
         split: What it is for: ``train``, ``test``, ….
-        camera: Pose and intrinsics, without distortion.
-        distortion: Coefficients of OpenCV's model in the order of `DISTORTION_NAMES`; all 0 for a pinhole.
-        image_path: The image file.
+        camera: The pinhole that `image` was taken by.
+        image_path: The image file, as photographed.
         truth_path: An EXR of exact channels, where the capture is synthetic.
         relit_paths: By name of the light, the exact image under it.
+        undistortion: What straightens the files, all of them, as they are read; None where a pinhole took them.
     """
 
     camera_name: str
@@ -65,10 +68,10 @@ class CaptureRecord:
     time: float
     split: str
     camera: Camera
-    distortion: tuple[float, ...]
     image_path: Path
     truth_path: Path | None = None
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
+    undistortion: Undistortion | None = None
 
     @property
     def name(self) -> str:
@@ -77,11 +80,17 @@ class CaptureRecord:
 
     @property
     def is_distorted(self) -> bool:
-        """True if the image needs undistorting before a pinhole fits it."""
-        return any(self.distortion)
+        """True if the file must be undistorted before a pinhole fits it, as `image` does."""
+        return self.undistortion is not None
+
+    def mask(self) -> NDArray[np.bool_]:
+        """Return which pixels of `image` were photographed, ``(H, W)``: all unless `Capture.read` keeps more."""
+        if self.undistortion is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=bool)
+        return self.undistortion.mask()
 
     def image(self) -> Image:
-        """Read the image.
+        """Read the image, undistorted.
 
         Raises:
             MissingFileError: It is not there.
@@ -90,7 +99,7 @@ class CaptureRecord:
         return self._read(self.image_path)
 
     def truth(self) -> Image:
-        """Read the exact channels.
+        """Read the exact channels, undistorted like the image.
 
         Raises:
             MissingFileError: The record has none, or the file is not there.
@@ -107,7 +116,7 @@ class CaptureRecord:
                 f"image must be {self.camera.width} x {self.camera.height} as {FILE_NAME} says, "
                 f"got {image.width} x {image.height} at {path}. Correct w and h, or the image."
             )
-        return image
+        return image if self.undistortion is None else self.undistortion.image(image)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,7 +154,7 @@ class Capture:
         )
 
     @classmethod
-    def read(cls, folder: str | os.PathLike[str]) -> Capture:
+    def read(cls, folder: str | os.PathLike[str], *, keep: float = 0.0) -> Capture:
         """Read a capture; images stay on disk until they are asked for.
 
         Plain nerfstudio files have no frames or cameras: there, every record is of frame 0 at time 0, its camera is
@@ -153,11 +162,16 @@ class Capture:
 
         Args:
             folder: The folder that holds ``transforms.json``, or that file.
+            keep: Of photographs that a lens has bent: 0 for the part that fills an undistorted image, 1 for all of
+                it with void at the borders (see `CaptureRecord.mask`), or anything between.
 
         Raises:
             MissingFileError: There is no such file.
-            AssetFormatError: It is not JSON, or a field is missing or out of range; the message names the record.
+            AssetFormatError: It is not JSON, a field is missing or out of range, or a lens cannot be inverted over
+                its photograph; the message names the record.
+            InvalidOptionError: ``keep`` is out of range.
         """
+        require_number("keep", keep, 0.0, 1.0)
         path = Path(folder)
         path = path / FILE_NAME if path.is_dir() else path
         content = _read_json(path)
@@ -178,7 +192,7 @@ class Capture:
             where = f"{path}, frames[{index}]"
             if not isinstance(entry, dict):
                 raise AssetFormatError(f"record must be an object, got {_shown(entry)} at {where}. Write it as one.")
-            record = _record(_Fields({**_shared(content), **entry}, where), root, splits)
+            record = _record(_Fields({**_shared(content), **entry}, where), root, splits, keep)
             if record.name in seen:
                 raise AssetFormatError(
                     f"camera and frame must be another pair in each record, got {record.name} "
@@ -272,7 +286,7 @@ class _Fields:
         return default if value is None else value
 
 
-_SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *DISTORTION_NAMES, "camera_model")
+_SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "camera_model")
 
 
 def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -280,23 +294,29 @@ def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: content[name] for name in _SHARED_NAMES if name in content}
 
 
-def _record(fields: _Fields, root: Path, splits: Mapping[str, str]) -> CaptureRecord:
+def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float) -> CaptureRecord:
     """Read one record."""
     model = fields.text("camera_model", "OPENCV")
-    if model not in PINHOLE_MODELS:
-        raise fields.error("camera_model", f"one of {', '.join(PINHOLE_MODELS)}", model)
+    if model not in LENS_MODELS:
+        raise fields.error("camera_model", f"one of {', '.join(LENS_MODELS)}", model)
+    intrinsics = Intrinsics(
+        fields.integer("w", low=1, high=2**16),
+        fields.integer("h", low=1, high=2**16),
+        fields.number("fl_x", low=1e-3, high=1e9),
+        fields.number("fl_y", low=1e-3, high=1e9),
+        fields.number("cx", low=-1e9, high=1e9),
+        fields.number("cy", low=-1e9, high=1e9),
+    )
+    pose = fields.matrix("transform_matrix") @ _OPENGL_TO_OPENCV
+    coefficients = tuple(
+        fields.number(name, 0.0, low=-MAX_COEFFICIENT, high=MAX_COEFFICIENT) for name in COEFFICIENT_NAMES
+    )
     try:
-        camera = Camera(
-            fields.integer("w", low=1, high=2**16),
-            fields.integer("h", low=1, high=2**16),
-            fields.number("fl_x", low=1e-3, high=1e9),
-            fields.number("fl_y", low=1e-3, high=1e9),
-            fields.number("cx", low=-1e9, high=1e9),
-            fields.number("cy", low=-1e9, high=1e9),
-            fields.matrix("transform_matrix") @ _OPENGL_TO_OPENCV,
-        )
-    except AssetFormatError:
-        raise
+        undistortion = Undistortion.fit(Lens(coefficients, LENS_MODELS[model]), intrinsics, keep)
+    except BeamError as error:  # it has no inverse: say where
+        raise AssetFormatError(f"{model} has no pinhole at {fields.where}: {error}") from error
+    try:
+        camera = undistortion.camera(pose)
     except BeamError as error:  # the pose is not rigid: say where
         raise AssetFormatError(f"transform_matrix is no camera pose at {fields.where}: {error}") from error
     file_path = fields.text("file_path")
@@ -308,10 +328,10 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str]) -> CaptureRe
         time=fields.number("time", 0.0, low=-1e9, high=1e9),
         split=fields.text("split", splits.get(file_path, "train")),
         camera=camera,
-        distortion=tuple(fields.number(name, 0.0, low=-1e6, high=1e6) for name in DISTORTION_NAMES),
         image_path=root / file_path,
         truth_path=root / fields.text("truth") if fields.values.get("truth") is not None else None,
         relit_paths=fields.paths("relit", root),
+        undistortion=None if undistortion.lens.is_straight else undistortion,
     )
 
 

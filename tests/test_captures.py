@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from beam_warp.captures import Capture
-from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.images import write_exr
+from beam_warp.undistortion import Lens
 
 INTRINSICS = {"w": 8, "h": 6, "fl_x": 10.0, "fl_y": 11.0, "cx": 4.0, "cy": 3.0}
 
@@ -42,7 +43,7 @@ def test_pose_turns_from_opengl_to_opencv(tmp_path):
 
 def test_fields_of_a_performance(tmp_path):
     truth = {"truth": "truth/a_0004.exr", "relit": {"studio": "truth/studio/a_0004.exr"}}
-    own = {"fl_x": 20.0, "k1": 0.1, "p2": -0.2}
+    own = {"fl_x": 20.0, "k1": 0.1, "p2": -0.02}
     (tmp_path / "environment.exr").touch()
     write_capture(
         tmp_path,
@@ -57,9 +58,11 @@ def test_fields_of_a_performance(tmp_path):
     assert capture.frames_per_second == 24.0
     assert capture.environment_path == tmp_path / "environment.exr"
     assert (first.name, first.camera.focal_x, first.is_distorted, first.truth_path) == ("a_0000", 10.0, False, None)
-    assert (second.name, second.camera.focal_x, second.time, second.split) == ("a_0004", 20.0, 0.5, "test")
-    assert second.distortion == (0.1, 0, 0, 0, 0, -0.2)
+    assert (second.name, second.time, second.split) == ("a_0004", 0.5, "test")
     assert second.is_distorted
+    assert second.undistortion.lens == Lens((0.1, 0, 0, 0, 0, -0.02))
+    assert second.undistortion.photograph.focal_x == 20.0
+    assert second.camera.focal_x == second.undistortion.pinhole.focal_x
     assert second.truth_path == tmp_path / "truth/a_0004.exr"
     assert second.relit_paths == {"studio": tmp_path / "truth/studio/a_0004.exr"}
     assert capture.select(split="test") == (second,)
@@ -117,7 +120,14 @@ def test_images_are_read_when_asked_for(tmp_path):
         ({"relit": ["x"]}, "relit must be an object of file names"),
         ({"file_path": ".", "camera": None}, "camera must be a text, got"),
         ({"truth": 3}, "truth must be a text"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model must be one of OPENCV, PINHOLE, SIMPLE_PINHOLE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of OPENCV, PINHOLE, SIMPLE_PINHOLE"),
+        ({"k2": float("nan")}, r"k2 must be a number in \[-1e\+06, 1e\+06\], got nan"),
+        ({"k3": 1e300}, r"k3 must be a number in .*, got 1e\+300"),
+        (
+            {"k1": -20.0},
+            "OPENCV has no pinhole at .* k1 must let the lens be inverted .*got -20, .*at 0.1291, at pixel",
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1 and p2 must be 0 for OPENCV_FISHEYE"),
     ],
 )
 def test_a_broken_record_is_named(tmp_path, changes, message):
@@ -171,6 +181,40 @@ def test_missing_files(tmp_path):
     write_capture(tmp_path, [record()], environment="sky.exr")
     with pytest.raises(MissingFileError, match=r"environment must be a file, got .*sky\.exr"):
         Capture.read(tmp_path)
+
+
+def test_a_bent_photograph_is_read_undistorted(tmp_path):
+    (tmp_path / "images/a").mkdir(parents=True)
+    ramp = np.broadcast_to(np.arange(8, dtype=np.float32), (6, 8))
+    write_exr(tmp_path / "images/a/0000.exr", {"R": ramp, "G": ramp, "B": ramp, "depth": ramp})
+    write_capture(tmp_path, [record(truth="images/a/0000.exr")], k1=0.1, camera_model="RADIAL")
+    bent = Capture.read(tmp_path).records[0]
+    assert bent.mask().all()
+    image = bent.image()
+    np.testing.assert_array_equal(image.channels["R"], bent.truth().channels["R"])
+    # Pincushion: the corners of the photograph, pulled inwards, bound the image, whose focal length has grown.
+    assert bent.camera.focal_x > 10.0
+    assert bent.camera.focal_y / bent.camera.focal_x == pytest.approx(1.1, rel=1e-12)
+    # Along the middle row the photograph shows the tangent t at 4 + 10 t (1 + 0.1 r^2), in a ramp of slope 1.
+    x, y = (np.arange(8) + 0.5 - 4.0) / bent.camera.focal_x, -0.5 / bent.camera.focal_y
+    expected = 4.0 + 10.0 * x * (1.0 + 0.1 * (x * x + y * y)) - 0.5
+    np.testing.assert_allclose(image.channels["depth"][2, 1:-1], expected[1:-1], atol=8 * 2**-23)
+    whole = Capture.read(tmp_path, keep=1.0).records[0]
+    assert whole.camera.focal_x < bent.camera.focal_x
+    with pytest.raises(InvalidOptionError, match="keep must be a number in"):
+        Capture.read(tmp_path, keep=2.0)
+
+
+def test_straight_photographs_are_untouched(tmp_path):
+    (tmp_path / "images/a").mkdir(parents=True)
+    values = np.random.default_rng(0).normal(size=(6, 8)).astype(np.float32)
+    write_exr(tmp_path / "images/a/0000.exr", dict.fromkeys("RGBA", values))
+    write_capture(tmp_path, [record(k1=0.0, p2=0)])
+    straight = Capture.read(tmp_path, keep=1.0).records[0]
+    assert not straight.is_distorted
+    assert (straight.camera.focal_x, straight.camera.center_y) == (10.0, 3.0)
+    assert straight.mask().all()
+    np.testing.assert_array_equal(straight.image().channels["G"], values)
 
 
 def test_the_walker(data_dir):

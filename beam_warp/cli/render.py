@@ -17,7 +17,7 @@ from beam_warp import converters
 from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.axes import change_axes
 from beam_warp.cameras import MAX_SIDE, Camera, bulk
-from beam_warp.captures import Capture, CaptureRecord
+from beam_warp.captures import Capture
 from beam_warp.checks import require_count, require_range
 from beam_warp.cli.console import print_json, progress
 from beam_warp.environments import EnvironmentMap
@@ -197,8 +197,9 @@ def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list
             f"asset must have a frame that the records of split {args.split!r} show, got {frame_count} frames in "
             f"{args.asset}. Choose another split."
         )
-    for record in within:
-        _require_pinhole(record)
+    bent = sum(record.is_distorted for record in within)
+    if bent:
+        notes.append(f"{bent} records were photographed through a lens that bends lines: drawn as undistorted images")
     try:
         args.out.mkdir(exist_ok=True)
     except OSError as error:
@@ -206,15 +207,6 @@ def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list
             f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
         ) from error
     return [View(record.frame, record.camera, args.out / f"{record.name}.exr") for record in within]
-
-
-def _require_pinhole(record: CaptureRecord) -> None:
-    """Refuse to draw through a lens that bends lines: the picture would not lie over the photograph."""
-    if record.is_distorted:
-        raise InvalidOptionError(
-            f"camera must be free of distortion to be rendered, got {list(record.distortion)} at {record.name}. "
-            "Undistort the capture's images first."
-        )
 
 
 def _numbered_views(args: Render, sequence: GaussianSequence) -> list[View]:

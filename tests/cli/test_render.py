@@ -10,6 +10,7 @@ from tyro.conf import FlagCreatePairsOff
 from beam_warp import converters
 from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
+from beam_warp.captures import Capture
 from beam_warp.cli.console import run_command
 from beam_warp.cli.render import Render, render
 from beam_warp.images import linear_to_srgb, read_image, write_exr
@@ -215,6 +216,21 @@ def test_capture_gives_a_file_for_each_record(ball, white_light, tmp_path, capsy
     assert set(read_image(out / "a_0000.exr").channels) == set("RGBA")
 
 
+def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_light, tmp_path, capsys):
+    write_capture(tmp_path / "bent", [("b", 0, "test")], k1=0.1)
+    pinhole = Capture.read(tmp_path / "bent").records[0].camera
+    same = {"fl_x": pinhole.focal_x, "fl_y": pinhole.focal_y, "cx": pinhole.center_x, "cy": pinhole.center_y}
+    write_capture(tmp_path / "straight", [("b", 0, "test")], **same)
+    common = (ball, "--environment", white_light, "--out")
+    assert run(*common, tmp_path / "x", "--capture", tmp_path / "bent") == 0
+    assert "1 records were photographed through a lens that bends lines" in capsys.readouterr().err
+    assert run(*common, tmp_path / "y", "--capture", tmp_path / "straight") == 0
+    assert "lens" not in capsys.readouterr().err
+    bent, straight = (read_image(tmp_path / name / "b_0000.exr").channels for name in ("x", "y"))
+    for part in "RGBA":
+        np.testing.assert_array_equal(bent[part], straight[part])
+
+
 def test_the_capture_brings_its_light(ball, white_light, tmp_path):
     write_capture(tmp_path / "capture", [("b", 0, "test")])
     white_light.rename(tmp_path / "capture" / "environment.exr")
@@ -264,19 +280,16 @@ def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
 
 
 def test_capture_refusals(ball, white_light, tmp_path, capsys):
-    write_capture(tmp_path / "bent", [("b", 0, "test")], k1=0.1)
     write_capture(tmp_path / "late", [("b", 5, "test")])
     out = tmp_path / "out"
     common = [ball, "--environment", white_light, "--out", out]
-    assert run(*common, "--capture", tmp_path / "bent") == 2
-    assert "camera must be free of distortion to be rendered, got [0.1" in capsys.readouterr().err
     assert run(*common, "--capture", tmp_path / "late") == 2
     assert "asset must have a frame that the records of split 'test' show, got 1 frames" in capsys.readouterr().err
     assert run(*common, "--capture", tmp_path / "late", "--split", "val") == 2
     assert "split must name records of the capture, got 'val' (it has test)" in capsys.readouterr().err
     assert not out.exists()
     out.touch()
-    assert run(*common, "--capture", tmp_path / "bent") == 2
+    assert run(*common, "--capture", tmp_path / "late") == 2
     assert "out must be a folder with --capture, got the file" in capsys.readouterr().err
 
 

@@ -1,0 +1,253 @@
+"""The same splats drawn by gsplat 1.5.3, forwards and backwards: images to compare with, and seconds.
+
+    python benchmarks/gsplat_peer.py [--scene figure] [--count 140000] [--size 1920 1080] [--images images.npz]
+
+Needs torch for CUDA, ``pip install gsplat==1.5.3``, and nvcc: gsplat compiles its kernels when they are first used. It
+is run on 11 channels and depth (``RGB+ED``), which it pads to 16, with our low-pass and near plane. What differs:
+
+- It leaves out the splat that would bring the transmittance to 1e-4 or below, and stops; we draw that one, and stop
+  after it. A splat of alpha 0.98 is left out at a transmittance of up to 1e-4 / 0.02: so values differ by up to 0.005
+  of that splat's where the image is opaque, and its alpha stays below 0.9999.
+- Its alpha is capped at 0.999 and ours at 0.99. The scenes have no opacity above 0.98.
+- Its depth is that of splats' centres, ours that of their tangent planes: thin surfaces differ, by splats' sizes.
+- Tiles are 16 pixels wide, filled by boxes; exp is CUDA's fast one; backward adds floats in any order.
+- It draws neither median depth nor the identity of what is seen; ours include them.
+
+It cannot run as a CUDA graph: its forward reads the number of (tile, splat) pairs back, to size what follows
+(``item()`` in ``Intersect.cpp``), which waits for the device and which stream capture refuses. Its seconds here are
+therefore what a training loop pays, with launches and that wait, whether the host's clock or events take them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import raster_scenes
+from numpy.typing import NDArray
+
+from beam_warp.assets import GaussianCloud
+from beam_warp.cameras import Camera
+
+VERSION = "1.5.3"
+LOW_PASS = 0.3
+NEAR = 0.01
+LEAVES = ("means", "quats", "scales", "opacities", "colors")
+"""Arguments of gsplat that gradients are asked for."""
+
+
+class GsplatUnavailableError(RuntimeError):
+    """There is no gsplat of this version, or no torch with a CUDA device."""
+
+
+class Images(NamedTuple):
+    """Sums of values ``(H, W, K)``, mean depth ``(H, W)`` [m], 0 where nothing is seen, and alpha ``(H, W)``."""
+
+    values: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+
+
+class Seconds(NamedTuple):
+    """Seconds of each repeat, by the host's clock from idle to idle, and between events on the device."""
+
+    wall: NDArray[np.float64]
+    device: NDArray[np.float64]
+
+    def summary(self) -> dict[str, float]:
+        """Return medians and the fastest repeat."""
+        return {
+            "wall_median": float(np.median(self.wall)),
+            "wall_fastest": float(self.wall.min()),
+            "device_median": float(np.median(self.device)),
+            "device_fastest": float(self.device.min()),
+        }
+
+
+def arguments(cloud: GaussianCloud, camera: Camera, values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    """Return gsplat's arrays by its names: quaternions wxyz, world to camera and K with OpenCV's axes, as ours are."""
+    intrinsics = [
+        [camera.focal_x, 0.0, camera.center_x],
+        [0.0, camera.focal_y, camera.center_y],
+        [0.0, 0.0, 1.0],
+    ]
+    arrays = {
+        "means": cloud.positions,
+        "quats": cloud.orientations[:, [3, 0, 1, 2]],
+        "scales": cloud.scales,
+        "opacities": cloud.opacities,
+        "colors": values,
+        "viewmats": camera.world_to_camera[None],
+        "Ks": np.array([intrinsics]),
+    }
+    return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+
+
+class GsplatPeer:
+    """A cloud and a camera on a CUDA device, drawn by gsplat.
+
+    Args:
+        cloud: What is drawn.
+        camera: From where.
+        values: What is composited, ``(N, K)``.
+        device: Torch's name of the device.
+        packed: gsplat's layout: False keeps every splat and is faster where most are seen.
+
+    Raises:
+        GsplatUnavailableError: See there.
+    """
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        camera: Camera,
+        values: NDArray[np.float32],
+        *,
+        device: str = "cuda:0",
+        packed: bool = False,
+    ) -> None:
+        try:
+            self.torch: Any = importlib.import_module("torch")
+            gsplat: Any = importlib.import_module("gsplat")
+        except ImportError as error:
+            raise GsplatUnavailableError(f"torch and gsplat must be importable, got {error}.") from error
+        if gsplat.__version__ != VERSION:
+            raise GsplatUnavailableError(f"gsplat must be {VERSION}, got {gsplat.__version__}.")
+        if not self.torch.cuda.is_available():
+            raise GsplatUnavailableError("torch must see a CUDA device, got none.")
+        self.device = self.torch.device(device)
+        self.tensors = {
+            name: self.torch.tensor(array, device=self.device)
+            for name, array in arguments(cloud, camera, values).items()
+        }
+        self._rasterization = gsplat.rasterization
+        self._options = {
+            "width": camera.width,
+            "height": camera.height,
+            "near_plane": NEAR,
+            "eps2d": LOW_PASS,
+            "packed": packed,
+            "render_mode": "RGB+ED",
+            "rasterize_mode": "classic",
+        }
+
+    def draw(self) -> Images:
+        """Draw once."""
+        with self.torch.no_grad():
+            rendered, alpha, _ = self._draw(self.tensors)
+        rendered, alpha = rendered[0].cpu().numpy(), alpha[0, ..., 0].cpu().numpy()
+        return Images(rendered[..., :-1], rendered[..., -1], alpha)
+
+    def pair_count(self) -> int:
+        """Return how many (tile, splat) pairs are composited."""
+        with self.torch.no_grad():
+            return len(self._draw(self.tensors)[2]["flatten_ids"])
+
+    def time_forward(self, repeats: int = 50, warm_up: int = 10) -> Seconds:
+        """Time drawing without gradients."""
+
+        def forward() -> None:
+            with self.torch.no_grad():
+                self._draw(self.tensors)
+
+        return self._timed(forward, repeats, warm_up)
+
+    def time_training(self, repeats: int = 50, warm_up: int = 10, seed: int = 0) -> Seconds:
+        """Time drawing and the way back, from random gradients of all images to those of `LEAVES`."""
+        leaves, step = self._training(seed)
+
+        def forward_and_backward() -> None:
+            for leaf in leaves.values():
+                leaf.grad = None
+            step()
+
+        return self._timed(forward_and_backward, repeats, warm_up)
+
+    def gradients(self, seed: int = 0) -> dict[str, NDArray[np.float32]]:
+        """Return the gradients of `LEAVES`, in gsplat's conventions, under the images' gradients of `time_training`."""
+        leaves, step = self._training(seed)
+        step()
+        return {name: leaf.grad.cpu().numpy() for name, leaf in leaves.items()}
+
+    def _training(self, seed: int) -> tuple[dict[str, Any], Callable[[], None]]:
+        """Return tensors that ask for gradients, and what draws and adds to them."""
+        leaves = {name: self.tensors[name].clone().requires_grad_() for name in LEAVES}
+        tensors = {**self.tensors, **leaves}
+        generator = self.torch.Generator(device=self.device).manual_seed(seed)
+        shape = (1, self._options["height"], self._options["width"])
+        channels = self.tensors["colors"].shape[1] + 1
+        upstream = [
+            self.torch.randn((*shape, count), generator=generator, device=self.device) for count in (channels, 1)
+        ]
+
+        def step() -> None:
+            rendered, alpha, _ = self._draw(tensors)
+            self.torch.autograd.backward([rendered, alpha], upstream)
+
+        return leaves, step
+
+    def _draw(self, tensors: dict[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+        """Return channels and depth ``(1, H, W, K + 1)``, alpha ``(1, H, W, 1)``, and what gsplat says of itself."""
+        with self.torch.cuda.device(self.device):
+            return self._rasterization(**tensors, **self._options)
+
+    def _timed(self, work: Callable[[], None], repeats: int, warm_up: int) -> Seconds:
+        """Time work that has been done before, so that kernels are compiled and memory is reserved."""
+        cuda = self.torch.cuda
+        with cuda.device(self.device):
+            for _ in range(warm_up):
+                work()
+            wall, device = [], []
+            for _ in range(repeats):
+                begin, end = cuda.Event(enable_timing=True), cuda.Event(enable_timing=True)
+                cuda.synchronize(self.device)
+                started = time.perf_counter()
+                begin.record()
+                work()
+                end.record()
+                cuda.synchronize(self.device)
+                wall.append(time.perf_counter() - started)
+                device.append(1e-3 * begin.elapsed_time(end))
+        return Seconds(np.array(wall), np.array(device))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", choices=("figure", "cube"), default="figure")
+    parser.add_argument("--count", type=int, default=140_000)
+    parser.add_argument("--size", type=int, nargs=2, default=(1920, 1080), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--packed", action="store_true")
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--images", type=Path, help="Where to save what was drawn.")
+    args = parser.parse_args()
+    scene: raster_scenes.RasterScene = getattr(raster_scenes, args.scene)(args.count, *args.size)
+    peer = GsplatPeer(scene.cloud, scene.camera, scene.values(), device=args.device, packed=args.packed)
+    images = peer.draw()
+    if args.images is not None:
+        np.savez(args.images, **images._asdict())
+    found = {
+        "gsplat": VERSION,
+        "torch": peer.torch.__version__,
+        "device": peer.torch.cuda.get_device_name(peer.device),
+        "scene": scene.name,
+        "splats": len(scene.cloud),
+        "size": list(args.size),
+        "packed": args.packed,
+        "pairs": peer.pair_count(),
+        "coverage": float((images.alpha > 0.5).mean()),
+        "forward_seconds": peer.time_forward(args.repeats).summary(),
+        "training_seconds": peer.time_training(args.repeats).summary(),
+        "memory_mib": round(peer.torch.cuda.max_memory_allocated(peer.device) / 2**20),
+    }
+    print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
