@@ -18,7 +18,14 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.composite import Images, channel_vector
-from beam_warp.kernels.splat_rows import SMALLEST_FACING, bend_at, facing_at
+from beam_warp.kernels.splat_rows import (
+    ALPHA_CAP,
+    SMALLEST_FACING,
+    bend_at,
+    depth_function,
+    facing_at,
+    quick_divide,
+)
 
 MOMENTS = wp.constant(11)
 """Moments before the channels."""
@@ -40,88 +47,100 @@ def pair_vector(channel_count: int, exact: bool):
 
 @wp.struct
 class Adjoints:
-    """Derivatives of a loss with respect to the images; an array of length 0 stands for zeros."""
+    """Derivatives of a loss with respect to the images; arrays of length 0 stand for zeros."""
 
     alpha: wp.array[float]
     depth: wp.array[float]
     median_depth: wp.array[float]
 
 
-@wp.struct
-class PixelAdjoint:
-    """Derivatives with respect to the sums at one pixel."""
-
-    alpha: float
-    depth: float  # to the weighted sum, not the mean
-    median_depth: float
-
-
-@wp.struct
-class DepthAdjoint:
-    """Derivatives with respect to what a splat's depth at a pixel is made of."""
-
-    depth: float
-    reach: float
-    facing: float
-    bend: float
-
-
 @wp.func
-def pixel_adjoint(images: Images, adjoints: Adjoints, pixel: int) -> PixelAdjoint:
-    """Take the derivative to the mean depth apart into those to its numerator and denominator."""
-    found = PixelAdjoint()
+def pixel_adjoint(images: Images, adjoints: Adjoints, pixel: int) -> wp.vec3:
+    """Derivatives to the sums of weights and of weighted depths, not their quotient, and to the median depth."""
+    found = wp.vec3(0.0, 0.0, 0.0)
     if adjoints.alpha.shape[0] > 0:
-        found.alpha = adjoints.alpha[pixel]
-    if adjoints.median_depth.shape[0] > 0:
-        found.median_depth = adjoints.median_depth[pixel]
-    weight_sum = images.alpha[pixel]
-    if adjoints.depth.shape[0] > 0 and weight_sum > 0.0:
-        found.depth = adjoints.depth[pixel] / weight_sum
-        found.alpha -= found.depth * images.depth[pixel]
+        found[0] = adjoints.alpha[pixel]
+        weight_sum = images.alpha[pixel]
+        if weight_sum > 0.0:
+            to_sum = adjoints.depth[pixel] / weight_sum
+            found[0] = found[0] - to_sum * images.depth[pixel]
+            found[1] = to_sum
+        found[2] = adjoints.median_depth[pixel]
     return found
 
 
 @cache
 def depth_adjoint_function(exact: bool):
-    """Return the function that takes the derivative ``v`` to a splat's depth ``z`` at a pixel apart."""
+    """Return the function that takes the derivative ``v`` to a splat's depth ``z`` at a pixel apart.
+
+    It gives those to the centre's depth, the reach, the factor l and the form e. It has no branches: in a kernel each
+    would cost a selection for every variable that it changes.
+    """
 
     @wp.func
     def depth_adjoint(
         center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2, z: float, v: float
-    ) -> DepthAdjoint:
-        found = DepthAdjoint()
-        if z >= center[3] + shape[3]:
-            found.depth = v
-            found.reach = v
-        elif z > wp.max(center[3] - shape[3], near):
-            found.depth = v * z / center[3]
-            found.facing = -found.depth * z
-            if wp.static(exact):
-                raw = facing_at(slope, offset)
-                facing = wp.max(raw, SMALLEST_FACING)
-                found.bend = found.facing / facing
-                found.facing *= 1.0 - bend_at(slope, bend, offset) / (facing * facing)
-                if raw < SMALLEST_FACING:
-                    found.facing = 0.0
-        elif center[3] - shape[3] > near:
-            found.depth = v
-            found.reach = -v
-        return found
+    ) -> wp.vec4:
+        least = center[3] - shape[3]
+        beyond = z >= center[3] + shape[3]
+        before = (not beyond) and z <= wp.max(least, near)
+        clamped = beyond or before
+        held = before and least <= near  # by the near plane, which nothing moves
+        slide = quick_divide(v * z, center[3])
+        to_z = wp.where(clamped, wp.where(held, 0.0, v), slide)
+        to_reach = wp.where(clamped, wp.where(beyond, v, wp.where(held, 0.0, -v)), 0.0)
+        to_facing = wp.where(clamped, 0.0, -slide * z)
+        to_bend = float(0.0)
+        if wp.static(exact):
+            raw = facing_at(slope, offset)
+            facing = wp.max(raw, SMALLEST_FACING)
+            to_bend = quick_divide(to_facing, facing)
+            to_facing -= quick_divide(to_bend * bend_at(slope, bend, offset), facing)
+            to_facing = wp.where(raw < SMALLEST_FACING, 0.0, to_facing)
+        return wp.vec4(to_z, to_reach, to_facing, to_bend)
 
     return depth_adjoint
 
 
 @cache
-def add_moments_function(channel_count: int, exact: bool):
-    """Return the function that adds one pixel's part to a pair's moments and channels."""
+def add_pixel_function(channel_count: int, exact: bool):
+    """Return the function that adds one pixel's part to a pair's moments and channels.
+
+    It takes the pixel's state, what passes before the splats still to come and the sum R of those behind them, and
+    gives both as they are in front of this splat. A splat that the pixel does not see has an alpha of 0.
+    """
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
-    bend = MOMENTS + channel_count
+    depth_at = depth_function(exact)
+    depth_adjoint = depth_adjoint_function(exact)
+    bend_start = MOMENTS + channel_count
 
     @wp.func
-    def add_moments(
-        total: Pair, e: wp.vec2, d: float, depth: DepthAdjoint, weight: float, to_channels: Channels
-    ) -> Pair:
+    def add_pixel(
+        total: Pair,
+        transmittance: float,
+        behind: float,
+        alpha: float,
+        is_median: bool,
+        adjoint: wp.vec3,
+        to_channels: Channels,
+        center: wp.vec4,
+        shape: wp.vec4,
+        slope: wp.vec4,
+        bend: float,
+        near: float,
+        offset: wp.vec2,
+        e: wp.vec2,
+        row: Channels,
+    ):
+        open_share = 1.0 - alpha
+        before = quick_divide(transmittance, open_share)
+        weight = alpha * before
+        z = depth_at(center, shape, slope, bend, near, offset)
+        s = wp.dot(row, to_channels) + z * adjoint[1] + adjoint[0]
+        d = wp.where(alpha < ALPHA_CAP, alpha * (before * s - quick_divide(behind, open_share)), 0.0)
+        to_depth = weight * adjoint[1] + wp.where(is_median, adjoint[2], 0.0)
+        depth = depth_adjoint(center, shape, slope, bend, near, offset, z, to_depth)
         d0 = d * e[0]
         d1 = d * e[1]
         total[0] = total[0] + d
@@ -130,21 +149,21 @@ def add_moments_function(channel_count: int, exact: bool):
         total[3] = total[3] + d0 * e[0]
         total[4] = total[4] + d0 * e[1]
         total[5] = total[5] + d1 * e[1]
-        total[6] = total[6] + depth.depth
-        total[7] = total[7] + depth.reach
-        total[8] = total[8] + depth.facing
-        total[9] = total[9] + depth.facing * e[0]
-        total[10] = total[10] + depth.facing * e[1]
+        total[6] = total[6] + depth[0]
+        total[7] = total[7] + depth[1]
+        total[8] = total[8] + depth[2]
+        total[9] = total[9] + depth[2] * e[0]
+        total[10] = total[10] + depth[2] * e[1]
         for i in range(wp.static(channel_count)):
             total[wp.static(MOMENTS) + i] = total[wp.static(MOMENTS) + i] + weight * to_channels[i]
         if wp.static(exact):
-            b0 = depth.bend * e[0]
-            b1 = depth.bend * e[1]
-            total[wp.static(bend)] = total[wp.static(bend)] + b0
-            total[wp.static(bend + 1)] = total[wp.static(bend + 1)] + b1
-            total[wp.static(bend + 2)] = total[wp.static(bend + 2)] + b0 * e[0]
-            total[wp.static(bend + 3)] = total[wp.static(bend + 3)] + b0 * e[1]
-            total[wp.static(bend + 4)] = total[wp.static(bend + 4)] + b1 * e[1]
-        return total
+            b0 = depth[3] * e[0]
+            b1 = depth[3] * e[1]
+            total[wp.static(bend_start)] = total[wp.static(bend_start)] + b0
+            total[wp.static(bend_start + 1)] = total[wp.static(bend_start + 1)] + b1
+            total[wp.static(bend_start + 2)] = total[wp.static(bend_start + 2)] + b0 * e[0]
+            total[wp.static(bend_start + 3)] = total[wp.static(bend_start + 3)] + b0 * e[1]
+            total[wp.static(bend_start + 4)] = total[wp.static(bend_start + 4)] + b1 * e[1]
+        return total, before, behind + weight * s
 
-    return add_moments
+    return add_pixel

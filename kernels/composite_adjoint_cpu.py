@@ -7,16 +7,14 @@ import warp as wp
 from beam_warp.kernels.composite import Frame, Images, channel_vector
 from beam_warp.kernels.composite_adjoint import (
     Adjoints,
-    DepthAdjoint,
-    add_moments_function,
-    depth_adjoint_function,
+    add_pixel_function,
     pair_vector,
     pixel_adjoint,
 )
 from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
-from beam_warp.kernels.splat_rows import ALPHA_CAP, alpha_of, depth_function, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
 
 
 @cache
@@ -24,9 +22,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
     """Return the kernel that writes the moments and channels of every pair, one tile an item."""
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
-    depth_at = depth_function(exact)
-    depth_adjoint = depth_adjoint_function(exact)
-    add_moments = add_moments_function(channel_count, exact)
+    add_pixel = add_pixel_function(channel_count, exact)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_adjoint_kernel(
@@ -72,25 +68,24 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                     log_alpha = log_alpha_of(center, e)
                     if k < images.ends[pixel] and log_alpha >= -LOG_CUT:
                         state = out_states[pixel]
-                        alpha = alpha_of(log_alpha)
-                        open_share = 1.0 - alpha
-                        transmittance = state[0] / open_share
-                        weight = alpha * transmittance
-                        adjoint = pixel_adjoint(images, adjoints, pixel)
-                        to_channels = channel_adjoints[pixel]
-                        z = depth_at(center, shape, slope, bend, frame.near, offset)
-                        s = wp.dot(row, to_channels) + z * adjoint.depth + adjoint.alpha
-                        d = float(0.0)
-                        if alpha < ALPHA_CAP:
-                            d = alpha * (transmittance * s - state[1] / open_share)
-                        to_depth = weight * adjoint.depth
-                        if k == images.medians[pixel]:
-                            to_depth += adjoint.median_depth
-                        taken = DepthAdjoint()
-                        if to_depth != 0.0:
-                            taken = depth_adjoint(center, shape, slope, bend, frame.near, offset, z, to_depth)
-                        total = add_moments(total, e, d, taken, weight, to_channels)
-                        out_states[pixel] = wp.vec2(transmittance, state[1] + weight * s)
+                        total, before, behind = add_pixel(
+                            total,
+                            state[0],
+                            state[1],
+                            alpha_of(log_alpha),
+                            k == images.medians[pixel],
+                            pixel_adjoint(images, adjoints, pixel),
+                            channel_adjoints[pixel],
+                            center,
+                            shape,
+                            slope,
+                            bend,
+                            frame.near,
+                            offset,
+                            e,
+                            row,
+                        )
+                        out_states[pixel] = wp.vec2(before, behind)
             out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel

@@ -10,13 +10,10 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.bin_tiles import SIDE
-from beam_warp.kernels.composite import Frame, Images, PixelPlace, channel_vector, pixel_place
+from beam_warp.kernels.composite import Frame, Images, channel_vector, pixel_place
 from beam_warp.kernels.composite_adjoint import (
     Adjoints,
-    DepthAdjoint,
-    PixelAdjoint,
-    add_moments_function,
-    depth_adjoint_function,
+    add_pixel_function,
     pair_length,
     pair_vector,
     pixel_adjoint,
@@ -38,15 +35,7 @@ from beam_warp.kernels.lanes import (
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
 from beam_warp.kernels.row_loads import load_row
-from beam_warp.kernels.splat_rows import (
-    ALPHA_CAP,
-    alpha_of,
-    depth_function,
-    log_alpha_of,
-    offset_from,
-    quick_divide,
-    whiten,
-)
+from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
 
 PART = wp.constant(8)
 """Side of the pixels of a warp."""
@@ -57,83 +46,15 @@ WARPS = 4
 THREADS = wp.constant(32 * WARPS)
 
 
-@wp.struct
-class TracedPixel:
-    """A pixel of a lane: what is known of it, and its state between two splats."""
-
-    index: int
-    position: wp.vec2
-    end: int
-    median: int
-    adjoint: PixelAdjoint
-    transmittance: float  # before the splats still to come
-    behind: float  # the sum R of those that have been
-
-
-@wp.func
-def begin_pixel(images: Images, adjoints: Adjoints, place: PixelPlace) -> TracedPixel:
-    """State of a pixel before the last splat."""
-    pixel = TracedPixel()
-    pixel.index = place.index
-    pixel.position = place.position
-    pixel.end = -1
-    pixel.median = -1
-    pixel.behind = 0.0
-    if place.index >= 0:
-        pixel.end = images.ends[place.index]
-        pixel.median = images.medians[place.index]
-        pixel.adjoint = pixel_adjoint(images, adjoints, place.index)
-        pixel.transmittance = images.transmittance[place.index]
-    return pixel
-
-
 @cache
 def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     """Return the kernel that writes the moments and channels of every pair, a block a tile."""
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
-    depth_at = depth_function(exact)
-    depth_adjoint = depth_adjoint_function(exact)
-    add_moments = add_moments_function(channel_count, exact)
+    add_pixel = add_pixel_function(channel_count, exact)
     share_row = share_row_function(4 if exact else 3, 1)
     share_channels = share_channels_function(Channels, 1)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
-
-    @wp.func
-    def add_pixel(
-        total: Pair,
-        pixel: TracedPixel,
-        to_channels: Channels,
-        near: float,
-        k: int,
-        center: wp.vec4,
-        shape: wp.vec4,
-        slope: wp.vec4,
-        bend: float,
-        offset: wp.vec2,
-        e: wp.vec2,
-        log_alpha: float,
-        row: Channels,
-    ):
-        alpha = alpha_of(log_alpha)
-        open_share = 1.0 - alpha
-        transmittance = quick_divide(pixel.transmittance, open_share)
-        weight = alpha * transmittance
-        z = depth_at(center, shape, slope, bend, near, offset)
-        s = wp.dot(row, to_channels) + z * pixel.adjoint.depth + pixel.adjoint.alpha
-        d = float(0.0)
-        if alpha < ALPHA_CAP:
-            d = alpha * (transmittance * s - quick_divide(pixel.behind, open_share))
-        to_depth = weight * pixel.adjoint.depth
-        if k == pixel.median:
-            to_depth += pixel.adjoint.median_depth
-        taken = DepthAdjoint()
-        if to_depth != 0.0:
-            taken = depth_adjoint(center, shape, slope, bend, near, offset, z, to_depth)
-        total = add_moments(total, e, d, taken, weight, to_channels)
-        pixel.transmittance = transmittance
-        pixel.behind += weight * s
-        return total, pixel
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_blocks_adjoint_kernel(
@@ -156,15 +77,33 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         corner = (part / 2) * PART * SIDE + (part % 2) * PART
         box = pixel_place(view, tile, corner)
         own = corner + (lane / PART) * SIDE + lane % PART
-        upper = begin_pixel(images, adjoints, pixel_place(view, tile, own))
-        lower = begin_pixel(images, adjoints, pixel_place(view, tile, own + SIDE * PART / 2))
+        upper = pixel_place(view, tile, own)
+        lower = pixel_place(view, tile, own + SIDE * PART / 2)
+        upper_end = int(-1)
+        lower_end = int(-1)
+        upper_median = int(-1)
+        lower_median = int(-1)
+        upper_adjoint = wp.vec3(0.0, 0.0, 0.0)
+        lower_adjoint = wp.vec3(0.0, 0.0, 0.0)
         to_upper = Channels()
         to_lower = Channels()
+        upper_transmittance = float(0.0)
+        lower_transmittance = float(0.0)
+        upper_behind = float(0.0)
+        lower_behind = float(0.0)
         if upper.index >= 0:
+            upper_end = images.ends[upper.index]
+            upper_median = images.medians[upper.index]
+            upper_adjoint = pixel_adjoint(images, adjoints, upper.index)
             to_upper = channel_adjoints[upper.index]
+            upper_transmittance = images.transmittance[upper.index]
         if lower.index >= 0:
+            lower_end = images.ends[lower.index]
+            lower_median = images.medians[lower.index]
+            lower_adjoint = pixel_adjoint(images, adjoints, lower.index)
             to_lower = channel_adjoints[lower.index]
-        own_end = greatest_of_lanes(wp.max(upper.end, lower.end))
+            lower_transmittance = images.transmittance[lower.index]
+        own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
         end = greatest_of_block(own_end)
         for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
             out_pairs[frame.lists.slots[k]] = Pair()
@@ -209,48 +148,51 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 lower_e = whiten(shape, lower_offset)
                 upper_log_alpha = log_alpha_of(center, upper_e)
                 lower_log_alpha = log_alpha_of(center, lower_e)
-                in_upper = k < upper.end and upper_log_alpha >= -LOG_CUT
-                in_lower = k < lower.end and lower_log_alpha >= -LOG_CUT
-                if ballot(wp.where(in_upper or in_lower, 1, 0)) != 0:
-                    total = Pair()
-                    slope = share_row(0, SLOPE, i, wp.vec4())
-                    bend = float(0.0)
-                    if wp.static(exact):
-                        bend = share_row(0, BEND, i, wp.vec4())[0]
-                    row = share_channels(0, i, channels, 0)
-                    if in_upper:
-                        total, upper = add_pixel(
-                            total,
-                            upper,
-                            to_upper,
-                            frame.near,
-                            k,
-                            center,
-                            shape,
-                            slope,
-                            bend,
-                            upper_offset,
-                            upper_e,
-                            upper_log_alpha,
-                            row,
-                        )
-                    if in_lower:
-                        total, lower = add_pixel(
-                            total,
-                            lower,
-                            to_lower,
-                            frame.near,
-                            k,
-                            center,
-                            shape,
-                            slope,
-                            bend,
-                            lower_offset,
-                            lower_e,
-                            lower_log_alpha,
-                            row,
-                        )
-                    sum_block(ADD_TO_SUMS, i, total, out_pairs)
+                in_upper = k < upper_end and upper_log_alpha >= -LOG_CUT
+                in_lower = k < lower_end and lower_log_alpha >= -LOG_CUT
+                if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
+                    continue
+                slope = share_row(0, SLOPE, i, wp.vec4())
+                bend = float(0.0)
+                if wp.static(exact):
+                    bend = share_row(0, BEND, i, wp.vec4())[0]
+                row = share_channels(0, i, channels, 0)
+                total = Pair()
+                total, upper_transmittance, upper_behind = add_pixel(
+                    total,
+                    upper_transmittance,
+                    upper_behind,
+                    wp.where(in_upper, alpha_of(upper_log_alpha), 0.0),
+                    k == upper_median,
+                    upper_adjoint,
+                    to_upper,
+                    center,
+                    shape,
+                    slope,
+                    bend,
+                    frame.near,
+                    upper_offset,
+                    upper_e,
+                    row,
+                )
+                total, lower_transmittance, lower_behind = add_pixel(
+                    total,
+                    lower_transmittance,
+                    lower_behind,
+                    wp.where(in_lower, alpha_of(lower_log_alpha), 0.0),
+                    k == lower_median,
+                    lower_adjoint,
+                    to_lower,
+                    center,
+                    shape,
+                    slope,
+                    bend,
+                    frame.near,
+                    lower_offset,
+                    lower_e,
+                    row,
+                )
+                sum_block(ADD_TO_SUMS, i, total, out_pairs)
             wait_for_block()
             sum_block(END_SUMS, 0, Pair(), out_pairs)
             wait_for_block()

@@ -111,36 +111,39 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                 drawn_shape = share_row(0, SHAPE, bit, wp.vec4())
                 offset = offset_from(drawn, place.position)
                 log_alpha = log_alpha_of(drawn, whiten(drawn_shape, offset))
-                if transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT:
-                    alpha = alpha_of(log_alpha)
-                    weight = alpha * transmittance
-                    bend = float(0.0)
-                    if wp.static(exact):
-                        bend = share_row(0, BEND, bit, wp.vec4())[0]
-                    z = depth_at(drawn, drawn_shape, share_row(0, SLOPE, bit, wp.vec4()), bend, frame.near, offset)
-                    total += share_channels(0, bit, channels, 0) * weight
-                    depth += z * weight
-                    weight_sum += weight
-                    last = begin + bit
-                    if transmittance > MEDIAN:
-                        median_depth = z
-                        median = last
-                    transmittance *= 1.0 - alpha
+                seen = transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT
+                if ballot(wp.where(seen, 1, 0)) == 0:
+                    continue
+                # No branches from here on: each would cost a selection for every variable that it changes.
+                alpha = wp.where(seen, alpha_of(log_alpha), 0.0)
+                weight = alpha * transmittance
+                bend = float(0.0)
+                if wp.static(exact):
+                    bend = share_row(0, BEND, bit, wp.vec4())[0]
+                z = depth_at(drawn, drawn_shape, share_row(0, SLOPE, bit, wp.vec4()), bend, frame.near, offset)
+                total += share_channels(0, bit, channels, 0) * weight
+                depth += z * weight
+                weight_sum += weight
+                last = wp.where(seen, begin + bit, last)
+                nearer = seen and transmittance > MEDIAN
+                median_depth = wp.where(nearer, z, median_depth)
+                median = wp.where(nearer, begin + bit, median)
+                transmittance *= 1.0 - alpha
             begin += LANES
             if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
                 begin = listed_range[1]
         if pixel >= 0:
-            seen = int(-1)
+            gaussian = int(-1)
             end = listed_range[0]
             if last >= 0:
-                seen = frame.lists.splats[last] % frame.gaussian_count
+                gaussian = frame.lists.splats[last] % frame.gaussian_count
                 end = last + 1
             out_channels[pixel] = total
             out_images.alpha[pixel] = weight_sum
             out_images.transmittance[pixel] = transmittance
             out_images.depth[pixel] = wp.where(weight_sum > 0.0, depth / weight_sum, 0.0)
             out_images.median_depth[pixel] = median_depth
-            out_images.gaussians[pixel] = seen
+            out_images.gaussians[pixel] = gaussian
             out_images.ends[pixel] = end
             out_images.medians[pixel] = median
 

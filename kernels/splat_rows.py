@@ -135,9 +135,7 @@ def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
 def clamp_depth(center: wp.vec4, shape: wp.vec4, near: float, inverse: float) -> float:
     """Depth of a centre over ``inverse``, kept where the Gaussian is."""
     far = center[3] + shape[3]
-    depth = far
-    if inverse > 0.0:
-        depth = wp.min(quick_divide(center[3], inverse), far)
+    depth = wp.where(inverse > 0.0, wp.min(quick_divide(center[3], inverse), far), far)
     return wp.max(depth, wp.max(center[3] - shape[3], near))
 
 
