@@ -31,15 +31,16 @@ from beam_warp.kernels.channel_rows import (
 from beam_warp.kernels.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
 from beam_warp.kernels.composite_adjoint import MOMENTS, Adjoints, pair_length, pair_vector
 from beam_warp.kernels.composite_adjoint_cpu import launch_composite_adjoint_cpu
-from beam_warp.kernels.composite_adjoint_cuda import launch_composite_adjoint_cuda
+from beam_warp.kernels.composite_adjoint_cuda import PARTS, launch_composite_adjoint_cuda
 from beam_warp.kernels.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.project import Projection, Splats, View, launch_project, launch_project_adjoint
 from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
 
-MAX_BAND_PAIRS = 2**25
-"""Most (tile, splat) pairs held at a time, 24 bytes each: beyond it the images are drawn in bands of tile rows."""
+MAX_BAND_PAIRS = 2**24
+"""Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 512: beyond it the images are drawn
+in bands of tile rows."""
 
 MAX_ROW_PAIRS = 2**30
 """Most pairs in one row of tiles, the least that can be drawn: positions in their list are 32-bit."""
@@ -484,13 +485,14 @@ class Rasterizer:
         for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
             pairs = back.pairs[rows.length]
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
+            back.present.zero_()
             if self.device.is_cuda:
-                launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
+                launch_composite_adjoint_cuda(*arguments, pairs.vectors, back.present, self.device)
             else:
-                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, self.device)
+                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, back.present, self.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
             summed = Pairs()
-            summed.rows = pairs.matrix
+            summed.rows, summed.present, summed.parts = pairs.matrix, back.present, back.parts
             summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
             launch_sum_pairs(summed, sums, self.device)
 
@@ -532,7 +534,9 @@ class _BackwardBuffers:
     images: RasterImages
     channel_adjoints: list[Rows]
     states: wp.array
+    parts: int
     pairs: dict[int, Rows]
+    present: wp.array
     splats: Splats
     sums: list[wp.array]
     blocks: ChannelBlocks
@@ -546,6 +550,8 @@ class _BackwardBuffers:
         channel_count, exact = rasterizer.value_channels.stop, rasterizer._exact
         adjoints = channel_rows(pixel_count, channel_count, device)
         lengths = {rows.length for rows in adjoints}
+        parts = PARTS if device.is_cuda else 1
+        rows_count = parts * rasterizer.pair_capacity
         has_colors, value_count = bool(rasterizer.color_channels), len(rasterizer.value_channels)
         gaussians = rasterizer._gaussians
         bands = gaussians.radiance.shape[1] if has_colors and gaussians is not None else 0
@@ -560,7 +566,9 @@ class _BackwardBuffers:
             ),
             adjoints,
             wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
-            {n: Rows.zeros(rasterizer.pair_capacity, pair_vector(n, exact), device) for n in lengths},
+            parts,
+            {n: Rows.zeros(rows_count, pair_vector(n, exact), device) for n in lengths},
+            wp.zeros(rows_count, dtype=wp.uint8),
             splats,
             [wp.zeros((splat_count, pair_length(rows.length, exact)), dtype=float) for rows in adjoints],
             blocks,

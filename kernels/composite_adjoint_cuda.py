@@ -1,8 +1,8 @@
-"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
+"""How pixels change with the splats that they see, for CUDA: 8 x 8 pixels a warp, two a lane, back to front.
 
-The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
-pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
-atomics, one order of additions, the same bits every run.
+The lanes look at 32 splats of the tile's list at once, as in `composite_cuda`, and the warp goes through those that
+reach its pixels. The sum over its pixels goes to a row of the pair of tile and splat that is the warp's own: no atomics,
+one order of additions, the same bits every run. No warp waits for another.
 """
 
 from functools import cache
@@ -20,17 +20,13 @@ from beam_warp.kernels.composite_adjoint import (
 )
 from beam_warp.kernels.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
 from beam_warp.kernels.lanes import (
-    ADD_TO_SUMS,
-    BEGIN_SUMS,
-    END_SUMS,
     ballot,
-    greatest_of_block,
     greatest_of_lanes,
     lowest_lane,
     share_channels_function,
     share_row_function,
-    sum_block_function,
-    wait_for_block,
+    store_lane_sums_function,
+    wait_for_lanes,
 )
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
@@ -40,10 +36,10 @@ from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, wh
 PART = wp.constant(8)
 """Side of the pixels of a warp."""
 
-WARPS = 4
-"""Warps of a block: a tile is 16 x 16 pixels."""
+PARTS = 4
+"""Warps of a tile of 16 x 16 pixels, and of a block."""
 
-THREADS = wp.constant(32 * WARPS)
+PAIR_PARTS = wp.constant(PARTS)
 
 
 @cache
@@ -52,12 +48,12 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
-    share_row = share_row_function(4 if exact else 3, 1)
-    share_channels = share_channels_function(Channels, 1)
-    sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
+    share_row = share_row_function(4 if exact else 3, PARTS)
+    share_channels = share_channels_function(Channels, PARTS)
+    store_lane_sums = store_lane_sums_function(pair_length(channel_count, exact))
 
     @wp.kernel(enable_backward=False, module="unique")
-    def composite_blocks_adjoint_kernel(
+    def composite_warps_adjoint_kernel(
         first: int,
         frame: Frame,
         channels: wp.array[Channels],
@@ -65,12 +61,12 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         channel_adjoints: wp.array[Channels],
         adjoints: Adjoints,
         out_pairs: wp.array[Pair],
+        out_present: wp.array[wp.uint8],
     ):
         item = first + wp.tid()
-        thread = item % THREADS
         lane = item % LANES
-        part = thread / LANES
-        listed = item / THREADS
+        part = (item / LANES) % PAIR_PARTS
+        listed = item / (LANES * PAIR_PARTS)
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         listed_range = frame.lists.ranges[listed]
@@ -103,39 +99,24 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             lower_adjoint = pixel_adjoint(images, adjoints, lower.index)
             to_lower = channel_adjoints[lower.index]
             lower_transmittance = images.transmittance[lower.index]
-        own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
-        end = greatest_of_block(own_end)
-        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
-            out_pairs[frame.lists.slots[k]] = Pair()
+        end = greatest_of_lanes(wp.max(upper_end, lower_end))
         while end > listed_range[0]:
             mine = end - 1 - lane
-            slot = int(-1)
-            splat = int(-1)
+            wanted = int(0)
             if mine >= listed_range[0]:
-                slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
-                if part == 0:
-                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
-                if part == 1:
-                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
-                if part == 2:
+                own_center = load_row(frame.splats.centers, splat)
+                own_shape = load_row(frame.splats.shapes, splat)
+                wanted = reaches(own_center, own_shape, box.position, PART, PART)
+                if wanted != 0:
+                    share_row(1, CENTER, lane, own_center)
+                    share_row(1, SHAPE, lane, own_shape)
                     share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
-                if part == 3:
-                    share_channels(1, lane, channels, splat)
                     if wp.static(exact):
                         share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
-            sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
-            wait_for_block()
-            wanted = int(0)
-            if splat >= 0 and mine < own_end:
-                wanted = reaches(
-                    share_row(0, CENTER, lane, wp.vec4()),
-                    share_row(0, SHAPE, lane, wp.vec4()),
-                    box.position,
-                    PART,
-                    PART,
-                )
+                    share_channels(1, lane, channels, splat)
             waiting = ballot(wanted)
+            wait_for_lanes()
             while waiting != 0:
                 i = lowest_lane(waiting)
                 waiting = waiting & (waiting - 1)
@@ -192,22 +173,28 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                     lower_e,
                     row,
                 )
-                sum_block(ADD_TO_SUMS, i, total, out_pairs)
-            wait_for_block()
-            sum_block(END_SUMS, 0, Pair(), out_pairs)
-            wait_for_block()
+                row_place = frame.lists.slots[k] * PAIR_PARTS + part
+                store_lane_sums(out_pairs, row_place, total)
+                if lane == 0:
+                    out_present[row_place] = wp.uint8(1)
+            wait_for_lanes()
             end -= LANES
 
-    return composite_blocks_adjoint_kernel
+    return composite_warps_adjoint_kernel
 
 
-def launch_composite_adjoint_cuda(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
-    """Write the moments and channels of a band's pairs into their slots."""
+def launch_composite_adjoint_cuda(
+    frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, out_present, device
+):
+    """Write the moments and channels of a band's pairs into the rows of their slots, `PARTS` each.
+
+    Rows that are written are marked with a 1 in ``out_present``.
+    """
     launch(
         composite_adjoint_cuda_kernel(channels.dtype._length_, exact),
-        (frame.band.end_tile - frame.band.first_tile) * THREADS,
+        (frame.band.end_tile - frame.band.first_tile) * LANES * PARTS,
         inputs=[frame, channels, images, channel_adjoints, adjoints],
-        outputs=[out_pairs],
+        outputs=[out_pairs, out_present],
         device=device,
-        block_dim=32 * WARPS,
+        block_dim=LANES * PARTS,
     )
