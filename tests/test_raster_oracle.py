@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference.raster_differences import gradients
+from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import RasterScene, harmonics, ray_forms, rotations, see
 from reference.rasterizing import RasterImage, decide, draw, pixel_centers, replay
 
@@ -39,11 +39,6 @@ def make_scene(rng, count, size, **changes):
         "radiance": rng.normal(0.0, 0.3, (count, 16, 3)),
     }
     return RasterScene(**{**fields, **changes})
-
-
-def make_upstream(rng, scene):
-    image = draw(scene)
-    return RasterImage(*(rng.normal(size=getattr(image, name).shape) for name in OUTPUTS))
 
 
 def loss(image, upstream):
@@ -244,7 +239,7 @@ def test_gradients_of_a_ball_by_hand():
     rng = np.random.default_rng(5)
     camera, f, z, s, o, v = ahead(), 20.0, 2.0, 0.3, 0.7, 3.0
     scene = RasterScene([[0, 0, z]], [2 * np.array(UP)], [[s] * 3], [o], camera, values=[[v]])
-    upstream = make_upstream(rng, scene)
+    upstream = random_upstream(rng, scene, decide(scene))
     got = gradients(scene, upstream)
     d = f * offsets(camera)
     square = (d**2).sum(-1)
@@ -277,7 +272,7 @@ def test_gradients_of_a_ball_by_hand():
 def test_gradients_of_all_splats_at_once_are_those_of_each_entry(rng, depth_mode, antialiased):
     """Against the whole image, replayed for one moved entry at a time."""
     scene = make_scene(rng, 40, 20, depth_mode=depth_mode, antialiased=antialiased)
-    upstream, decisions = make_upstream(rng, scene), decide(scene)
+    upstream, decisions = random_upstream(rng, scene, decide(scene)), decide(scene)
     got = gradients(scene, upstream, decisions)
     assert list(got) == list(scene.arrays())
     for name, array in scene.arrays().items():
@@ -306,7 +301,7 @@ def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mod
         radiance=rng.normal(0.0, 0.1, (count, 4, 3)),
         depth_mode=depth_mode,
     )
-    upstream, decisions = make_upstream(rng, scene), decide(scene)
+    upstream, decisions = random_upstream(rng, scene, decide(scene)), decide(scene)
     assert len(decisions.splat) == count * 30
     assert not decisions.depth_side.any()
     assert not decisions.near_tie.any()
@@ -327,14 +322,14 @@ def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mod
 def test_gradients_know_what_cannot_move(rng):
     scene = make_scene(rng, 40, 20)
     scene.positions[0] = scene.camera.position - scene.camera.forward  # behind the camera
-    got = gradients(scene, make_upstream(rng, scene))
+    got = gradients(scene, random_upstream(rng, scene, decide(scene)))
     for name in scene.arrays():
         assert not got[name][0].any()
     turning = (got["orientations"] * scene.orientations).sum(axis=1)
     size = np.linalg.norm(got["orientations"], axis=1) * np.linalg.norm(scene.orientations, axis=1)
     assert np.all(np.abs(turning) <= 1e-10 * size.max())  # a quaternion's length is no parameter
     capped = RasterScene([[0, 0, 2.0]], [UP], [[50.0] * 3], [1.0], ahead(1, 1), values=[[1.0]])
-    assert not gradients(capped, make_upstream(rng, capped))["opacities"].any()
+    assert not gradients(capped, random_upstream(rng, capped, decide(capped)))["opacities"].any()
 
 
 @pytest.mark.parametrize("end", [-1, 1])

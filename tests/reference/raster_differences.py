@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from reference.raster_splats import see
-from reference.rasterizing import decide, pair_terms
+from reference.rasterizing import RasterImage, decide, pair_terms
 
 STEP = 1e-20
 
@@ -33,6 +33,18 @@ def gradients(scene, upstream, decisions=None):
             columns[:, k] = frozen.derivatives(**{name: moved})
         result[name] = gradient
     return result
+
+
+def random_upstream(rng, scene, decisions):
+    """Normal numbers that single precision holds, and 0 on pixels where it may decide otherwise."""
+    shape = decisions.near_tie.shape
+    count = see(scene, decisions.splats).channels.shape[1]
+    sides = {"alpha": (), "depth": (), "median_depth": (), "channels": (count,), "normals": (3,)}
+    arrays = {}
+    for name, trailing in sides.items():
+        arrays[name] = rng.normal(size=(*shape, *trailing)).astype(np.float32).astype(np.float64)
+        arrays[name][decisions.near_tie] = 0.0
+    return RasterImage(**arrays)
 
 
 class FrozenPairs:

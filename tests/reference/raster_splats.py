@@ -131,13 +131,13 @@ def channels(scene, decisions):
     if scene.values is not None:
         parts.append(scene.values)
     if scene.radiance is not None:
-        parts.append(np.where(decisions.positive, shifted_color(scene), 0.0))
+        parts.append(np.where(decisions.positive, shifted_color(scene, decisions.visible), 0.0))
     return np.concatenate(parts, axis=1)
 
 
-def shifted_color(scene):
+def shifted_color(scene, visible):
     """Captured colour towards the camera before it is clamped at 0, (N, 3)."""
-    toward = scene.positions - scene.camera.position
+    toward = np.where(visible[:, None], scene.positions - scene.camera.position, (0.0, 0.0, 1.0))
     degree = round(np.sqrt(scene.radiance.shape[1])) - 1
     return 0.5 + np.einsum("nk,nkc->nc", harmonics(toward / length(toward), degree), scene.radiance)
 

@@ -121,7 +121,7 @@ def decide_splats(scene):
     p = np.where(visible[:, None], local, (0.0, 0.0, 1.0))
     low, high = slope_range(scene)
     slopes = p[:, :2] / p[:, 2:]
-    color = shifted_color(scene) if scene.radiance is not None else np.ones((len(p), 0))
+    color = shifted_color(scene, visible) if scene.radiance is not None else np.ones((len(p), 0))
     small, large = np.sort(scene.scales, axis=1)[:, 1:].T
     chosen = SplatDecisions(
         visible=visible,
