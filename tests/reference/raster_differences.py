@@ -26,24 +26,23 @@ def gradients(scene, upstream, decisions=None):
     result = {}
     for name, array in scene.arrays().items():
         gradient = np.zeros(array.shape)
-        columns = gradient.reshape(len(array), -1)
-        for k in range(columns.shape[1]):
+        for k in np.ndindex(array.shape[1:]):
             moved = array.astype(complex)
-            moved.reshape(len(array), -1)[:, k] += 1j * STEP
-            columns[:, k] = frozen.derivatives(**{name: moved})
+            moved[:, *k] += 1j * STEP
+            gradient[:, *k] = frozen.derivatives(**{name: moved})
         result[name] = gradient
     return result
 
 
 def random_upstream(rng, scene, decisions):
     """Normal numbers that single precision holds, and 0 on pixels where it may decide otherwise."""
-    shape = decisions.near_tie.shape
+    unclear = decisions.near_jump | decisions.near_bend
     count = see(scene, decisions.splats).channels.shape[1]
     sides = {"alpha": (), "depth": (), "median_depth": (), "channels": (count,), "normals": (3,)}
     arrays = {}
     for name, trailing in sides.items():
-        arrays[name] = rng.normal(size=(*shape, *trailing)).astype(np.float32).astype(np.float64)
-        arrays[name][decisions.near_tie] = 0.0
+        arrays[name] = rng.normal(size=(*unclear.shape, *trailing)).astype(np.float32).astype(np.float64)
+        arrays[name][unclear] = 0.0
     return RasterImage(**arrays)
 
 

@@ -62,7 +62,17 @@ class Decisions:
     behind: Any  # (M,) l clamped in exact depth
     depth_side: Any  # (M,) -1 at the far end, 0, 1 at the near end
     median: Any  # (H W,) pair, -1 without
-    near_tie: Any  # (H, W) pixels where float32 may decide otherwise
+    near_jump: Any  # (H, W) pixels where float32 may decide otherwise and then shows another image
+    near_bend: Any  # (H, W) pixels where it may decide otherwise and then has another slope only
+
+
+@dataclass(frozen=True)
+class LooseSplats:
+    """Splats whose decisions float32 may take otherwise."""
+
+    visible: Any  # (N,)
+    bends: Any  # (N,) side of the Jacobian's clamp, or of a colour's
+    reach: Any  # (N,) what limits its depth: matters where depth is clamped
 
 
 def rasterize(cloud, camera, values, *, antialiased=False):
@@ -78,31 +88,31 @@ def draw(scene):
 
 def decide(scene):
     """Take every decision."""
-    chosen, loose, loose_reach = decide_splats(scene)
+    chosen, loose = decide_splats(scene)
     splats = see(scene, chosen)
     pixels = pixel_centers(scene.camera)
     transmittance, depth_before = np.ones(len(pixels)), np.zeros(len(pixels))
-    median, near_tie = np.full(len(pixels), -1), np.zeros(len(pixels), bool)
+    median = np.full(len(pixels), -1)
+    near_jump, near_bend = np.zeros((2, len(pixels)), bool)
     pairs, count = [], 0
     for i in np.argsort(splats.depth, kind="stable"):
         if not chosen.visible[i]:
             continue
         alpha = response(splats, i, pixels)
         counts = (alpha >= ALPHA_MIN) & (transmittance >= STOP)
-        tie = close(alpha, ALPHA_MIN) | close(transmittance, STOP, STOP_TIE)
-        near_tie |= tie & (transmittance > STOP * (1.0 - STOP_TIE))
+        jump = close(alpha, ALPHA_MIN) | close(transmittance, STOP, STOP_TIE) | (loose.visible[i] & (alpha > 0.0))
+        near_jump |= jump & (transmittance > STOP * (1.0 - STOP_TIE))
         here = np.flatnonzero(counts)
         forms = ray_forms(scene, splats, i, pixels[here])
         behind = ~(forms[0] > LEAST_AHEAD)
         inverse = inverse_depth(scene, splats, i, forms, behind)
         side = (inverse > splats.nearest[i]).astype(int) - (inverse < splats.farthest[i])
         step = splats.depth[i] - depth_before[here]
-        tie = close(alpha[here], ALPHA_MAX) | close(transmittance[here], HALF)
-        tie |= (step > 0.0) & (step < SORT_TIE * splats.depth[i])
-        tie |= close(inverse, splats.nearest[i]) | close(inverse, splats.farthest[i])
-        tie |= (np.abs(forms[0]) < TIE) & (scene.depth_mode == "exact")
-        tie |= loose[i] | (loose_reach[i] & (side != 0))
-        near_tie[here] |= tie
+        near_jump[here] |= close(transmittance[here], HALF) | ((step > 0.0) & (step < SORT_TIE * splats.depth[i]))
+        near_jump[here] |= (np.abs(forms[0]) < TIE) & (scene.depth_mode == "exact")
+        bend = close(inverse, splats.nearest[i]) | close(inverse, splats.farthest[i])
+        bend |= close(alpha[here], ALPHA_MAX) | loose.bends[i] | (loose.reach[i] & (side != 0))
+        near_bend[here] |= bend
         above = transmittance[here] > HALF
         median[here[above]] = count + np.flatnonzero(above)
         pairs.append((np.full(len(here), i), here, alpha[here] > ALPHA_MAX, behind, side))
@@ -111,11 +121,12 @@ def decide(scene):
         transmittance[here] *= 1.0 - np.minimum(alpha[here], ALPHA_MAX)
     empty = [np.zeros(0, kind) for kind in (int, int, bool, bool, int)]
     columns = [np.concatenate(column) for column in zip(empty, *pairs, strict=True)]
-    return Decisions(chosen, *columns, median, near_tie.reshape(scene.camera.height, scene.camera.width))
+    shape = (scene.camera.height, scene.camera.width)
+    return Decisions(chosen, *columns, median, near_jump.reshape(shape), near_bend.reshape(shape))
 
 
 def decide_splats(scene):
-    """Decisions of splats; which of them are near ties, and which of these matter only where depth is clamped."""
+    """Decisions of splats, and which of them are loose."""
     local = local_positions(scene)
     visible = local[:, 2] > NEAR
     p = np.where(visible[:, None], local, (0.0, 0.0, 1.0))
@@ -132,9 +143,12 @@ def decide_splats(scene):
         positive=color > 0.0,
     )
     edge = np.minimum(np.abs(slopes - low), np.abs(slopes - high)) < TIE * (high - low)
-    loose = close(local[:, 2], NEAR) | edge.any(axis=1) | (np.abs(color) < TIE).any(axis=1)
-    loose_reach = (large - small < TIE * large) | (np.abs(p[:, 2] - REACH * large - NEAR) < TIE * p[:, 2])
-    return chosen, loose, loose_reach
+    loose = LooseSplats(
+        visible=close(local[:, 2], NEAR),
+        bends=edge.any(axis=1) | (np.abs(color) < TIE).any(axis=1),
+        reach=(large - small < TIE * large) | (np.abs(p[:, 2] - REACH * large - NEAR) < TIE * p[:, 2]),
+    )
+    return chosen, loose
 
 
 def close(value, threshold, tolerance=TIE):
