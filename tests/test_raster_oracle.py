@@ -115,6 +115,13 @@ def test_layers_are_composited_capped_and_stopped():
     assert image.last[0, 0] == order.index(4)
 
 
+@pytest.mark.parametrize(("first", "median"), [(0.49, 3.0), (0.51, 2.0)])
+def test_the_median_is_the_last_with_more_than_half_before_it(first, median):
+    camera = ahead(1, 1)
+    scene = RasterScene([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 4.0]], [UP] * 3, [[50.0] * 3] * 3, [first, 0.3, 0.9], camera)
+    assert draw(scene).median_depth[0, 0] == pytest.approx(median, rel=ROUNDING)
+
+
 def test_what_is_not_seen():
     camera = ahead()
     image = draw(
@@ -304,8 +311,8 @@ def test_gradients_of_all_splats_at_once_are_those_of_each_entry(rng, depth_mode
         assert np.linalg.norm(difference) < 1e-10 * np.linalg.norm(expected), name
 
 
-@pytest.mark.parametrize("depth_mode", ["plane", "exact"])
-def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mode):
+@pytest.mark.parametrize(("depth_mode", "antialiased"), [("plane", True), ("exact", False)])
+def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mode, antialiased):
     """Wide, faint splats that all pixels see: the image itself is smooth, and is drawn anew for every difference."""
     count = 6
     scene = RasterScene(
@@ -317,6 +324,7 @@ def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mod
         values=rng.uniform(size=(count, 2)),
         radiance=rng.normal(0.0, 0.1, (count, 4, 3)),
         depth_mode=depth_mode,
+        antialiased=antialiased,
     )
     upstream, decisions = random_upstream(rng, scene, decide(scene)), decide(scene)
     assert len(decisions.splat) == count * 30
