@@ -78,13 +78,20 @@ def discs_at_five_degrees(rng):
 
 
 @hazard
+def discs_past_their_horizon(rng):
+    """The low-pass shows them up to three degrees away from their plane: nearly half of those rays never meet it."""
+    return grazing(rng, 1.0, 1e-5)
+
+
+@hazard
 def discs_at_a_tenth_of_a_degree(rng):
+    """Less than thickness over width: the surface of largest response leaves the disc's plane."""
     return grazing(rng, 0.1, 1e-3)
 
 
 @hazard
 def discs_edge_on(rng):
-    """Wider on screen through the low-pass alone: half of their pixels are behind the plane's horizon."""
+    """That surface swings through a right angle within a millionth of a radian: no input determines it."""
     return grazing(rng, 0.0, 1e-4)
 
 
