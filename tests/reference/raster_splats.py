@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-NEAR = 0.01
 REACH = 3.0  # depth stays within this many of the largest standard deviation
 LEAST_SCALE = 1e-12  # a disc without thickness has a normal, but no inverse
 LEAST_AHEAD = 1e-6  # l of exact depth: below 0 the ray leaves the plane behind
@@ -27,6 +26,7 @@ class RasterScene:
     radiance: Any = None  # (N, (degree + 1)^2, 3); the colour towards the camera is drawn after the values
     antialiased: bool = False
     low_pass: float = 0.3
+    near: float = 0.01
     depth_mode: str = "plane"  # or "exact"
 
     def __post_init__(self):
@@ -118,7 +118,7 @@ def see(scene, decisions):
         opacity=opacity,
         whitening=whitening,
         ray=ray,
-        nearest=1.0 / np.where(decisions.near_side, NEAR, z - reach),
+        nearest=1.0 / np.where(decisions.near_side, scene.near, z - reach),
         farthest=1.0 / (z + reach),
         normal=-m / length(m) @ scene.to_camera,
         channels=channels(scene, decisions),

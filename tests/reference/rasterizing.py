@@ -13,7 +13,6 @@ import numpy as np
 from reference.raster_splats import (
     LEAST_AHEAD,
     LEAST_SCALE,
-    NEAR,
     REACH,
     RasterScene,
     SplatDecisions,
@@ -128,7 +127,7 @@ def decide(scene):
 def decide_splats(scene):
     """Decisions of splats, and which of them are loose."""
     local = local_positions(scene)
-    visible = local[:, 2] > NEAR
+    visible = local[:, 2] > scene.near
     p = np.where(visible[:, None], local, (0.0, 0.0, 1.0))
     low, high = slope_range(scene)
     slopes = p[:, :2] / p[:, 2:]
@@ -139,14 +138,14 @@ def decide_splats(scene):
         slope_side=(slopes > high).astype(int) - (slopes < low),
         floored=~(scene.scales > LEAST_SCALE),
         largest=scene.scales.argmax(axis=1),
-        near_side=~(p[:, 2] - REACH * large > NEAR),
+        near_side=~(p[:, 2] - REACH * large > scene.near),
         positive=color > 0.0,
     )
     edge = np.minimum(np.abs(slopes - low), np.abs(slopes - high)) < TIE * (high - low)
     loose = LooseSplats(
-        visible=close(local[:, 2], NEAR),
+        visible=close(local[:, 2], scene.near),
         bends=edge.any(axis=1) | (np.abs(color) < TIE).any(axis=1),
-        reach=(large - small < TIE * large) | (np.abs(p[:, 2] - REACH * large - NEAR) < TIE * p[:, 2]),
+        reach=(large - small < TIE * large) | (np.abs(p[:, 2] - REACH * large - scene.near) < TIE * p[:, 2]),
     )
     return chosen, loose
 
