@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from reference.raster_splats import see
-from reference.rasterizing import RasterImage, decide, pair_terms
+from reference.rasterizing import RasterImage, decide, pair_terms, replay
 
 STEP = 1e-20
 
@@ -35,14 +35,20 @@ def gradients(scene, upstream, decisions=None):
 
 
 def random_upstream(rng, scene, decisions):
-    """Normal numbers that single precision holds, and 0 on pixels where it may decide otherwise."""
+    """Normal numbers that single precision holds, and 0 on pixels where it may decide otherwise.
+
+    That of the mean depth is weighted by alpha, as a loss would: else a pixel of alpha 1/255 asks, 255 times as loudly
+    as others, for the difference of a splat's depth and the mean, which is all rounding where there is one splat.
+    """
     unclear = decisions.near_jump | decisions.near_bend
-    count = see(scene, decisions.splats).channels.shape[1]
-    sides = {"alpha": (), "depth": (), "median_depth": (), "channels": (count,), "normals": (3,)}
+    image = replay(scene, decisions)
     arrays = {}
-    for name, trailing in sides.items():
-        arrays[name] = rng.normal(size=(*unclear.shape, *trailing)).astype(np.float32).astype(np.float64)
-        arrays[name][unclear] = 0.0
+    for name in ("alpha", "depth", "median_depth", "channels", "normals"):
+        array = rng.normal(size=getattr(image, name).shape)
+        if name == "depth":
+            array *= image.alpha
+        array[unclear] = 0.0
+        arrays[name] = array.astype(np.float32).astype(np.float64)
     return RasterImage(**arrays)
 
 

@@ -145,7 +145,7 @@ def decide_splats(scene):
     loose = LooseSplats(
         visible=close(local[:, 2], scene.near),
         bends=edge.any(axis=1) | (np.abs(color) < TIE).any(axis=1),
-        reach=(large - small < TIE * large) | (np.abs(p[:, 2] - REACH * large - scene.near) < TIE * p[:, 2]),
+        reach=(large - small <= TIE * large) | (np.abs(p[:, 2] - REACH * large - scene.near) < TIE * p[:, 2]),
     )
     return chosen, loose
 
