@@ -31,7 +31,7 @@ from beam_warp.kernels.channel_rows import (
 from beam_warp.kernels.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
 from beam_warp.kernels.composite_adjoint import MOMENTS, Adjoints, pair_length, pair_vector
 from beam_warp.kernels.composite_adjoint_cpu import launch_composite_adjoint_cpu
-from beam_warp.kernels.composite_adjoint_cuda import PARTS, launch_composite_adjoint_cuda
+from beam_warp.kernels.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
@@ -39,7 +39,7 @@ from beam_warp.kernels.project import Projection, Splats, View, launch_project, 
 from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
 
 MAX_BAND_PAIRS = 2**24
-"""Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 512: beyond it the images are drawn
+"""Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 128: beyond it the images are drawn
 in bands of tile rows."""
 
 MAX_ROW_PAIRS = 2**30
@@ -249,6 +249,7 @@ class Rasterizer:
     def _reserve(self, capacity: int) -> None:
         """Make room for pairs."""
         self._tiles = wp.zeros(2 * capacity, dtype=int)  # the sort wants room for as many again
+        self._listed_tiles = self._tiles[:capacity]
         self._slots = wp.zeros(2 * capacity, dtype=int)
         self._owners = wp.zeros(capacity, dtype=int)
         lists = TileLists()
@@ -447,7 +448,7 @@ class Rasterizer:
         if not self.pair_capacity:
             return
         wp.utils.array_scan(self._counts, self._ends, inclusive=True)
-        self._tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
+        self._listed_tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
         launch_emit_pairs(
             self._order,
             self._counts,
@@ -485,14 +486,13 @@ class Rasterizer:
         for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
             pairs = back.pairs[rows.length]
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
-            back.present.zero_()
             if self.device.is_cuda:
-                launch_composite_adjoint_cuda(*arguments, pairs.vectors, back.present, self.device)
+                launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
             else:
-                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, back.present, self.device)
+                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, self.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
             summed = Pairs()
-            summed.rows, summed.present, summed.parts = pairs.matrix, back.present, back.parts
+            summed.rows = pairs.matrix
             summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
             launch_sum_pairs(summed, sums, self.device)
 
@@ -534,9 +534,7 @@ class _BackwardBuffers:
     images: RasterImages
     channel_adjoints: list[Rows]
     states: wp.array
-    parts: int
     pairs: dict[int, Rows]
-    present: wp.array
     splats: Splats
     sums: list[wp.array]
     blocks: ChannelBlocks
@@ -550,8 +548,6 @@ class _BackwardBuffers:
         channel_count, exact = rasterizer.value_channels.stop, rasterizer._exact
         adjoints = channel_rows(pixel_count, channel_count, device)
         lengths = {rows.length for rows in adjoints}
-        parts = PARTS if device.is_cuda else 1
-        rows_count = parts * rasterizer.pair_capacity
         has_colors, value_count = bool(rasterizer.color_channels), len(rasterizer.value_channels)
         gaussians = rasterizer._gaussians
         bands = gaussians.radiance.shape[1] if has_colors and gaussians is not None else 0
@@ -566,9 +562,7 @@ class _BackwardBuffers:
             ),
             adjoints,
             wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
-            parts,
-            {n: Rows.zeros(rows_count, pair_vector(n, exact), device) for n in lengths},
-            wp.zeros(rows_count, dtype=wp.uint8),
+            {n: Rows.zeros(rasterizer.pair_capacity, pair_vector(n, exact), device) for n in lengths},
             splats,
             [wp.zeros((splat_count, pair_length(rows.length, exact)), dtype=float) for rows in adjoints],
             blocks,

@@ -34,7 +34,6 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         adjoints: Adjoints,
         out_states: wp.array[wp.vec2],
         out_pairs: wp.array[Pair],
-        out_present: wp.array[wp.uint8],
     ):
         # A pixel's state: what passes before the splats still to come, and the sum R of those behind them.
         listed = first + wp.tid()
@@ -48,6 +47,8 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                 pixel = view.first_pixel + y * view.width + x
                 out_states[pixel] = wp.vec2(images.transmittance[pixel], 0.0)
                 end = wp.max(end, images.ends[pixel])
+        for k in range(end, listed_range[1]):
+            out_pairs[frame.lists.slots[k]] = Pair()
         for back in range(end - listed_range[0]):
             k = end - 1 - back
             splat = frame.lists.splats[k]
@@ -85,25 +86,20 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                             row,
                         )
                         out_states[pixel] = wp.vec2(before, behind)
-            slot = frame.lists.slots[k]
-            out_pairs[slot] = total
-            out_present[slot] = wp.uint8(1)
+            out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel
 
 
 def launch_composite_adjoint_cpu(
-    frame, channels, exact, images, channel_adjoints, adjoints, out_states, out_pairs, out_present, device
+    frame, channels, exact, images, channel_adjoints, adjoints, out_states, out_pairs, device
 ):
-    """Write the moments and channels of a band's pairs into the rows of their slots, one each.
-
-    Rows that are written are marked with a 1 in ``out_present``.
-    """
+    """Write the moments and channels of a band's pairs into their slots."""
     launch(
         composite_adjoint_cpu_kernel(channels.dtype._length_, exact),
         frame.band.end_tile - frame.band.first_tile,
         inputs=[frame, channels, images, channel_adjoints, adjoints],
-        outputs=[out_states, out_pairs, out_present],
+        outputs=[out_states, out_pairs],
         device=device,
         min_chunk=MIN_TILES,
     )

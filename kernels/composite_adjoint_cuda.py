@@ -1,8 +1,8 @@
-"""How pixels change with the splats that they see, for CUDA: 8 x 8 pixels a warp, two a lane, back to front.
+"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
 
-The lanes look at 32 splats of the tile's list at once, as in `composite_cuda`, and the warp goes through those that
-reach its pixels. The sum over its pixels goes to a row of the pair of tile and splat that is the warp's own: no atomics,
-one order of additions, the same bits every run. No warp waits for another.
+The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
+pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
+atomics, one order of additions, the same bits every run.
 """
 
 from functools import cache
@@ -20,13 +20,17 @@ from beam_warp.kernels.composite_adjoint import (
 )
 from beam_warp.kernels.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
 from beam_warp.kernels.lanes import (
+    ADD_TO_SUMS,
+    BEGIN_SUMS,
+    END_SUMS,
     ballot,
+    greatest_of_block,
     greatest_of_lanes,
     lowest_lane,
     share_channels_function,
     share_row_function,
-    store_lane_sums_function,
-    wait_for_lanes,
+    sum_block_function,
+    wait_for_block,
 )
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
@@ -36,10 +40,10 @@ from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, wh
 PART = wp.constant(8)
 """Side of the pixels of a warp."""
 
-PARTS = 4
-"""Warps of a tile of 16 x 16 pixels, and of a block."""
+WARPS = 4
+"""Warps of a block: a tile is 16 x 16 pixels."""
 
-PAIR_PARTS = wp.constant(PARTS)
+THREADS = wp.constant(32 * WARPS)
 
 
 @cache
@@ -48,12 +52,12 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
-    share_row = share_row_function(4 if exact else 3, PARTS)
-    share_channels = share_channels_function(Channels, PARTS)
-    store_lane_sums = store_lane_sums_function(pair_length(channel_count, exact))
+    share_row = share_row_function(4 if exact else 3, 1)
+    share_channels = share_channels_function(Channels, 1)
+    sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def composite_warps_adjoint_kernel(
+    def composite_blocks_adjoint_kernel(
         first: int,
         frame: Frame,
         channels: wp.array[Channels],
@@ -61,12 +65,12 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         channel_adjoints: wp.array[Channels],
         adjoints: Adjoints,
         out_pairs: wp.array[Pair],
-        out_present: wp.array[wp.uint8],
     ):
         item = first + wp.tid()
+        thread = item % THREADS
         lane = item % LANES
-        part = (item / LANES) % PAIR_PARTS
-        listed = item / (LANES * PAIR_PARTS)
+        part = thread / LANES
+        listed = item / THREADS
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         listed_range = frame.lists.ranges[listed]
@@ -99,24 +103,39 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             lower_adjoint = pixel_adjoint(images, adjoints, lower.index)
             to_lower = channel_adjoints[lower.index]
             lower_transmittance = images.transmittance[lower.index]
-        end = greatest_of_lanes(wp.max(upper_end, lower_end))
+        own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
+        end = greatest_of_block(own_end)
+        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
+            out_pairs[frame.lists.slots[k]] = Pair()
         while end > listed_range[0]:
             mine = end - 1 - lane
-            wanted = int(0)
+            slot = int(-1)
+            splat = int(-1)
             if mine >= listed_range[0]:
+                slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
-                own_center = load_row(frame.splats.centers, splat)
-                own_shape = load_row(frame.splats.shapes, splat)
-                wanted = reaches(own_center, own_shape, box.position, PART, PART)
-                if wanted != 0:
-                    share_row(1, CENTER, lane, own_center)
-                    share_row(1, SHAPE, lane, own_shape)
+                if part == 0:
+                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
+                if part == 1:
+                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
+                if part == 2:
                     share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+                if part == 3:
+                    share_channels(1, lane, channels, splat)
                     if wp.static(exact):
                         share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
-                    share_channels(1, lane, channels, splat)
+            sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
+            wait_for_block()
+            wanted = int(0)
+            if splat >= 0 and mine < own_end:
+                wanted = reaches(
+                    share_row(0, CENTER, lane, wp.vec4()),
+                    share_row(0, SHAPE, lane, wp.vec4()),
+                    box.position,
+                    PART,
+                    PART,
+                )
             waiting = ballot(wanted)
-            wait_for_lanes()
             while waiting != 0:
                 i = lowest_lane(waiting)
                 waiting = waiting & (waiting - 1)
@@ -173,28 +192,22 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                     lower_e,
                     row,
                 )
-                row_place = frame.lists.slots[k] * PAIR_PARTS + part
-                store_lane_sums(out_pairs, row_place, total)
-                if lane == 0:
-                    out_present[row_place] = wp.uint8(1)
-            wait_for_lanes()
+                sum_block(ADD_TO_SUMS, i, total, out_pairs)
+            wait_for_block()
+            sum_block(END_SUMS, 0, Pair(), out_pairs)
+            wait_for_block()
             end -= LANES
 
-    return composite_warps_adjoint_kernel
+    return composite_blocks_adjoint_kernel
 
 
-def launch_composite_adjoint_cuda(
-    frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, out_present, device
-):
-    """Write the moments and channels of a band's pairs into the rows of their slots, `PARTS` each.
-
-    Rows that are written are marked with a 1 in ``out_present``.
-    """
+def launch_composite_adjoint_cuda(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
+    """Write the moments and channels of a band's pairs into their slots."""
     launch(
         composite_adjoint_cuda_kernel(channels.dtype._length_, exact),
-        (frame.band.end_tile - frame.band.first_tile) * LANES * PARTS,
+        (frame.band.end_tile - frame.band.first_tile) * THREADS,
         inputs=[frame, channels, images, channel_adjoints, adjoints],
-        outputs=[out_pairs, out_present],
+        outputs=[out_pairs],
         device=device,
-        block_dim=LANES * PARTS,
+        block_dim=32 * WARPS,
     )

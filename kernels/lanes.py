@@ -1,4 +1,4 @@
-"""What the 32 lanes of a CUDA warp tell each other: by votes, by exchanges, by shared memory.
+"""What the threads of a CUDA block tell each other: by votes and exchanges in a warp of 32 lanes, by shared memory.
 
 Nothing here does anything sensible on the CPU, where a thread is alone; the kernels that call it are for CUDA.
 """
@@ -39,6 +39,36 @@ def greatest_of_lanes(value: int) -> int:
 """)
 def wait_for_lanes():
     """Return when all lanes are here, and see what they wrote."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait_for_block():
+    """Return when all threads of the block are here, and see what they wrote."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ int greatest[32];
+    const int own = __reduce_max_sync(0xffffffffu, value);
+    if ((threadIdx.x & 31) == 0)
+        greatest[threadIdx.x >> 5] = own;
+    __syncthreads();
+    int found = greatest[0];
+    for (int i = 1; i < blockDim.x / 32; ++i)
+        found = max(found, greatest[i]);
+    return found;
+#else
+    return value;
+#endif
+""")
+def greatest_of_block(value: int) -> int:
+    """The greatest value of all threads of the block. All must call it together, once in a kernel."""
     ...
 
 
@@ -91,32 +121,57 @@ _SHARE_CHANNELS = """
     return row;
 """
 
-_STORE_LANE_SUMS = """
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31;
-    float held[WIDTH];
-    #pragma unroll
-    for (int i = 0; i < WIDTH; ++i)
-        held[i] = i < LENGTH ? numbers[i] : 0.0f;
-    int place = 0;
-    #pragma unroll
-    for (int step = 16; step > 0; step >>= 1) {
-        const int half = WIDTH * step / 32;
-        const bool upper = (lane & step) != 0;
-        if (half > 0) {
+_HALVE = """
+        {
+            const bool upper = (lane & STEP) != 0;
             #pragma unroll
-            for (int i = 0; i < half; ++i) {
-                const float given = upper ? held[i] : held[i + half];
-                const float kept = upper ? held[i + half] : held[i];
-                held[i] = kept + __shfl_xor_sync(0xffffffffu, given, step);
+            for (int i = 0; i < HALF; ++i) {
+                const float given = upper ? held[i] : held[i + HALF];
+                const float kept = upper ? held[i + HALF] : held[i];
+                held[i] = kept + __shfl_xor_sync(0xffffffffu, given, STEP);
             }
-            place += upper ? half : 0;
-        } else {
-            held[0] += __shfl_xor_sync(0xffffffffu, held[0], step);
+            place += upper ? HALF : 0;
+        }
+"""
+
+_ADD_LAST = """
+        held[0] += __shfl_xor_sync(0xffffffffu, held[0], 1);
+"""
+
+_SUM_BLOCK = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32 * WARPS * LENGTH];
+    __shared__ int present[32 * WARPS];
+    __shared__ int slots[32];
+    const int warp = threadIdx.x >> 5;
+    const int lane = threadIdx.x & 31;
+    if (action == 0) {
+        present[threadIdx.x] = 0;
+        if (warp == 0)
+            slots[lane] = pair;
+    } else if (action == 1) {
+        float held[WIDTH];
+        #pragma unroll
+        for (int i = 0; i < WIDTH; ++i)
+            held[i] = i < LENGTH ? numbers[i] : 0.0f;
+        int place = 0;
+HALVINGS        if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
+            parts[(pair * WARPS + warp) * LENGTH + place] = held[0];
+        if (lane == 0)
+            present[pair * WARPS + warp] = 1;
+    } else {
+        for (int i = threadIdx.x; i < 32 * LENGTH; i += 32 * WARPS) {
+            const int listed = i / LENGTH;
+            if (slots[listed] >= 0) {
+                float total = 0.0f;
+                #pragma unroll
+                for (int w = 0; w < WARPS; ++w)
+                    if (present[listed * WARPS + w])
+                        total += parts[(listed * WARPS + w) * LENGTH + i % LENGTH];
+                reinterpret_cast<float*>(out_rows.data)[size_t(slots[listed]) * LENGTH + i % LENGTH] = total;
+            }
         }
     }
-    if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
-        reinterpret_cast<float*>(out_rows.data)[size_t(row) * LENGTH + place] = held[0];
 #endif
 """
 
@@ -125,7 +180,7 @@ _STORE_LANE_SUMS = """
 def share_row_function(kinds: int, groups: int):
     """Return the function that puts a row into shared memory or, with ``store`` 0, takes it from there.
 
-    There are 32 rows of each of some kinds, for every warp of ``groups`` in a block.
+    There are 32 rows of each of some kinds, for every warp of ``groups``, or for the whole block with 1.
     """
     snippet = _SHARE_ROW.replace("KINDS", str(kinds)).replace("GROUPS", str(groups))
 
@@ -139,7 +194,7 @@ def share_row_function(kinds: int, groups: int):
 def share_channels_function(Channels, groups: int):
     """Return the function that copies a splat's channels to shared memory or, with ``store`` 0, takes them from there.
 
-    There are 32 rows for every warp of ``groups`` in a block.
+    There are 32 rows for every warp of ``groups``, or for the whole block with 1.
     """
     snippet = _SHARE_CHANNELS.replace("LENGTH", str(Channels._length_)).replace("GROUPS", str(groups))
 
@@ -149,17 +204,31 @@ def share_channels_function(Channels, groups: int):
     return share_channels
 
 
-@cache
-def store_lane_sums_function(length: int):
-    """Return the function that stores the sums over all lanes of ``length`` numbers, at most 32, as a row.
+BEGIN_SUMS, ADD_TO_SUMS, END_SUMS = (wp.constant(k) for k in range(3))
 
-    Lanes halve what they hold in each of five steps, as in a transpose: 16 numbers take 16 exchanges, where one sum
-    after the other would take five each. The order of additions is fixed.
+
+@cache
+def sum_block_function(length: int, warps: int):
+    """Return the function that sums ``length`` numbers, at most 32, over a block, for 32 pairs at a time.
+
+    - `BEGIN_SUMS`: every lane of the first warp names the slot of its pair, -1 for none.
+    - `ADD_TO_SUMS`: the lanes of a warp bring their numbers for a pair. They halve what they hold in each of five
+      steps, as in a transpose: 16 numbers take 16 exchanges, where one sum after the other would take five each.
+    - `END_SUMS`: the sums of the warps that brought some, in their order, go to the rows of the slots; zeros for none.
+
+    All threads must wait for each other between the three. The order of additions is fixed.
     """
     Numbers = wp.types.vector(length=length, dtype=float)
-    snippet = _STORE_LANE_SUMS.replace("LENGTH", str(length)).replace("WIDTH", "16" if length <= 16 else "32")
+    width = 16 if length <= 16 else 32
+    # Written out step by step: NVRTC keeps an array that is indexed by a loop it does not unroll in slow local memory.
+    steps = [(16 >> i, width >> (i + 1)) for i in range(5)]
+    halvings = [
+        _HALVE.replace("STEP", str(step)).replace("HALF", str(half)) if half else _ADD_LAST for step, half in steps
+    ]
+    snippet = _SUM_BLOCK.replace("HALVINGS", "".join(halvings)).replace("LENGTH", str(length))
+    snippet = snippet.replace("WARPS", str(warps)).replace("WIDTH", str(width))
 
     @wp.func_native(snippet)
-    def store_lane_sums(out_rows: wp.array[Numbers], row: int, numbers: Numbers): ...
+    def sum_block(action: int, pair: int, numbers: Numbers, out_rows: wp.array[Numbers]): ...
 
-    return store_lane_sums
+    return sum_block

@@ -13,9 +13,7 @@ wp.set_module_options({"enable_backward": False})
 class Pairs:
     """The moments and channels of all pairs of a band; those of a splat lie side by side, splats in depth order."""
 
-    rows: wp.array2d[float]  # some for every pair
-    present: wp.array[wp.uint8]  # 1 for the rows that were written
-    parts: int  # rows of a pair
+    rows: wp.array2d[float]
     order: wp.array[int]
     counts: wp.array[int]
     ends: wp.array[int]
@@ -32,10 +30,8 @@ def sum_pairs_kernel(first: int, pairs: Pairs, out_sums: wp.array2d[float]):
     if count <= 0:
         return
     total = float(0.0)
-    end = wp.min(pairs.ends[place] * pairs.parts, pairs.rows.shape[0])
-    for row in range((pairs.ends[place] - count) * pairs.parts, end):
-        if pairs.present[row] != wp.uint8(0):
-            total += pairs.rows[row, column]
+    for row in range(pairs.ends[place] - count, wp.min(pairs.ends[place], pairs.rows.shape[0])):
+        total += pairs.rows[row, column]
     splat = pairs.order[place]
     out_sums[splat, column] = out_sums[splat, column] + total
 

@@ -103,7 +103,11 @@ def project_gaussians_kernel(
     margin_y = 0.15 * height / focal[1]
     ju = wp.clamp(u, -middle[0] / focal[0] - margin_x, (width - middle[0]) / focal[0] + margin_x)
     jv = wp.clamp(v, -middle[1] / focal[1] - margin_y, (height - middle[1]) / focal[1] + margin_y)
-    axes = view.world_to_camera * wp.quat_to_matrix(wp.normalize(orientations[i]))
+    orientation = orientations[i]
+    # Warp normalises a quaternion of NaN to 0, and turns 0 into a rotation.
+    if not (wp.dot(orientation, orientation) > 0.0):
+        return
+    axes = view.world_to_camera * wp.quat_to_matrix(wp.normalize(orientation))
     s = scales[i]
     scaled = axes * wp.diag(s)
     row_x = wp.vec3(scaled[0, 0], scaled[0, 1], scaled[0, 2])
@@ -132,9 +136,11 @@ def project_gaussians_kernel(
     if faint or not (wp.isfinite(x) and wp.isfinite(y) and wp.isfinite(det) and det > 0.0):
         return
     log_opacity = wp.log(opacity) + 0.5 * wp.log(kept)
-    least = wp.max(wp.min(s[0], wp.min(s[1], s[2])), SMALLEST_SCALE)
+    # Floored one by one: the adjoint of a maximum of equal numbers goes to one of them, and scales are often equal.
+    thick = wp.vec3(wp.max(s[0], SMALLEST_SCALE), wp.max(s[1], SMALLEST_SCALE), wp.max(s[2], SMALLEST_SCALE))
+    least = wp.min(thick[0], wp.min(thick[1], thick[2]))
     largest = wp.max(s[0], wp.max(s[1], s[2]))
-    inverse = wp.vec3(least / wp.max(s[0], least), least / wp.max(s[1], least), least / wp.max(s[2], least))
+    inverse = wp.vec3(least / thick[0], least / thick[1], least / thick[2])
     away = wp.vec3(u, v, 1.0)
     a = wp.cw_mul(inverse, wp.transpose(axes) * away)
     b0 = wp.cw_mul(inverse, wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])) / focal[0]
