@@ -249,7 +249,7 @@ class Rasterizer:
     def _reserve(self, capacity: int) -> None:
         """Make room for pairs."""
         self._tiles = wp.zeros(2 * capacity, dtype=int)  # the sort wants room for as many again
-        self._listed_tiles = self._tiles[:capacity]
+        self._listed_tiles = self._tiles[:capacity] if capacity else self._tiles
         self._slots = wp.zeros(2 * capacity, dtype=int)
         self._owners = wp.zeros(capacity, dtype=int)
         lists = TileLists()
