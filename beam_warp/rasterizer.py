@@ -404,7 +404,7 @@ class Rasterizer:
             self._blocks.values = gaussians.values
         for i, rows in enumerate(self._rows):
             launch_gather_channels(self._blocks, i * CHANNEL_COUNTS[-1], rows.matrix, self.device)
-        launch_key_splats(self._splats, self._views, self._count, self._keys, self._order, self.device)
+        launch_key_splats(self._splats, self._keys, self._order, self.device)
         if len(self._counts):
             wp.utils.radix_sort_pairs(self._keys, self._order, len(self._counts))
 
@@ -437,7 +437,7 @@ class Rasterizer:
         """Count the pairs of a band, splat by splat in depth order."""
         self._frame.band = _band(band)
         launch_count_pairs(
-            self._order, self._keys, self._splats, self._views, self._count, self._frame.band, self._counts, self.device
+            self._order, self._splats, self._views, self._count, self._frame.band, self._counts, self.device
         )
 
     def _bin(self, band: tuple[int, int]) -> None:

@@ -16,6 +16,8 @@ from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import Splats, View
 from beam_warp.kernels.row_loads import load_row
 from beam_warp.kernels.splat_rows import (
+    EXTENT_MARGIN,
+    RELATIVE_MARGIN,
     end_pixel_at,
     first_pixel_from,
     reach_columns,
@@ -51,29 +53,33 @@ class TileLists:
 
 
 @wp.func
-def row_range(center: wp.vec4, shape: wp.vec4, view: View) -> wp.vec2i:
-    """First and end row of pixels that a splat reaches."""
-    reach = reach_rows(shape, squared_extent(center[2]))
-    return wp.vec2i(first_pixel_from(center[1] - reach, view.height), end_pixel_at(center[1] + reach, view.height))
-
-
-@wp.func
-def tile_row_range(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec2i:
-    """First and end row of tiles that a splat reaches in a band; none if it is not drawn."""
+def tile_box(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec4i:
+    """First column, first row, end column and end row of the tiles of a band that a splat's box reaches."""
     if not (center[2] > -wp.inf):
-        return wp.vec2i(0, 0)
-    rows = row_range(center, shape, view)
-    if rows[1] <= rows[0]:
-        return wp.vec2i(0, 0)
-    first = wp.max(band.first_tile - view.first_tile, 0) / view.columns  # bands hold whole rows
-    end = wp.max(band.end_tile - view.first_tile, 0) / view.columns
-    top = wp.max(rows[0] / SIDE, first)
-    return wp.vec2i(top, wp.max(wp.min((rows[1] - 1) / SIDE + 1, end), top))
+        return wp.vec4i(0, 0, 0, 0)
+    squared = squared_extent(center[2])
+    down = reach_rows(shape, squared)
+    across = wp.sqrt(squared) / shape[0] * (1.0 + RELATIVE_MARGIN) + EXTENT_MARGIN
+    x0 = first_pixel_from(center[0] - across, view.width)
+    x1 = end_pixel_at(center[0] + across, view.width)
+    y0 = first_pixel_from(center[1] - down, view.height)
+    y1 = end_pixel_at(center[1] + down, view.height)
+    if x1 <= x0 or y1 <= y0:
+        return wp.vec4i(0, 0, 0, 0)
+    # Bands hold whole rows of tiles.
+    top = wp.max(y0 / SIDE, wp.max(band.first_tile - view.first_tile, 0) / view.columns)
+    bottom = wp.min((y1 - 1) / SIDE + 1, wp.max(band.end_tile - view.first_tile, 0) / view.columns)
+    return wp.vec4i(x0 / SIDE, top, (x1 - 1) / SIDE + 1, wp.max(bottom, top))
 
 
 @wp.func
-def tile_column_range(center: wp.vec4, shape: wp.vec4, view: View, row: int) -> wp.vec2i:
-    """First and end column of the tiles of a row that a splat's ellipse reaches."""
+def tile_columns(center: wp.vec4, shape: wp.vec4, view: View, box: wp.vec4i, row: int) -> wp.vec2i:
+    """First and end column of the tiles of a row that a splat's ellipse reaches.
+
+    Where the box is one tile wide or high, an ellipse, which touches all its sides, reaches all of it.
+    """
+    if box[2] - box[0] == 1 or box[3] - box[1] == 1:
+        return wp.vec2i(box[0], box[2])
     top = float(row * SIDE) + 0.5 - center[1]
     columns = reach_columns(shape, squared_extent(center[2]), top, top + LAST)
     first = first_pixel_from(center[0] + columns[0], view.width)
@@ -84,28 +90,13 @@ def tile_column_range(center: wp.vec4, shape: wp.vec4, view: View, row: int) -> 
 
 
 @wp.kernel
-def key_splats_kernel(
-    first: int,
-    splats: Splats,
-    views: wp.array[View],
-    gaussian_count: int,
-    out_keys: wp.array[int],
-    out_order: wp.array[int],
-):
-    """Depth of each splat as a sorting key; those on no pixel come last."""
+def key_splats_kernel(first: int, splats: Splats, out_keys: wp.array[int], out_order: wp.array[int]):
+    """Depth of each splat as a sorting key; those that are not drawn come last."""
     splat = first + wp.tid()
     center = load_row(splats.centers, splat)
     key = int(0x7F800000)  # infinity
     if center[2] > -wp.inf:
-        shape = load_row(splats.shapes, splat)
-        view = views[splat / gaussian_count]
-        squared = squared_extent(center[2])
-        rows = row_range(center, shape, view)
-        reach = wp.sqrt(squared) / shape[0] * 1.00001 + 0.01
-        x0 = first_pixel_from(center[0] - reach, view.width)
-        x1 = end_pixel_at(center[0] + reach, view.width)
-        if rows[1] > rows[0] and x1 > x0:
-            key = wp.cast(center[3], int)  # the bits of a positive float sort like an integer
+        key = wp.cast(center[3], int)  # the bits of a positive float sort like an integer
     out_keys[splat] = key
     out_order[splat] = splat
 
@@ -114,7 +105,6 @@ def key_splats_kernel(
 def count_pairs_kernel(
     first: int,
     order: wp.array[int],
-    keys: wp.array[int],
     splats: Splats,
     views: wp.array[View],
     gaussian_count: int,
@@ -122,16 +112,15 @@ def count_pairs_kernel(
     out_counts: wp.array[int],
 ):
     place = first + wp.tid()
+    splat = order[place]
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
+    view = views[splat / gaussian_count]
+    box = tile_box(center, shape, view, band)
     count = int(0)
-    if keys[place] < 0x7F800000:
-        splat = order[place]
-        center = load_row(splats.centers, splat)
-        shape = load_row(splats.shapes, splat)
-        view = views[splat / gaussian_count]
-        rows = tile_row_range(center, shape, view, band)
-        for row in range(rows[0], rows[1]):
-            columns = tile_column_range(center, shape, view, row)
-            count += columns[1] - columns[0]
+    for row in range(box[1], box[3]):
+        columns = tile_columns(center, shape, view, box, row)
+        count += columns[1] - columns[0]
     out_counts[place] = count
 
 
@@ -160,9 +149,9 @@ def emit_pairs_kernel(
     center = load_row(splats.centers, splat)
     shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
-    rows = tile_row_range(center, shape, view, band)
-    for row in range(rows[0], rows[1]):
-        columns = tile_column_range(center, shape, view, row)
+    box = tile_box(center, shape, view, band)
+    for row in range(box[1], box[3]):
+        columns = tile_columns(center, shape, view, box, row)
         for column in range(columns[0], columns[1]):
             if slot >= 0 and slot < end:
                 out_tiles[slot] = view.first_tile - band.first_tile + row * view.columns + column
@@ -192,23 +181,17 @@ def find_ranges_kernel(
         out_ranges[tile][1] = i + 1
 
 
-def launch_key_splats(splats, views, gaussian_count, keys, order, device):
+def launch_key_splats(splats, keys, order, device):
     """Write every splat's depth key and number."""
-    launch(
-        key_splats_kernel,
-        len(splats.centers),
-        inputs=[splats, views, gaussian_count],
-        outputs=[keys, order],
-        device=device,
-    )
+    launch(key_splats_kernel, len(splats.centers), inputs=[splats], outputs=[keys, order], device=device)
 
 
-def launch_count_pairs(order, keys, splats, views, gaussian_count, band, counts, device):
+def launch_count_pairs(order, splats, views, gaussian_count, band, counts, device):
     """Count the tiles of a band that each splat reaches, in depth order."""
     launch(
         count_pairs_kernel,
         len(splats.centers),
-        inputs=[order, keys, splats, views, gaussian_count, band],
+        inputs=[order, splats, views, gaussian_count, band],
         outputs=[counts],
         device=device,
     )

@@ -49,20 +49,19 @@ def normal_channels(blocks: ChannelBlocks) -> int:
 @wp.kernel(enable_backward=False)
 def gather_channels_kernel(first: int, blocks: ChannelBlocks, start: int, out_rows: wp.array2d[float]):
     """Channels from ``start`` on, as many as a row is long; what is beyond the last is 0."""
-    item = first + wp.tid()
-    length = out_rows.shape[1]
-    splat = item / length
-    channel = start + item % length
+    splat = first + wp.tid()
     colors_end = color_channels(blocks)
     normals_end = colors_end + normal_channels(blocks)
-    value = float(0.0)
-    if channel < colors_end:
-        value = blocks.colors[splat][channel]
-    elif channel < normals_end:
-        value = blocks.normals[splat][channel - colors_end]
-    elif channel < normals_end + blocks.values.shape[1]:
-        value = blocks.values[splat % blocks.values.shape[0], channel - normals_end]
-    out_rows[splat, item % length] = value
+    for column in range(out_rows.shape[1]):
+        channel = start + column
+        value = float(0.0)
+        if channel < colors_end:
+            value = blocks.colors[splat][channel]
+        elif channel < normals_end:
+            value = blocks.normals[splat][channel - colors_end]
+        elif channel < normals_end + blocks.values.shape[1]:
+            value = blocks.values[splat % blocks.values.shape[0], channel - normals_end]
+        out_rows[splat, column] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -120,7 +119,7 @@ def launch_evaluate_colors_adjoint(
 
 def launch_gather_channels(blocks, start, rows, device):
     """Write the channels from ``start`` on; ``rows`` are ``(splats, length)`` floats."""
-    launch(gather_channels_kernel, rows.shape[0] * rows.shape[1], inputs=[blocks, start], outputs=[rows], device=device)
+    launch(gather_channels_kernel, rows.shape[0], inputs=[blocks, start], outputs=[rows], device=device)
 
 
 def launch_scatter_channels(rows, columns, start, view_count, gradients, device):

@@ -14,7 +14,7 @@ from beam_warp.kernels.composite_adjoint import (
 from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
-from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
 
 
 @cache
@@ -59,33 +59,37 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
             row = channels[splat]
             total = Pair()
             rows = rows_in(box, center, shape)
+            reach = row_reach(shape, squared_extent(center[2]))
             for y in range(rows[0], rows[1]):
-                columns = columns_in(box, center, shape, y)
+                columns = columns_in(box, center, reach, y)
                 for x in range(columns[0], columns[1]):
                     pixel = view.first_pixel + y * view.width + x
+                    if k >= images.ends[pixel]:
+                        continue
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
                     e = whiten(shape, offset)
                     log_alpha = log_alpha_of(center, e)
-                    if k < images.ends[pixel] and log_alpha >= -LOG_CUT:
-                        state = out_states[pixel]
-                        total, before, behind = add_pixel(
-                            total,
-                            state[0],
-                            state[1],
-                            alpha_of(log_alpha),
-                            k == images.medians[pixel],
-                            pixel_adjoint(images, adjoints, pixel),
-                            channel_adjoints[pixel],
-                            center,
-                            shape,
-                            slope,
-                            bend,
-                            frame.near,
-                            offset,
-                            e,
-                            row,
-                        )
-                        out_states[pixel] = wp.vec2(before, behind)
+                    if log_alpha < -LOG_CUT:
+                        continue
+                    state = out_states[pixel]
+                    total, before, behind = add_pixel(
+                        total,
+                        state[0],
+                        state[1],
+                        alpha_of(log_alpha),
+                        k == images.medians[pixel],
+                        pixel_adjoint(images, adjoints, pixel),
+                        channel_adjoints[pixel],
+                        center,
+                        shape,
+                        slope,
+                        bend,
+                        frame.near,
+                        offset,
+                        e,
+                        row,
+                    )
+                    out_states[pixel] = wp.vec2(before, behind)
             out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel

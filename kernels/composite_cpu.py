@@ -15,14 +15,16 @@ from beam_warp.kernels.project import LOG_CUT, View
 from beam_warp.kernels.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
+    RowReach,
     alpha_of,
     depth_function,
     end_pixel_at,
     first_pixel_from,
     log_alpha_of,
     offset_from,
-    reach_columns,
+    reach_row,
     reach_rows,
+    row_reach,
     squared_extent,
     whiten,
 )
@@ -50,10 +52,9 @@ def rows_in(box: wp.vec4i, center: wp.vec4, shape: wp.vec4) -> wp.vec2i:
 
 
 @wp.func
-def columns_in(box: wp.vec4i, center: wp.vec4, shape: wp.vec4, y: int) -> wp.vec2i:
+def columns_in(box: wp.vec4i, center: wp.vec4, row: RowReach, y: int) -> wp.vec2i:
     """First and end x of a box's pixels that a splat reaches in a row."""
-    height = float(y) + 0.5 - center[1]
-    columns = reach_columns(shape, squared_extent(center[2]), height, height)
+    columns = reach_row(row, float(y) + 0.5 - center[1])
     return wp.vec2i(
         wp.max(first_pixel_from(center[0] + columns[0], box[2]), box[0]), end_pixel_at(center[0] + columns[1], box[2])
     )
@@ -96,35 +97,40 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
             bend = frame.splats.bends[splat]
             row = channels[splat]
             rows = rows_in(box, center, shape)
+            reach = row_reach(shape, squared_extent(center[2]))
             for y in range(rows[0], rows[1]):
-                columns = columns_in(box, center, shape, y)
+                columns = columns_in(box, center, reach, y)
+                start = view.first_pixel + y * view.width
                 for x in range(columns[0], columns[1]):
-                    pixel = view.first_pixel + y * view.width + x
+                    pixel = start + x
                     transmittance = out_images.transmittance[pixel]
+                    if transmittance < TRANSMITTANCE_STOP:
+                        continue
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
                     log_alpha = log_alpha_of(center, whiten(shape, offset))
-                    if transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT:
-                        alpha = alpha_of(log_alpha)
-                        weight = alpha * transmittance
-                        z = depth_at(center, shape, slope, bend, frame.near, offset)
-                        out_channels[pixel] = out_channels[pixel] + row * weight
-                        out_images.depth[pixel] = out_images.depth[pixel] + z * weight
-                        out_images.alpha[pixel] = out_images.alpha[pixel] + weight
-                        if transmittance > MEDIAN:
-                            out_images.median_depth[pixel] = z
-                            out_images.medians[pixel] = k
-                        out_images.gaussians[pixel] = splat % frame.gaussian_count
-                        out_images.ends[pixel] = k + 1
-                        transmittance *= 1.0 - alpha
-                        out_images.transmittance[pixel] = transmittance
-                        if transmittance < TRANSMITTANCE_STOP:
-                            open_pixels -= 1
+                    if log_alpha < -LOG_CUT:
+                        continue
+                    alpha = alpha_of(log_alpha)
+                    weight = alpha * transmittance
+                    z = depth_at(center, shape, slope, bend, frame.near, offset)
+                    out_channels[pixel] = out_channels[pixel] + row * weight
+                    out_images.depth[pixel] = out_images.depth[pixel] + z * weight
+                    out_images.alpha[pixel] = out_images.alpha[pixel] + weight
+                    if transmittance > MEDIAN:
+                        out_images.median_depth[pixel] = z
+                        out_images.medians[pixel] = k
+                    out_images.ends[pixel] = k + 1
+                    transmittance *= 1.0 - alpha
+                    out_images.transmittance[pixel] = transmittance
+                    if transmittance < TRANSMITTANCE_STOP:
+                        open_pixels -= 1
         for y in range(box[1], box[3]):
             for x in range(box[0], box[2]):
                 pixel = view.first_pixel + y * view.width + x
                 weight_sum = out_images.alpha[pixel]
                 if weight_sum > 0.0:
                     out_images.depth[pixel] = out_images.depth[pixel] / weight_sum
+                    out_images.gaussians[pixel] = frame.lists.splats[out_images.ends[pixel] - 1] % frame.gaussian_count
 
     return composite_tiles_kernel
 

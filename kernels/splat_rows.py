@@ -57,6 +57,36 @@ def reach_columns(shape: wp.vec4, squared: float, top: float, bottom: float) -> 
     return wp.vec2(left / k - margin, right / k + margin)
 
 
+@wp.struct
+class RowReach:
+    """What the pixels that a splat reaches in a row of pixels follow from, the same for all rows."""
+
+    lean: float  # x of their middle over y, both from the centre
+    widest: float  # square of half their extent in the centre's row
+    narrowing: float  # how much of it each squared y takes
+
+
+@wp.func
+def row_reach(shape: wp.vec4, squared: float) -> RowReach:
+    e = shape[1] * shape[2]
+    k = shape[0] * shape[0] + e * e
+    found = RowReach()
+    found.lean = e * shape[2] / k
+    found.widest = squared / k
+    sharpness = shape[0] * shape[2] / k
+    found.narrowing = sharpness * sharpness
+    return found
+
+
+@wp.func
+def reach_row(row: RowReach, y: float) -> wp.vec2:
+    """Least and greatest x of the ellipse where alpha is 1/255 at a y, from the centre; `reach_columns` of one row."""
+    middle = row.lean * y
+    half = wp.sqrt(wp.max(row.widest - row.narrowing * y * y, 0.0))
+    margin = RELATIVE_MARGIN * (wp.abs(middle) + half) + EXTENT_MARGIN
+    return wp.vec2(middle - half - margin, middle + half + margin)
+
+
 @wp.func
 def first_pixel_from(edge: float, limit: int) -> int:
     """First of ``limit`` pixels whose centre is not before an edge; clamped as a float: no integer holds every one."""
