@@ -149,46 +149,73 @@ class GsplatPeer:
         with self.torch.no_grad():
             return len(self._draw(self.tensors)[2]["flatten_ids"])
 
-    def time_forward(self, repeats: int = 50, warm_up: int = 10) -> Seconds:
-        """Time drawing without gradients."""
+    def forward(self) -> None:
+        """Draw without gradients, and leave the images on the device."""
+        with self.torch.no_grad():
+            self._draw(self.tensors)
 
-        def forward() -> None:
-            with self.torch.no_grad():
-                self._draw(self.tensors)
-
-        return self._timed(forward, repeats, warm_up)
-
-    def time_training(self, repeats: int = 50, warm_up: int = 10, seed: int = 0) -> Seconds:
-        """Time drawing and the way back, from random gradients of all images to those of `LEAVES`."""
-        leaves, step = self._training(seed)
+    def training(self, upstream: Images) -> Callable[[], None]:
+        """Return what draws and finds the gradients of `LEAVES` under a loss's derivatives to the images."""
+        leaves, step = self._training(upstream)
 
         def forward_and_backward() -> None:
             for leaf in leaves.values():
                 leaf.grad = None
             step()
 
-        return self._timed(forward_and_backward, repeats, warm_up)
+        return forward_and_backward
 
-    def gradients(self, seed: int = 0) -> dict[str, NDArray[np.float32]]:
-        """Return the gradients of `LEAVES`, in gsplat's conventions, under the images' gradients of `time_training`."""
-        leaves, step = self._training(seed)
+    def gradients(self, upstream: Images) -> dict[str, NDArray[np.float32]]:
+        """Return the gradients of `LEAVES`, in gsplat's conventions, under a loss's derivatives to the images."""
+        leaves, step = self._training(upstream)
         step()
         return {name: leaf.grad.cpu().numpy() for name, leaf in leaves.items()}
 
-    def _training(self, seed: int) -> tuple[dict[str, Any], Callable[[], None]]:
+    def random_upstream(self, seed: int = 0) -> Images:
+        """Return normally distributed derivatives to every image."""
+        rng = np.random.default_rng(seed)
+        shape = (self._options["height"], self._options["width"])
+        sizes = ((*shape, self.tensors["colors"].shape[1]), shape, shape)
+        return Images(*(rng.standard_normal(size, dtype=np.float32) for size in sizes))
+
+    def event(self) -> Any:
+        """Record an event on the stream that gsplat launches on."""
+        with self.torch.cuda.device(self.device):
+            event = self.torch.cuda.Event(enable_timing=True)
+            event.record()
+        return event
+
+    @staticmethod
+    def seconds_between(begin: Any, end: Any) -> float:
+        """Return the seconds from one event to another, which the device has passed."""
+        return 1e-3 * begin.elapsed_time(end)
+
+    def timed(self, work: Callable[[], None], repeats: int = 50, warm_up: int = 10) -> Seconds:
+        """Time work, after as much of it that kernels are compiled and memory is reserved."""
+        for _ in range(warm_up):
+            work()
+        wall, device = [], []
+        for _ in range(repeats):
+            self.torch.cuda.synchronize(self.device)
+            started = time.perf_counter()
+            begin = self.event()
+            work()
+            end = self.event()
+            self.torch.cuda.synchronize(self.device)
+            wall.append(time.perf_counter() - started)
+            device.append(self.seconds_between(begin, end))
+        return Seconds(np.array(wall), np.array(device))
+
+    def _training(self, upstream: Images) -> tuple[dict[str, Any], Callable[[], None]]:
         """Return tensors that ask for gradients, and what draws and adds to them."""
         leaves = {name: self.tensors[name].clone().requires_grad_() for name in LEAVES}
         tensors = {**self.tensors, **leaves}
-        generator = self.torch.Generator(device=self.device).manual_seed(seed)
-        shape = (1, self._options["height"], self._options["width"])
-        channels = self.tensors["colors"].shape[1] + 1
-        upstream = [
-            self.torch.randn((*shape, count), generator=generator, device=self.device) for count in (channels, 1)
-        ]
+        rendered = np.concatenate([upstream.values, upstream.depth[..., None]], axis=-1)
+        given = [self.torch.tensor(array[None], device=self.device) for array in (rendered, upstream.alpha[..., None])]
 
         def step() -> None:
             rendered, alpha, _ = self._draw(tensors)
-            self.torch.autograd.backward([rendered, alpha], upstream)
+            self.torch.autograd.backward([rendered, alpha], given)
 
         return leaves, step
 
@@ -196,25 +223,6 @@ class GsplatPeer:
         """Return channels and depth ``(1, H, W, K + 1)``, alpha ``(1, H, W, 1)``, and what gsplat says of itself."""
         with self.torch.cuda.device(self.device):
             return self._rasterization(**tensors, **self._options)
-
-    def _timed(self, work: Callable[[], None], repeats: int, warm_up: int) -> Seconds:
-        """Time work that has been done before, so that kernels are compiled and memory is reserved."""
-        cuda = self.torch.cuda
-        with cuda.device(self.device):
-            for _ in range(warm_up):
-                work()
-            wall, device = [], []
-            for _ in range(repeats):
-                begin, end = cuda.Event(enable_timing=True), cuda.Event(enable_timing=True)
-                cuda.synchronize(self.device)
-                started = time.perf_counter()
-                begin.record()
-                work()
-                end.record()
-                cuda.synchronize(self.device)
-                wall.append(time.perf_counter() - started)
-                device.append(1e-3 * begin.elapsed_time(end))
-        return Seconds(np.array(wall), np.array(device))
 
 
 def main() -> None:
@@ -242,8 +250,8 @@ def main() -> None:
         "packed": args.packed,
         "pairs": peer.pair_count(),
         "coverage": float((images.alpha > 0.5).mean()),
-        "forward_seconds": peer.time_forward(args.repeats).summary(),
-        "training_seconds": peer.time_training(args.repeats).summary(),
+        "forward_seconds": peer.timed(peer.forward, args.repeats).summary(),
+        "training_seconds": peer.timed(peer.training(peer.random_upstream()), args.repeats).summary(),
         "memory_mib": round(peer.torch.cuda.max_memory_allocated(peer.device) / 2**20),
     }
     print(json.dumps(found, indent=1))
