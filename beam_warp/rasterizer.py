@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -144,7 +144,9 @@ class Rasterizer:
 
     All arrays stay on the device and where they are. `draw` waits for the device, to learn how much room the frame
     takes; `redraw`, and `backward` from its second call on, wait for nothing and allocate nothing, so that they can be
-    captured in a CUDA graph.
+    captured in a CUDA graph. Capture again after a `draw` that changed `pair_capacity`.
+
+    Gaussians that are not finite, or whose quaternion is 0, are not drawn; their own gradients may not be finite.
 
     Attributes:
         device: Where everything is.
@@ -258,7 +260,7 @@ class Rasterizer:
         lists.slots = self._slots
         self._lists = lists
         self._frame.lists = lists
-        self._back = None
+        self._pair_rows: dict[int, Rows] = {}
 
     def set_cameras(self, cameras: Sequence[Camera]) -> None:
         """Move cameras or change their lenses; their number and sizes stay.
@@ -289,7 +291,11 @@ class Rasterizer:
 
         More than `pair_capacity` after `redraw`: the images lack splats. Call `draw`.
         """
-        return int(self._counts.numpy().sum(dtype=np.int64))
+        if not len(self._counts):
+            return 0
+        if len(self._counts) * int(self._layout.first_tiles[-1]) < 2**31:
+            return int(self._ends[-1:].numpy()[0])
+        return int(self._counts.numpy().sum(dtype=np.int64))  # the ends may be beyond the range of integers
 
     def draw(self, gaussians: GaussianArrays) -> RasterImages:
         """Draw Gaussians, however much room they take.
@@ -311,7 +317,9 @@ class Rasterizer:
             self._project(gaussians)
             self._bands = self._plan_bands()
             for band in self._bands:
-                self._bin(band)
+                if len(self._bands) > 1:
+                    self._count_pairs(band)
+                self._list_pairs()
                 self._composite()
         return self.images
 
@@ -329,7 +337,8 @@ class Rasterizer:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
             self._project(gaussians)
-            self._bin(self._bands[0])
+            self._count_pairs(self._bands[0])
+            self._list_pairs()
             self._composite()
         return self.images
 
@@ -354,10 +363,12 @@ class Rasterizer:
         gaussians = self._drawn_gaussians("backward")
         with wp.ScopedDevice(self.device):
             back = self._backward_buffers()
+            back.match(gaussians if self.color_channels else None)
             back.zero_()
             for band in self._bands:
                 if len(self._bands) > 1:
-                    self._bin(band)
+                    self._count_pairs(band)
+                    self._list_pairs()
                 self._composite_adjoint(back)
             return self._project_adjoint(gaussians, back)
 
@@ -434,20 +445,21 @@ class Rasterizer:
         return bands
 
     def _count_pairs(self, band: tuple[int, int]) -> None:
-        """Count the pairs of a band, splat by splat in depth order."""
+        """Count the pairs of a band, splat by splat in depth order, and what each one's are the end of."""
         self._frame.band = _band(band)
         launch_count_pairs(
             self._order, self._splats, self._views, self._count, self._frame.band, self._counts, self.device
         )
+        if len(self._counts):
+            wp.utils.array_scan(self._counts, self._ends, inclusive=True)
 
-    def _bin(self, band: tuple[int, int]) -> None:
-        """List the splats of every tile of a band."""
-        self._count_pairs(band)
-        tile_count = band[1] - band[0]
+    def _list_pairs(self) -> None:
+        """List the splats of every tile of the band that was counted."""
+        band = self._frame.band
+        tile_count = band.end_tile - band.first_tile
         self._lists.ranges.zero_()
         if not self.pair_capacity:
             return
-        wp.utils.array_scan(self._counts, self._ends, inclusive=True)
         self._listed_tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
         launch_emit_pairs(
             self._order,
@@ -476,6 +488,13 @@ class Rasterizer:
             self._back = _BackwardBuffers.of(self)
         return self._back
 
+    def _rows_of_pairs(self, channel_count: int) -> Rows:
+        """Return where the moments and channels of pairs go, allocated when first asked for."""
+        if channel_count not in self._pair_rows:
+            dtype = pair_vector(channel_count, self._exact)
+            self._pair_rows[channel_count] = Rows.zeros(self.pair_capacity, dtype, self.device)
+        return self._pair_rows[channel_count]
+
     def _composite_adjoint(self, back: _BackwardBuffers) -> None:
         """Add what the band at hand says to the gradients of splats and of their rows."""
         if not self.pair_capacity:
@@ -484,7 +503,7 @@ class Rasterizer:
         upstream.alpha, upstream.depth = back.images.alpha, back.images.depth
         upstream.median_depth = back.images.median_depth
         for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
-            pairs = back.pairs[rows.length]
+            pairs = self._rows_of_pairs(rows.length)
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
             if self.device.is_cuda:
                 launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
@@ -527,14 +546,13 @@ class Rasterizer:
         return found
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _BackwardBuffers:
     """What the way back needs besides what was drawn."""
 
     images: RasterImages
     channel_adjoints: list[Rows]
     states: wp.array
-    pairs: dict[int, Rows]
     splats: Splats
     sums: list[wp.array]
     blocks: ChannelBlocks
@@ -547,10 +565,7 @@ class _BackwardBuffers:
         splat_count, pixel_count = count * len(rasterizer.cameras), rasterizer.first_pixels[-1]
         channel_count, exact = rasterizer.value_channels.stop, rasterizer._exact
         adjoints = channel_rows(pixel_count, channel_count, device)
-        lengths = {rows.length for rows in adjoints}
         has_colors, value_count = bool(rasterizer.color_channels), len(rasterizer.value_channels)
-        gaussians = rasterizer._gaussians
-        bands = gaussians.radiance.shape[1] if has_colors and gaussians is not None else 0
         splats = _zero_splats(splat_count)
         blocks = ChannelBlocks()
         blocks.values = wp.zeros((count, value_count), dtype=float)
@@ -562,7 +577,6 @@ class _BackwardBuffers:
             ),
             adjoints,
             wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
-            {n: Rows.zeros(rasterizer.pair_capacity, pair_vector(n, exact), device) for n in lengths},
             splats,
             [wp.zeros((splat_count, pair_length(rows.length, exact)), dtype=float) for rows in adjoints],
             blocks,
@@ -572,9 +586,17 @@ class _BackwardBuffers:
                 wp.zeros(count, dtype=wp.vec3),
                 wp.zeros(count, dtype=float),
                 blocks.values if value_count else None,
-                wp.zeros((count, bands), dtype=wp.vec3) if has_colors else None,
+                None,
             ),
         )
+
+    def match(self, colored: GaussianArrays | None) -> None:
+        """Make room for as many coefficients of captured colour as Gaussians that show it have."""
+        if colored is None or colored.radiance is None:
+            return
+        held = self.gaussians.radiance
+        if held is None or held.shape != colored.radiance.shape:
+            self.gaussians = replace(self.gaussians, radiance=wp.zeros_like(colored.radiance))
 
     def zero_(self) -> None:
         """Begin a new sum."""
