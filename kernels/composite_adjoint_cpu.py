@@ -69,7 +69,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
                     e = whiten(shape, offset)
                     log_alpha = log_alpha_of(center, e)
-                    if log_alpha < -LOG_CUT:
+                    if not (log_alpha >= -LOG_CUT):
                         continue
                     state = out_states[pixel]
                     total, before, behind = add_pixel(

@@ -104,11 +104,11 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                 for x in range(columns[0], columns[1]):
                     pixel = start + x
                     transmittance = out_images.transmittance[pixel]
-                    if transmittance < TRANSMITTANCE_STOP:
+                    if not (transmittance >= TRANSMITTANCE_STOP):
                         continue
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
                     log_alpha = log_alpha_of(center, whiten(shape, offset))
-                    if log_alpha < -LOG_CUT:
+                    if not (log_alpha >= -LOG_CUT):
                         continue
                     alpha = alpha_of(log_alpha)
                     weight = alpha * transmittance

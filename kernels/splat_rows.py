@@ -89,14 +89,20 @@ def reach_row(row: RowReach, y: float) -> wp.vec2:
 
 @wp.func
 def first_pixel_from(edge: float, limit: int) -> int:
-    """First of ``limit`` pixels whose centre is not before an edge; clamped as a float: no integer holds every one."""
-    return int(wp.clamp(wp.ceil(edge - 0.5), 0.0, float(limit)))
+    """First of ``limit`` pixels whose centre is not before an edge.
+
+    Clamped as a float, since no integer holds every one; and rounded as an integer, since a rounding function is a call
+    on processors without SSE 4.1, for which Warp compiles.
+    """
+    start = wp.clamp(edge - 0.5, 0.0, float(limit))
+    whole = int(start)
+    return whole + wp.where(float(whole) < start, 1, 0)
 
 
 @wp.func
 def end_pixel_at(edge: float, limit: int) -> int:
     """End of those of ``limit`` pixels whose centre is not beyond an edge."""
-    return int(wp.clamp(wp.floor(edge - 0.5) + 1.0, 0.0, float(limit)))
+    return int(wp.clamp(edge + 0.5, 0.0, float(limit)))
 
 
 @wp.func_native("""
