@@ -120,6 +120,7 @@ class TorchRasterizer:
         }
         self._stream: Any = None
         self._drawn: _Ticket | None = None
+        self._shared: dict[str, tuple[Any, list[Any]]] = {}
         with self._torch_stream():
             self._rasterizer = Rasterizer(
                 gaussian_count,
@@ -230,17 +231,18 @@ class TorchRasterizer:
         self._drawn = ticket
         return images
 
-    def _forward(self, ticket: _Ticket, tensors: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor | None, ...]:
+    def _forward(self, ticket: _Ticket, given: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor | None, ...]:
         """Draw, and copy what was drawn."""
         with self._torch_stream():
-            images = self._render(ticket, tensors)
-            passes = [wp.to_torch(rows) for rows in images.channels]
+            images = self._render(ticket, given)
+            arrays = (images.alpha, images.depth, images.median_depth, self._rasterizer.gaussian_ids, *images.channels)
+            tensors = self._share("images", images, arrays)
+            flat, passes = tensors[:4], tensors[4:]
             channels = [
                 torch.cat([passes[i][:, columns] for i, columns, _ in _cuts(block)], dim=1) if block else None
                 for block in self._blocks()
             ]
-            flat = (images.alpha, images.depth, images.median_depth, self._rasterizer.gaussian_ids)
-            return (*channels, *(wp.to_torch(image).clone() for image in flat))
+            return (*channels, *(image.clone() for image in flat))
 
     def _backward(
         self,
@@ -254,20 +256,26 @@ class TorchRasterizer:
             if self._drawn is not ticket:
                 self._render(ticket, tensors)
             adjoints = self._rasterizer.adjoints()
-            passes = [wp.to_torch(rows) for rows in adjoints.channels]
+            arrays = (adjoints.alpha, adjoints.depth, adjoints.median_depth, *adjoints.channels)
+            targets = self._share("adjoints", adjoints, arrays)
+            flat, passes = targets[:3], targets[3:]
             for block, gradient in zip(self._blocks(), upstream[:3], strict=True):
                 for i, columns, own in _cuts(block):
                     _put(passes[i][:, columns], None if gradient is None else gradient[:, own])
-            for image, gradient in zip(
-                (adjoints.alpha, adjoints.depth, adjoints.median_depth), upstream[3:6], strict=True
-            ):
-                _put(wp.to_torch(image), gradient)
+            for target, gradient in zip(flat, upstream[3:6], strict=True):
+                _put(target, gradient)
             found = self._rasterizer.backward()
             arrays = (found.positions, found.orientations, found.scales, found.opacities, found.values, found.radiance)
-            return [
-                wp.to_torch(array).clone() if want and array is not None else None
-                for array, want in zip(arrays, wanted, strict=True)
-            ]
+            gradients = self._share("gradients", found, arrays)
+            return [gradient.clone() if want else None for gradient, want in zip(gradients, wanted, strict=True)]
+
+    def _share(self, name: str, owner: Any, arrays: Sequence[Any]) -> list[Any]:
+        """Return tensors over a record's arrays, the same ones as long as it is the same record."""
+        held = self._shared.get(name)
+        if held is None or held[0] is not owner:
+            held = owner, [None if array is None else wp.to_torch(array) for array in arrays]
+            self._shared[name] = held
+        return held[1]
 
     def _blocks(self) -> tuple[range, range, range]:
         """Where colours, normals and values are among the channels."""
