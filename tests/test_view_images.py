@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import warp as wp
 
 from beam_warp.cameras import Camera
 from beam_warp.devices import upload
@@ -15,8 +16,6 @@ from beam_warp.view_images import view_images
 
 def drawn(device, rng, value_count=5):
     """A rasteriser that has drawn colours, normals and values for two cameras of different sizes."""
-    import warp as wp
-
     cameras = [
         Camera.orbit((0, 0, 0), 3.0, 20.0 * i, 10.0, width=width, height=height, vertical_fov=40.0)
         for i, (width, height) in enumerate([(24, 17), (9, 20)])
