@@ -28,6 +28,10 @@ class DeviceError(BeamError, RuntimeError):
     """A compute device was asked for that is not there."""
 
 
+class MissingPackageError(BeamError, ImportError):
+    """A room was imported whose optional package is not installed; the message names the extra."""
+
+
 class MissingFileError(BeamError, FileNotFoundError):
     """An input file or folder does not exist or cannot be read."""
 
