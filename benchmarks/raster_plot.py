@@ -21,6 +21,9 @@ HERE = Path(__file__).parent
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
 """What is timed in growth rows, and how it is called."""
 
+COLORS = [f"C{number}" for number in (0, 1, 2, 3, 4, 5, 6, 9)]
+"""Of stages in their order: all but the greys, which are the rest's."""
+
 
 class Way(NamedTuple):
     """One way to draw, as a line: its name in the results, the clock it is read from, and how it looks."""
@@ -83,7 +86,7 @@ def draw_stages(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             total = sum(part[way]["ms"].values())
             for number, stage in enumerate((*order, REST)):
                 width = 100.0 * part[way]["ms"].get(stage, 0.0) / total
-                color = "0.8" if stage == REST else f"C{number}"
+                color = "0.8" if stage == REST else COLORS[number]
                 axes.barh(place, width, left=begin, color=color, label=stage if not place else None)
                 if width > 6.0:
                     text = f"{part[way]['ms'][stage]:.3g}"
