@@ -53,6 +53,9 @@ Row = dict[str, Any]
 CASES = {"RGB and depth": 3, "11 channels and depth": 11}
 """Channels of the comparison with gsplat; 3 are the captured colour."""
 
+PARTS = ("forward", "backward", "training")
+"""What is timed of a training step: drawing, the way back, and both one after the other."""
+
 FLIP = 1e-4
 """A larger difference is a decision that fell the other way: a splat at the cut of alpha, the stop, the order of two,
 the pick of the median. Rounding stays below."""
@@ -152,14 +155,12 @@ def peer_adjoints(scene: RasterScene, adjoints: Seen) -> PeerImages:
     )
 
 
-def contenders_for(scene: RasterScene, values: NDArray[np.float32], device: Any) -> tuple[dict[str, Clocked], Row]:
-    """Return everything that draws a scene here, forwards, backwards and both, and facts about the scene."""
+def contenders_for(
+    scene: RasterScene, values: NDArray[np.float32], device: Any, parts: Sequence[str] = PARTS
+) -> tuple[dict[str, Clocked], Row]:
+    """Return everything that draws a scene here, of some `PARTS` of a step, and facts about the scene."""
     drawing = Drawing(scene, device, values=values)
-    works: dict[str, Callable[[], Any]] = {
-        "forward": drawing.forward,
-        "backward": drawing.backward,
-        "training": drawing.training,
-    }
+    works: dict[str, Callable[[], Any]] = {part: getattr(drawing, part) for part in parts}
     found = {f"ours redraw, {name}": Clocked.on(device, work) for name, work in works.items()}
     facts: Row = {"pairs": drawing.rasterizer.pair_count(), "covered": digits((drawing.seen().alpha > OPAQUE).mean())}
     if device.is_cuda:
@@ -370,7 +371,7 @@ def measure_growth(effort: Effort, device: Any, say: Callable[[str], None]) -> R
     found: Row = {"gaussians": [], "pixels": [], "repeats": effort.growth_repeats}
     for series, scene in growth(effort.counts, effort.sizes, count=effort.gaussians, size=effort.size):
         say(f"growth: {len(scene.cloud):,} Gaussians, {scene.camera.width} x {scene.camera.height}")
-        contenders, facts = contenders_for(scene, scene.values(), device)
+        contenders, facts = contenders_for(scene, scene.values(), device, ("forward", "training"))
         measured = measure_in_turn(contenders, effort.growth_repeats, device, two_threads=True)
         found[series].append(
             {

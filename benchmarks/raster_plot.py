@@ -61,11 +61,11 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             for result in results:
                 for way in ON_CPU if result["machine"]["device"] == "cpu" else ON_CUDA:
                     _draw_line(axes, result["growth"][series], series, part, way, device_name(result))
-            sizes = {_still(result["growth"][series], series) for result in results}
-            axes.set(title=f"{called}: {'; '.join(sorted(sizes))}", ylabel="time [ms]", xlabel=_axis_label(series))
+            sizes = [f"{device_name(result)} {_still(result['growth'][series], series)}" for result in results]
+            axes.set(title=f"{called}: {'; '.join(sizes)}", ylabel="time [ms]", xlabel=_axis_label(series))
             _log_axes(axes)
     panels[0, 0].legend()
-    figure.suptitle("11 channels, depth, median depth and alpha of a figure that covers a quarter of the image")
+    figure.suptitle("11 channels, depth, median depth and alpha of a figure; areas are ranges over repeats")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -25,7 +25,6 @@ from raster_contenders import (
     measure_in_turn,
     record_event,
     seconds_between,
-    spread,
 )
 
 from beam_warp import rasterizer
@@ -152,9 +151,8 @@ def measure_stages(make: Callable[[], Drawing], repeats: int, device: Any) -> di
         }
     if unwatched is not None:
         for name, work in (("forward", unwatched.forward), ("backward", unwatched.backward)):
-            launch = captured(work, device)
-            seconds = measure_in_turn({name: Clocked.on(device, launch)}, repeats, device)[name].device
-            found[name]["graph_ms"] = spread(seconds)
+            launch = Clocked.on(device, captured(work, device))
+            found[name]["graph"] = measure_in_turn({name: launch}, repeats, device)[name].summary()
         found["kernels"] = measure_kernels(unwatched, repeats)
     return found
 
