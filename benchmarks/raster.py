@@ -554,15 +554,20 @@ def markdown(result: Row) -> str:
                     f"| {stage} | {value:g} | {100 * part[way]['share'][stage]:.0f} % |"
                     for stage, value in part[way]["ms"].items()
                 ]
-                lines.append(f"| **{way}** | {part[way]['total_ms']:g} | |")
+                graph = part[way].get("graph")
+                beside = "" if graph is None else f", {graph['device_ms']['median']:g} as a graph"
+                lines.append(f"| **{way}** | {part[way]['total_ms']:g}{beside} | |")
     for series in ("gaussians", "pixels"):
         rows = measured.get("growth", {}).get(series, [])
         for row in rows:
             label = f"{row['splats']:,} at {row['width']} x {row['height']}"
             lines += ["", *_time_table(f"{label}, {row['pairs']:,} pairs", row["ms"])]
-    if "accuracy" in measured:
-        shown = {name: part for name, part in measured["accuracy"].items() if isinstance(part, dict)}
-        lines += ["", "```json", json.dumps(shown, indent=1), "```"]
+    for name in ("peer", "accuracy"):
+        shown = {
+            key: part for key, part in measured.get(name, {}).items() if key.startswith(("agree", "figure", "cube"))
+        }
+        if shown:
+            lines += ["", f"{name}:", "", "```json", json.dumps(shown, indent=1), "```"]
     return "\n".join(lines) + "\n"
 
 
