@@ -39,9 +39,9 @@ from raster_contenders import (
     measure_in_turn,
     random_adjoints,
 )
-from raster_scenes import RasterScene, cube, figure
+from raster_scenes import RasterScene, cube, figure, growth
 from raster_stages import measure_stages
-from raster_truth import brute_force
+from raster_truth import Truth, brute_force
 from timing import commit, launch_threads, machine
 
 from beam_warp.devices import resolve_device
@@ -52,6 +52,9 @@ Row = dict[str, Any]
 
 CASES = {"RGB and depth": 3, "11 channels and depth": 11}
 """Channels of the comparison with gsplat; 3 are the captured colour."""
+
+PARTS = ("forward", "backward", "training")
+"""What is timed of a training step: drawing, the way back, and both one after the other."""
 
 FLIP = 1e-4
 """A larger difference is a decision that fell the other way: a splat at the cut of alpha, the stop, the order of two,
@@ -100,12 +103,12 @@ class Effort:
 ON_CPU = Effort(
     gaussians=100_000,
     size=(512, 512),
-    repeats=5,
+    repeats=3,
     slow_repeats=2,
     stage_repeats=5,
     truth_pixels=200,
     counts=(1_000, 3_000, 10_000, 30_000, 100_000, 200_000),
-    sizes=((128, 128), (256, 256), (512, 512), (1024, 1024), (1920, 1080), (3840, 2160)),
+    sizes=((128, 128), (256, 256), (512, 512), (1920, 1080), (3840, 2160)),
     growth_repeats=2,
 )
 ON_CUDA = Effort(
@@ -152,18 +155,14 @@ def peer_adjoints(scene: RasterScene, adjoints: Seen) -> PeerImages:
     )
 
 
-def contenders_for(scene: RasterScene, values: NDArray[np.float32], device: Any) -> tuple[dict[str, Clocked], Row]:
-    """Return everything that draws a scene here, forwards, backwards and both, and facts about the scene."""
+def contenders_for(
+    scene: RasterScene, values: NDArray[np.float32], device: Any, parts: Sequence[str] = PARTS
+) -> tuple[dict[str, Clocked], Row]:
+    """Return everything that draws a scene here, of some `PARTS` of a step, and facts about the scene."""
     drawing = Drawing(scene, device, values=values)
-    works: dict[str, Callable[[], Any]] = {
-        "forward": drawing.forward,
-        "backward": drawing.backward,
-        "training": drawing.training,
-    }
+    works: dict[str, Callable[[], Any]] = {part: getattr(drawing, part) for part in parts}
     found = {f"ours redraw, {name}": Clocked.on(device, work) for name, work in works.items()}
-    found["ours draw, forward"] = Clocked.on(device, drawing.draw)
-    pairs = drawing.rasterizer.pair_count()
-    facts: Row = {"pairs": pairs, "covered": digits((drawing.seen().alpha > OPAQUE).mean())}
+    facts: Row = {"pairs": drawing.rasterizer.pair_count(), "covered": digits((drawing.seen().alpha > OPAQUE).mean())}
     if device.is_cuda:
         found |= {f"ours graph, {name}": Clocked.on(device, captured(work, device)) for name, work in works.items()}
     peer, absent = peer_for(scene, values, device)
@@ -276,15 +275,17 @@ def measure_frames(effort: Effort, device: Any) -> Row:
 
 
 def measure_all_stages(effort: Effort, device: Any) -> Row:
-    """Time the stages of RGB and depth, of 11 channels, and of all; on the CPU of one thread, and of two."""
-    scene = figure(effort.gaussians, *effort.size)
-    makers: dict[str, Callable[[], Drawing]] = {
+    """Time the stages of a frame: on CUDA of few channels and of many; on the CPU of many, by one thread and two."""
+    scene, dense = figure(effort.gaussians, *effort.size), cube(effort.gaussians, *effort.size)
+    few = {
         case: lambda count=count: Drawing(scene, device, values=np.ascontiguousarray(scene.values()[:, :count]))
         for case, count in CASES.items()
     }
-    makers["17 channels and depth"] = lambda: Drawing(scene, device, **all_channels(scene))
-    dense = cube(effort.gaussians, *effort.size)
-    makers["cube, 11 channels and depth"] = lambda: Drawing(dense, device)
+    makers: dict[str, Callable[[], Drawing]] = {
+        **(few if device.is_cuda else {}),
+        "17 channels and depth": lambda: Drawing(scene, device, **all_channels(scene)),
+        "cube, 11 channels and depth": lambda: Drawing(dense, device),
+    }
     found: Row = {"scene": describe(scene), "repeats": effort.stage_repeats}
     for case, make in makers.items():
         if device.is_cuda:
@@ -318,6 +319,10 @@ def measure_variants(effort: Effort, device: Any) -> Row:
         measured = measure_in_turn(tasks, effort.slow_repeats, device)
         seen = {name: drawing.seen() for name, drawing in drawings.items()}
         pixels = sampled_pixels(seen["plane"], effort.truth_pixels)
+        truths = {
+            antialiased: brute_force(scene.cloud, scene.camera, scene.values(), pixels, antialiased)
+            for antialiased in (False, True)
+        }
         usual = measured["plane"].times
         rows: Row = {}
         for name, entry in measured.items():
@@ -325,7 +330,7 @@ def measure_variants(effort: Effort, device: Any) -> Row:
             rows[name] = {
                 **entry.summary(),
                 "times_as_long_as_plane": digits(usual.faster_than(entry.times)),
-                "errors": errors(seen[name], scene, pixels, options),
+                "errors": errors(seen[name], pixels, truths[options.antialiased], options.depth),
             }
         for fast, readable in TWINS:
             rows[readable]["bit_equal_to_fast"] = {
@@ -346,15 +351,14 @@ def sampled_pixels(seen: Seen, count: int) -> NDArray[np.int64]:
     return np.union1d(pick(even), pick(partial))
 
 
-def errors(seen: Seen, scene: RasterScene, pixels: NDArray[np.int64], options: RasterOptions) -> Row:
+def errors(seen: Seen, pixels: NDArray[np.int64], truth: Truth, depth: str) -> Row:
     """Return differences to float64: rounding, and for depth also the model's to the largest response on the ray."""
-    truth = brute_force(scene.cloud, scene.camera, scene.values(), pixels, options.antialiased)
     opaque = truth.alpha > OPAQUE
     found: Row = {
         "channels": gaps(np.abs(seen.channels[pixels] - truth.values).max(axis=1)),
         "alpha": gaps(seen.alpha[pixels] - truth.alpha),
     }
-    kinds = {"own_model": options.depth, "largest_response": "exact"}
+    kinds = {"own_model": depth, "largest_response": "exact"}
     for against, kind in kinds.items():
         for name in ("depth", "median_depth"):
             gap = getattr(seen, name)[pixels] - getattr(truth, name)[kind]
@@ -365,14 +369,10 @@ def errors(seen: Seen, scene: RasterScene, pixels: NDArray[np.int64], options: R
 def measure_growth(effort: Effort, device: Any, say: Callable[[str], None]) -> Row:
     """Time 11 channels and depth over the number of Gaussians, and over that of pixels."""
     found: Row = {"gaussians": [], "pixels": [], "repeats": effort.growth_repeats}
-    rows = [("gaussians", count, effort.size) for count in effort.counts]
-    rows += [("pixels", effort.gaussians, size) for size in effort.sizes]
-    for series, count, size in rows:
-        say(f"growth: {count:,} Gaussians, {size[0]} x {size[1]}")
-        scene = figure(count, *size)
-        contenders, facts = contenders_for(scene, scene.values(), device)
-        kept = {name: entry for name, entry in contenders.items() if "draw, forward" not in name or "redraw" in name}
-        measured = measure_in_turn(kept, effort.growth_repeats, device, two_threads=True)
+    for series, scene in growth(effort.counts, effort.sizes, count=effort.gaussians, size=effort.size):
+        say(f"growth: {len(scene.cloud):,} Gaussians, {scene.camera.width} x {scene.camera.height}")
+        contenders, facts = contenders_for(scene, scene.values(), device, ("forward", "training"))
+        measured = measure_in_turn(contenders, effort.growth_repeats, device, two_threads=True)
         found[series].append(
             {
                 **describe(scene),
@@ -554,15 +554,20 @@ def markdown(result: Row) -> str:
                     f"| {stage} | {value:g} | {100 * part[way]['share'][stage]:.0f} % |"
                     for stage, value in part[way]["ms"].items()
                 ]
-                lines.append(f"| **{way}** | {part[way]['total_ms']:g} | |")
+                graph = part[way].get("graph")
+                beside = "" if graph is None else f", {graph['device_ms']['median']:g} as a graph"
+                lines.append(f"| **{way}** | {part[way]['total_ms']:g}{beside} | |")
     for series in ("gaussians", "pixels"):
         rows = measured.get("growth", {}).get(series, [])
         for row in rows:
             label = f"{row['splats']:,} at {row['width']} x {row['height']}"
             lines += ["", *_time_table(f"{label}, {row['pairs']:,} pairs", row["ms"])]
-    if "accuracy" in measured:
-        shown = {name: part for name, part in measured["accuracy"].items() if isinstance(part, dict)}
-        lines += ["", "```json", json.dumps(shown, indent=1), "```"]
+    for name in ("peer", "accuracy"):
+        shown = {
+            key: part for key, part in measured.get(name, {}).items() if key.startswith(("agree", "figure", "cube"))
+        }
+        if shown:
+            lines += ["", f"{name}:", "", "```json", json.dumps(shown, indent=1), "```"]
     return "\n".join(lines) + "\n"
 
 

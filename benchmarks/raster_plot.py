@@ -21,6 +21,9 @@ HERE = Path(__file__).parent
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
 """What is timed in growth rows, and how it is called."""
 
+COLORS = [f"C{number}" for number in (0, 1, 2, 3, 4, 5, 6, 9)]
+"""Of stages in their order: all but the greys, which are the rest's."""
+
 
 class Way(NamedTuple):
     """One way to draw, as a line: its name in the results, the clock it is read from, and how it looks."""
@@ -58,11 +61,13 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             for result in results:
                 for way in ON_CPU if result["machine"]["device"] == "cpu" else ON_CUDA:
                     _draw_line(axes, result["growth"][series], series, part, way, device_name(result))
-            sizes = {_still(result["growth"][series], series) for result in results}
-            axes.set(title=f"{called}: {'; '.join(sorted(sizes))}", ylabel="time [ms]", xlabel=_axis_label(series))
+            sizes = [f"{device_name(result)} {_still(result['growth'][series], series)}" for result in results]
+            axes.set(title=f"{called}: {'; '.join(sizes)}", ylabel="time [ms]", xlabel=_axis_label(series))
             _log_axes(axes)
     panels[0, 0].legend()
-    figure.suptitle("11 channels, depth, median depth and alpha of a figure that covers a quarter of the image")
+    figure.suptitle(
+        "11 channels, depth, median depth and alpha of a figure; lines are the fastest repeats, areas their ranges"
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -83,13 +88,13 @@ def draw_stages(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             total = sum(part[way]["ms"].values())
             for number, stage in enumerate((*order, REST)):
                 width = 100.0 * part[way]["ms"].get(stage, 0.0) / total
-                color = "0.8" if stage == REST else f"C{number}"
+                color = "0.8" if stage == REST else COLORS[number]
                 axes.barh(place, width, left=begin, color=color, label=stage if not place else None)
                 if width > 6.0:
-                    text = f"{part[way]['ms'][stage]:.3g}"
+                    text = _plain(part[way]["ms"][stage])
                     axes.text(begin + 0.5 * width, place, text, ha="center", va="center", color="white", fontsize=8)
                 begin += width
-        names = [f"{label}\n{part[way]['total_ms']:.3g} ms" for label, part in bars]
+        names = [f"{label}\n{_plain(part[way]['total_ms'])} ms" for label, part in bars]
         axes.set_yticks(range(len(bars)), names, fontsize=8)
         axes.invert_yaxis()
         axes.set(xlim=(0.0, 100.0), xlabel="part of the time [%]; numbers in bars are ms", title=f"{way}s")
@@ -122,17 +127,17 @@ def _measured(result: Mapping[str, Any], section: str) -> bool:
 
 
 def _draw_line(axes: Any, rows: Sequence[Mapping[str, Any]], series: str, part: str, way: Way, device: str) -> None:
-    """Draw medians as a line and ranges as an area; nothing where nothing was measured."""
+    """Draw the fastest repeats as a line, disturbed least, and ranges as an area; nothing where nothing was measured."""
     points = []
     for row in rows:
         entry = row["ms"].get(f"{way.name}, {part}", {}).get(way.clock)
         if entry is not None:
             across = row["splats"] if series == "gaussians" else row["width"] * row["height"]
-            points.append((across, entry["median"], entry["lowest"], entry["highest"]))
+            points.append((across, entry["lowest"], entry["highest"]))
     if not points:
         return
-    x, middle, low, high = zip(*sorted(points), strict=True)
-    axes.plot(x, middle, way.style, color=way.color, marker="o", markersize=5, label=f"{device}, {way.label}")
+    x, low, high = zip(*sorted(points), strict=True)
+    axes.plot(x, low, way.style, color=way.color, marker="o", markersize=5, label=f"{device}, {way.label}")
     axes.fill_between(x, low, high, color=way.color, alpha=0.12, linewidth=0)
 
 
@@ -157,6 +162,11 @@ def _log_axes(axes: Any) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
     axes.grid(True, which="major", alpha=0.4)
     axes.grid(True, which="minor", alpha=0.12)
+
+
+def _plain(number: float) -> str:
+    """Return three digits, or all of a larger number's."""
+    return f"{number:.3g}" if number < 1000.0 else f"{number:.0f}"
 
 
 def _short(number: float) -> str:

@@ -6,7 +6,7 @@ splats lie on a pixel. No opacity is above 0.98, so that programs that cap alpha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +17,6 @@ from beam_warp.assets import LINEAR_REC709, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.spherical_harmonics import sh_color
 
-COUNTS = (35_000, 70_000, 140_000, 280_000, 560_000, 1_120_000, 2_240_000)
-"""Splats of the growth series, at 1920 x 1080."""
-SIZES = ((480, 270), (960, 540), (1920, 1080), (3840, 2160))
-"""Images of the growth series, of 140,000 splats."""
 BUMP = 0.06
 """Height of the bumps over the radius."""
 FIELD_OF_VIEW = 35.0
@@ -86,12 +82,27 @@ def cube(count: int = 100_000, width: int = 512, height: int = 512, *, seed: int
     return RasterScene("cube", cloud, _camera(CUBE_DISTANCE, width, height))
 
 
-def growth(*, seed: int = 0) -> Iterator[RasterScene]:
-    """Yield figures of more and more splats, and then of more and more pixels, one at a time."""
-    for count in COUNTS:
-        yield figure(count, seed=seed)
-    for width, height in SIZES:
-        yield figure(width=width, height=height, seed=seed)
+def growth(
+    counts: Iterable[int],
+    sizes: Iterable[tuple[int, int]],
+    *,
+    count: int = 140_000,
+    size: tuple[int, int] = (1920, 1080),
+    seed: int = 0,
+) -> Iterator[tuple[str, RasterScene]]:
+    """Yield figures of more and more splats, and then of more and more pixels, each with what grows.
+
+    Args:
+        counts: Splats at ``size``.
+        sizes: Widths and heights at ``count``.
+        count: See above.
+        size: See above.
+        seed: Of every figure.
+    """
+    for splats in counts:
+        yield "gaussians", figure(splats, *size, seed=seed)
+    for width, height in sizes:
+        yield "pixels", figure(count, width, height, seed=seed)
 
 
 def bumpy_sphere(directions: NDArray[np.float64]) -> Surface:

@@ -2,7 +2,8 @@
 
 On the CPU by the wall clock around each launcher. On CUDA by events around them, queued behind other work that keeps
 the device busy, so that the host's launches are ahead of it and no wait for them is counted; sorts and scans, which
-``wp.timing_begin`` does not list, are so measured like the rest. Kernels by name are those that it does list.
+``wp.timing_begin`` does not list, are so measured like the rest. Each event takes a microsecond or two of the device,
+which the time of the whole as a CUDA graph lacks. Kernels by name are those that ``wp.timing_begin`` lists.
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ from unittest.mock import patch
 
 import numpy as np
 import warp as wp
-from raster_contenders import Drawing, captured, digits, record_event, seconds_between
+from raster_contenders import (
+    Clocked,
+    Drawing,
+    captured,
+    digits,
+    measure_in_turn,
+    record_event,
+    seconds_between,
+)
 
 from beam_warp import rasterizer
 
@@ -141,6 +150,9 @@ def measure_stages(make: Callable[[], Drawing], repeats: int, device: Any) -> di
             "bottleneck": max(milliseconds, key=lambda stage: milliseconds[stage]),
         }
     if unwatched is not None:
+        for name, work in (("forward", unwatched.forward), ("backward", unwatched.backward)):
+            launch = Clocked.on(device, captured(work, device))
+            found[name]["graph"] = measure_in_turn({name: launch}, repeats, device)[name].summary()
         found["kernels"] = measure_kernels(unwatched, repeats)
     return found
 

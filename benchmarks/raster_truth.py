@@ -58,6 +58,9 @@ def brute_force(
     focal = np.array([camera.focal_x, camera.focal_y])
     centers = focal * local[:, :2] / local[:, 2:] + middle
     inverse = (axes / scales[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
+    # No further along x or y than this is alpha at the cut; splats that do not reach it have no extent.
+    squared = 2.0 * np.log(np.maximum(opacity / ALPHA_CUT, 1.0))
+    extents = np.sqrt(squared[:, None] * covariance[:, (0, 1), (0, 1)]) + 1e-6
     count = len(pixels)
     found = Truth(
         np.zeros((count, values.shape[1])),
@@ -67,16 +70,19 @@ def brute_force(
     )
     for row, pixel in enumerate(pixels):
         position = np.array([pixel % camera.width, pixel // camera.width]) + 0.5
-        x, y = (position - centers).T
-        exponent = 0.5 * (form[:, 0, 0] * x * x + 2.0 * form[:, 0, 1] * x * y + form[:, 1, 1] * y * y)
-        alpha = np.minimum(opacity * np.exp(-exponent), ALPHA_CAP)
-        seen = np.flatnonzero(alpha >= ALPHA_CUT)
-        after = np.cumprod(1.0 - alpha[seen])
-        seen = seen[: np.searchsorted(-after, -STOP, side="right") + 1]  # the splat that ends the pixel counts
+        near = np.flatnonzero((np.abs(position - centers) <= extents).all(axis=1))
+        x, y = (position - centers[near]).T
+        exponent = 0.5 * (form[near, 0, 0] * x * x + 2.0 * form[near, 0, 1] * x * y + form[near, 1, 1] * y * y)
+        alpha = np.minimum(opacity[near] * np.exp(-exponent), ALPHA_CAP)
+        counted = alpha >= ALPHA_CUT
+        seen, alpha = near[counted], alpha[counted]
         if not len(seen):
             continue
+        after = np.cumprod(1.0 - alpha)
+        end = int(np.searchsorted(-after, -STOP, side="right")) + 1  # the splat that ends the pixel counts
+        seen, alpha = seen[:end], alpha[:end]
         before = np.concatenate([[1.0], after[: len(seen) - 1]])
-        weight = alpha[seen] * before
+        weight = alpha * before
         found.values[row] = weight @ values[order[seen]]
         found.alpha[row] = weight.sum()
         ray = np.append((position - middle) / focal, 1.0)
