@@ -127,7 +127,7 @@ def _measured(result: Mapping[str, Any], section: str) -> bool:
 
 
 def _draw_line(axes: Any, rows: Sequence[Mapping[str, Any]], series: str, part: str, way: Way, device: str) -> None:
-    """Draw the fastest repeats as a line, disturbed least, and ranges as an area; nothing where nothing was measured."""
+    """Draw the fastest repeats as a line and ranges as an area; nothing where nothing was measured."""
     points = []
     for row in rows:
         entry = row["ms"].get(f"{way.name}, {part}", {}).get(way.clock)
