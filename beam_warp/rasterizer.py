@@ -198,8 +198,11 @@ class Rasterizer:
         self.value_channels = range(self.normal_channels.stop, self.normal_channels.stop + value_count)
         self._count = gaussian_count
         self._exact = self.options.depth == "exact"
-        fast = launch_composite_cuda if self.device.is_cuda else launch_composite_cpu
-        self._launch_composite = launch_composite_pixels if readable else fast
+        cuda = self.device.is_cuda
+        self._launch_composite = launch_composite_cuda if cuda else launch_composite_cpu
+        self._launch_composite_adjoint = launch_composite_adjoint_cuda if cuda else launch_composite_adjoint_cpu
+        if readable:
+            self._launch_composite = launch_composite_pixels
         self._layout = ViewLayout.of(self.cameras)
         with wp.ScopedDevice(self.device):
             self._allocate()
@@ -228,6 +231,7 @@ class Rasterizer:
             setattr(self._drawn, name, wp.zeros(pixel_count, dtype=float))
         for name in ("gaussians", "ends", "medians"):
             setattr(self._drawn, name, wp.zeros(pixel_count, dtype=int))
+        self._drawn.states = wp.zeros(0 if self.device.is_cuda else pixel_count, dtype=wp.vec4)
         self._channel_images = channel_rows(pixel_count, channel_count, self.device)
         self.images = RasterImages(
             tuple(image.matrix for image in self._channel_images),
@@ -505,10 +509,7 @@ class Rasterizer:
         for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
             pairs = self._rows_of_pairs(rows.length)
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
-            if self.device.is_cuda:
-                launch_composite_adjoint_cuda(*arguments, pairs.vectors, self.device)
-            else:
-                launch_composite_adjoint_cpu(*arguments, back.states, pairs.vectors, self.device)
+            self._launch_composite_adjoint(*arguments, pairs.vectors, self.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
             summed = Pairs()
             summed.rows = pairs.matrix
@@ -552,7 +553,6 @@ class _BackwardBuffers:
 
     images: RasterImages
     channel_adjoints: list[Rows]
-    states: wp.array
     splats: Splats
     sums: list[wp.array]
     blocks: ChannelBlocks
@@ -576,7 +576,6 @@ class _BackwardBuffers:
                 tuple(rows.matrix for rows in adjoints), *(wp.zeros(pixel_count, dtype=float) for _ in range(3))
             ),
             adjoints,
-            wp.zeros(0 if device.is_cuda else pixel_count, dtype=wp.vec2),
             splats,
             [wp.zeros((splat_count, pair_length(rows.length, exact)), dtype=float) for rows in adjoints],
             blocks,

@@ -250,11 +250,13 @@ def compare_with_peer(scene: RasterScene, device: Any) -> Row | str:
 
 
 def all_channels(scene: RasterScene) -> Row:
-    """Return what makes a `Drawing` composite 17 channels: colour of degree 3, normals of geometry, and 11 values."""
+    """Return what makes a `Drawing` composite all that an asset has: captured colour of degree 3, normals of geometry,
+    and base colour, roughness, ambient occlusion and normals, 14 channels.
+    """
     rng = np.random.default_rng(7)
     radiance = 0.05 * rng.standard_normal((len(scene.cloud), 16, 3), dtype=np.float32)
     radiance[:, :1] = scene.cloud.radiance
-    return {"radiance": radiance, "normals": True}
+    return {"values": np.ascontiguousarray(scene.values()[:, 3:]), "radiance": radiance, "normals": True}
 
 
 def measure_frames(effort: Effort, device: Any) -> Row:
@@ -283,7 +285,7 @@ def measure_all_stages(effort: Effort, device: Any) -> Row:
     }
     makers: dict[str, Callable[[], Drawing]] = {
         **(few if device.is_cuda else {}),
-        "17 channels and depth": lambda: Drawing(scene, device, **all_channels(scene)),
+        "14 channels and depth": lambda: Drawing(scene, device, **all_channels(scene)),
         "cube, 11 channels and depth": lambda: Drawing(dense, device),
     }
     found: Row = {"scene": describe(scene), "repeats": effort.stage_repeats}

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from tracing_scenes import FLATNESS, JITTER, Surface, spun_orientations
 
 from beam_warp.assets import LINEAR_REC709, GaussianCloud
-from beam_warp.cameras import Camera
+from beam_warp.cameras import Camera, focal_length
 from beam_warp.spherical_harmonics import sh_color
 
 BUMP = 0.06
 """Height of the bumps over the radius."""
 FIELD_OF_VIEW = 35.0
 """Angle between the top and bottom edges of the image [degree]."""
-FIGURE_DISTANCE = 4.33
-"""From the camera to the middle of a figure of radius 1, which then covers 26 % of an image of 16 to 9 [m]."""
+FIGURE_SHARE = 0.26
+"""Of an image, which a figure covers."""
 CUBE_DISTANCE = 1.2
 """From the camera to the middle of a cube of side 1, whose front then fills an image of up to 16 to 9 [m]."""
 VALUE_COUNT = 11
@@ -67,7 +67,10 @@ def figure(count: int = 140_000, width: int = 1920, height: int = 1080, *, seed:
     scales = np.exp(rng.normal(np.log([spacing, spacing, FLATNESS * spacing]), JITTER, (count, 3)))
     orientations = spun_orientations(surface.normals, rng.uniform(0.0, 2.0 * np.pi, count))
     cloud = _painted(rng, surface.points, orientations, scales, rng.uniform(0.3, 0.98, count), surface.normals)
-    return RasterScene("figure", cloud, _camera(FIGURE_DISTANCE, width, height))
+    # A sphere of radius 1 at distance d is a disc of f / sqrt(d^2 - 1) pixels.
+    radius = np.sqrt(FIGURE_SHARE * width * height / np.pi)
+    distance = float(np.hypot(1.0, focal_length(height, FIELD_OF_VIEW) / radius))
+    return RasterScene("figure", cloud, _camera(distance, width, height))
 
 
 def cube(count: int = 100_000, width: int = 512, height: int = 512, *, seed: int = 0) -> RasterScene:

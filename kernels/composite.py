@@ -49,6 +49,7 @@ class Images:
     gaussians: wp.array[int]  # the last that was seen, -1 for none
     ends: wp.array[int]  # end of what was looked at, in the lists
     medians: wp.array[int]  # place of the median's splat in the lists, -1 for none
+    states: wp.array[wp.vec4]  # what the CPU's kernels know of a pixel between two splats; none on CUDA
 
 
 @wp.struct

@@ -11,7 +11,7 @@ from beam_warp.kernels.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
+from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, load_state, rows_in, store_state, tile_box
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
 from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
@@ -32,10 +32,10 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         images: Images,
         channel_adjoints: wp.array[Channels],
         adjoints: Adjoints,
-        out_states: wp.array[wp.vec2],
         out_pairs: wp.array[Pair],
     ):
-        # A pixel's state: what passes before the splats still to come, and the sum R of those behind them.
+        # A pixel's state: what passes before the splats still to come, the sum R of those behind them, and the
+        # derivatives to the sums of weights and of weighted depths.
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
@@ -45,7 +45,8 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         for y in range(box[1], box[3]):
             for x in range(box[0], box[2]):
                 pixel = view.first_pixel + y * view.width + x
-                out_states[pixel] = wp.vec2(images.transmittance[pixel], 0.0)
+                adjoint = pixel_adjoint(images, adjoints, pixel)
+                images.states[pixel] = wp.vec4(images.transmittance[pixel], 0.0, adjoint[0], adjoint[1])
                 end = wp.max(end, images.ends[pixel])
         for k in range(end, listed_range[1]):
             out_pairs[frame.lists.slots[k]] = Pair()
@@ -71,14 +72,18 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                     log_alpha = log_alpha_of(center, e)
                     if not (log_alpha >= -LOG_CUT):
                         continue
-                    state = out_states[pixel]
+                    state = load_state(images.states, pixel)
+                    is_median = k == images.medians[pixel]
+                    to_median = float(0.0)
+                    if is_median and adjoints.median_depth.shape[0] > 0:
+                        to_median = adjoints.median_depth[pixel]
                     total, before, behind = add_pixel(
                         total,
                         state[0],
                         state[1],
                         alpha_of(log_alpha),
-                        k == images.medians[pixel],
-                        pixel_adjoint(images, adjoints, pixel),
+                        is_median,
+                        wp.vec3(state[2], state[3], to_median),
                         channel_adjoints[pixel],
                         center,
                         shape,
@@ -89,21 +94,19 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                         e,
                         row,
                     )
-                    out_states[pixel] = wp.vec2(before, behind)
+                    store_state(images.states, pixel, wp.vec4(before, behind, state[2], state[3]))
             out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel
 
 
-def launch_composite_adjoint_cpu(
-    frame, channels, exact, images, channel_adjoints, adjoints, out_states, out_pairs, device
-):
+def launch_composite_adjoint_cpu(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
     """Write the moments and channels of a band's pairs into their slots."""
     launch(
         composite_adjoint_cpu_kernel(channels.dtype._length_, exact),
         frame.band.end_tile - frame.band.first_tile,
         inputs=[frame, channels, images, channel_adjoints, adjoints],
-        outputs=[out_states, out_pairs],
+        outputs=[out_pairs],
         device=device,
         min_chunk=MIN_TILES,
     )

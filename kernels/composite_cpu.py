@@ -1,7 +1,7 @@
 """What each pixel shows, for the CPU: a tile's splats one after the other, each on the pixels that it reaches.
 
-A pixel is visited only by splats whose alpha there is at least 1/255 or nearly so, by the interval of each row. The
-images themselves hold the sums: a tile is in the cache while its splats are drawn.
+A pixel is visited only by splats whose alpha there is at least 1/255 or nearly so, by the interval of each row. What is
+known of it lies in one row of memory: a tile is in the cache while its splats are drawn.
 """
 
 from functools import cache
@@ -60,11 +60,51 @@ def columns_in(box: wp.vec4i, center: wp.vec4, row: RowReach, y: int) -> wp.vec2
     )
 
 
+@wp.func_native("""
+    return states.data[pixel];
+""")
+def load_state(states: wp.array[wp.vec4], pixel: int) -> wp.vec4:
+    """Return ``states[pixel]``, without the six instructions by which Warp also takes negative numbers."""
+    ...
+
+
+@wp.func_native("""
+    states.data[pixel] = state;
+""")
+def store_state(states: wp.array[wp.vec4], pixel: int, state: wp.vec4):
+    """Set ``states[pixel]``."""
+    ...
+
+
+_ADD_ROW = """
+#if !defined(__CUDA_ARCH__)
+    typedef float quad __attribute__((vector_size(16), aligned(4)));
+    const quad* source = reinterpret_cast<const quad*>(rows.data + row);
+    quad* target = reinterpret_cast<quad*>(out_images.data + pixel);
+    ADDITIONS
+#endif
+"""
+
+
+@cache
+def add_row_function(channel_count: int):
+    """Return the function that adds a row of channels to a pixel's, in vector instructions and in place."""
+    Channels = channel_vector(channel_count)
+
+    additions = "".join(f"target[{i}] += source[{i}] * weight; " for i in range(channel_count // 4))
+
+    @wp.func_native(_ADD_ROW.replace("ADDITIONS", additions))
+    def add_row(rows: wp.array[Channels], row: int, weight: float, out_images: wp.array[Channels], pixel: int): ...
+
+    return add_row
+
+
 @cache
 def composite_cpu_kernel(channel_count: int, exact: bool):
     """Return the kernel that composites ``channel_count`` channels, one tile an item."""
     Channels = channel_vector(channel_count)
     depth_at = depth_function(exact)
+    add_row = add_row_function(channel_count)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_kernel(
@@ -75,15 +115,12 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
         view = frame.views[frame.tile_views[tile]]
         box = tile_box(view, tile)
         listed_range = frame.lists.ranges[listed]
+        # A pixel's state: what passes, the sums of weights and of weighted depths, the median depth.
         for y in range(box[1], box[3]):
             for x in range(box[0], box[2]):
                 pixel = view.first_pixel + y * view.width + x
                 out_channels[pixel] = Channels()
-                out_images.alpha[pixel] = 0.0
-                out_images.transmittance[pixel] = 1.0
-                out_images.depth[pixel] = 0.0
-                out_images.median_depth[pixel] = 0.0
-                out_images.gaussians[pixel] = -1
+                out_images.states[pixel] = wp.vec4(1.0, 0.0, 0.0, 0.0)
                 out_images.ends[pixel] = listed_range[0]
                 out_images.medians[pixel] = -1
         open_pixels = (box[2] - box[0]) * (box[3] - box[1])
@@ -95,7 +132,6 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
             shape = frame.splats.shapes[splat]
             slope = frame.splats.slopes[splat]
             bend = frame.splats.bends[splat]
-            row = channels[splat]
             rows = rows_in(box, center, shape)
             reach = row_reach(shape, squared_extent(center[2]))
             for y in range(rows[0], rows[1]):
@@ -103,7 +139,8 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                 start = view.first_pixel + y * view.width
                 for x in range(columns[0], columns[1]):
                     pixel = start + x
-                    transmittance = out_images.transmittance[pixel]
+                    state = load_state(out_images.states, pixel)
+                    transmittance = state[0]
                     if not (transmittance >= TRANSMITTANCE_STOP):
                         continue
                     offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
@@ -113,24 +150,34 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                     alpha = alpha_of(log_alpha)
                     weight = alpha * transmittance
                     z = depth_at(center, shape, slope, bend, frame.near, offset)
-                    out_channels[pixel] = out_channels[pixel] + row * weight
-                    out_images.depth[pixel] = out_images.depth[pixel] + z * weight
-                    out_images.alpha[pixel] = out_images.alpha[pixel] + weight
+                    add_row(channels, splat, weight, out_channels, pixel)
+                    median = state[3]
                     if transmittance > MEDIAN:
-                        out_images.median_depth[pixel] = z
+                        median = z
                         out_images.medians[pixel] = k
                     out_images.ends[pixel] = k + 1
                     transmittance *= 1.0 - alpha
-                    out_images.transmittance[pixel] = transmittance
+                    store_state(
+                        out_images.states,
+                        pixel,
+                        wp.vec4(transmittance, state[1] + weight, state[2] + z * weight, median),
+                    )
                     if transmittance < TRANSMITTANCE_STOP:
                         open_pixels -= 1
         for y in range(box[1], box[3]):
             for x in range(box[0], box[2]):
                 pixel = view.first_pixel + y * view.width + x
-                weight_sum = out_images.alpha[pixel]
-                if weight_sum > 0.0:
-                    out_images.depth[pixel] = out_images.depth[pixel] / weight_sum
-                    out_images.gaussians[pixel] = frame.lists.splats[out_images.ends[pixel] - 1] % frame.gaussian_count
+                state = out_images.states[pixel]
+                depth = float(0.0)
+                gaussian = int(-1)
+                if state[1] > 0.0:
+                    depth = state[2] / state[1]
+                    gaussian = frame.lists.splats[out_images.ends[pixel] - 1] % frame.gaussian_count
+                out_images.transmittance[pixel] = state[0]
+                out_images.alpha[pixel] = state[1]
+                out_images.depth[pixel] = depth
+                out_images.median_depth[pixel] = state[3]
+                out_images.gaussians[pixel] = gaussian
 
     return composite_tiles_kernel
 

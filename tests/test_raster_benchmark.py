@@ -146,10 +146,10 @@ def test_adjoints_reach_every_channel(device):
     drawing = Drawing(scene, resolve_device(device), **benchmark.all_channels(scene))
     adjoints = random_adjoints(16 * 9, drawing.channel_count)
     drawing.set_adjoints(adjoints)
-    assert drawing.channel_count == 17
+    assert drawing.channel_count == 14
     written = np.concatenate([rows.numpy() for rows in drawing.rasterizer.adjoints().channels], axis=1)
-    np.testing.assert_array_equal(written[:, :17], adjoints.channels)
-    assert not written[:, 17:].any()
+    np.testing.assert_array_equal(written[:, :14], adjoints.channels)
+    assert not written[:, 14:].any()
     assert set(drawing.gradients()) == {*rasterizer.GaussianGradients.__annotations__}
 
 
@@ -169,7 +169,7 @@ def test_everything_is_measured(device, tmp_path):
         assert result["accuracy"][scene]["two_runs_bit_equal"] == {"images": True, "gradients": True}
     assert [row["splats"] for row in result["growth"]["gaussians"]] == [100, 300]
     assert [row["width"] for row in result["growth"]["pixels"]] == [16, 24]
-    assert "17 channels and depth" in benchmark.markdown(result)
+    assert "14 channels and depth" in benchmark.markdown(result)
     for draw_one in (draw_growth, draw_stages):
         draw_one([result], tmp_path / "plot.png")
         assert (tmp_path / "plot.png").stat().st_size > 10_000
