@@ -60,6 +60,9 @@ FLIP = 1e-4
 """A larger difference is a decision that fell the other way: a splat at the cut of alpha, the stop, the order of two,
 the pick of the median. Rounding stays below."""
 
+ROUNDING = 2e-6
+"""What CPU and CUDA may differ by in a channel where nothing was decided otherwise."""
+
 OPAQUE = 0.5
 """Depths are compared where alpha is above: elsewhere they are means over little."""
 
@@ -460,6 +463,7 @@ def gaps(gap: NDArray[Any]) -> Row:
         "median": digits(np.median(gap)),
         "p99": digits(np.quantile(gap, 0.99)),
         "largest": digits(gap.max()),
+        "beyond_2e-6": int((gap > ROUNDING).sum()),
         "beyond_1e-4": int((gap > FLIP).sum()),
         "compared": len(gap),
     }

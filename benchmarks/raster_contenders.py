@@ -131,7 +131,13 @@ def captured(work: Callable[[], Any], device: Any) -> Callable[[], Any]:
     wp.synchronize_device(device)
     with wp.ScopedCapture(device) as capture:
         work()
-    return lambda: wp.capture_launch(capture.graph)
+    graph = capture.graph
+
+    def launch() -> Any:
+        wp.capture_launch(graph)
+        return work  # held: the graph reads and writes the arrays of what does the work
+
+    return launch
 
 
 @dataclass
