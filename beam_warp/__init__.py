@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from beam_warp._version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from beam_warp.adam import Adam as Adam
+    from beam_warp.adam import Parameters as Parameters
     from beam_warp.assets import GaussianCloud as GaussianCloud
     from beam_warp.assets import GaussianSequence as GaussianSequence
     from beam_warp.assets import Observability as Observability
@@ -20,9 +22,13 @@ if TYPE_CHECKING:
     from beam_warp.captures import Capture as Capture
     from beam_warp.converters import read as read
     from beam_warp.converters import write as write
+    from beam_warp.depth_normals import DepthNormals as DepthNormals
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
     from beam_warp.gradients import visibility_gradients as visibility_gradients
+    from beam_warp.image_losses import L1Loss as L1Loss
+    from beam_warp.image_losses import NormalLoss as NormalLoss
+    from beam_warp.image_losses import SsimLoss as SsimLoss
     from beam_warp.incident_light import Irradiance as Irradiance
     from beam_warp.incident_light import irradiance as irradiance
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
@@ -44,23 +50,29 @@ if TYPE_CHECKING:
     from beam_warp.tracing import visibility as visibility
 
 _HOMES = {
+    "Adam": "adam",
     "AmbientOcclusion": "lighting",
     "BeamError": "errors",
     "Camera": "cameras",
     "Capture": "captures",
+    "DepthNormals": "depth_normals",
     "EnvironmentMap": "environments",
     "GBuffer": "rasterizing",
     "GaussianArrays": "rasterizer",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
     "Irradiance": "incident_light",
+    "L1Loss": "image_losses",
     "MaterialOptions": "materials",
+    "NormalLoss": "image_losses",
     "Observability": "assets",
+    "Parameters": "adam",
     "RasterOptions": "rasterizer",
     "Rasterizer": "rasterizer",
     "RunOptions": "pipeline",
     "RunResult": "pipeline",
     "Scene": "scene",
+    "SsimLoss": "image_losses",
     "SurfaceHits": "surface_tracing",
     "SurfaceNormals": "surfaces",
     "TraceOptions": "tracing",

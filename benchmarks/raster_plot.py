@@ -62,7 +62,8 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
                 for way in ON_CPU if result["machine"]["device"] == "cpu" else ON_CUDA:
                     _draw_line(axes, result["growth"][series], series, part, way, device_name(result))
             sizes = [f"{device_name(result)} {_still(result['growth'][series], series)}" for result in results]
-            axes.set(title=f"{called}: {'; '.join(sizes)}", ylabel="time [ms]", xlabel=_axis_label(series))
+            axes.set(ylabel="time [ms]", xlabel=_axis_label(series))
+            axes.set_title(f"{called}: {'; '.join(sizes)}", fontsize=10)
             _log_axes(axes)
     panels[0, 0].legend()
     figure.suptitle(
