@@ -278,7 +278,7 @@ class TestRefusals:
             Adam(self.one(rate=np.nan))
         with pytest.raises(InvalidOptionError, match="name must be one of a, got 'b'"):
             Adam(self.one()).set_learning_rate("b", 0.1)
-        with pytest.raises(InvalidOptionError, match="fresh_from must be a number in"):
+        with pytest.raises(InvalidOptionError, match="fresh_from must be an integer in"):
             Adam(self.one()).gather([0, 1], fresh_from=3)
 
     def test_masks_and_indices(self):
