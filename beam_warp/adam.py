@@ -200,6 +200,8 @@ class Adam:
         options = self._options
         result = Adam(parameters, beta1=options.beta1, beta2=options.beta2, epsilon=options.epsilon)
         wp.copy(result._rates, self._rates)
+        if not kept:  # Warp cuts no array down to nothing
+            return result
         for old, new in zip(self._groups, result._groups, strict=True):
             launch_gather_rows(old.means, rows[:kept], new.means[:kept], self.device)
             launch_gather_rows(old.squares, rows[:kept], new.squares[:kept], self.device)
