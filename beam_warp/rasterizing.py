@@ -38,10 +38,10 @@ CHANNELS = (
 UNIT_CHANNELS = ("normals", SURFACE_NORMALS)
 """Channels of directions: their mean is brought to unit length."""
 
-MAX_SPLATS = 2**23
+GROUP_SPLATS = 2**23
 """Most splats, Gaussians times cameras, projected at a time unless one camera has more: 1.2 GB with 11 channels."""
 
-MAX_PIXELS = 2**25
+GROUP_PIXELS = 2**25
 """Most pixels drawn at a time unless one camera has more: 2.6 GB with 11 channels, 3.1 GB on the CPU."""
 
 
@@ -324,7 +324,7 @@ class _Source:
             pixels = cameras[first].width * cameras[first].height
             while end < len(cameras):
                 pixels += cameras[end].width * cameras[end].height
-                if pixels > MAX_PIXELS or (end + 1 - first) * len(self.gaussians.positions) > MAX_SPLATS:
+                if pixels > GROUP_PIXELS or (end + 1 - first) * len(self.gaussians.positions) > GROUP_SPLATS:
                     break
                 end += 1
             rasterizer = Rasterizer(

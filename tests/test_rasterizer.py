@@ -296,7 +296,7 @@ def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
     made = cloud(rng, base_color=rng.uniform(0, 1, (200, 3)))
     cameras = [around(10, 20), around(33, 5, 70.0), around(16, 16, 140.0)]
     together = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
-    monkeypatch.setattr("beam_warp.rasterizing.MAX_PIXELS", 1)
+    monkeypatch.setattr("beam_warp.rasterizing.GROUP_PIXELS", 1)
     apart = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
     assert rasterize(made, [], channels=(), device=device) == []
     for camera, one, other in zip(cameras, together, apart, strict=True):
