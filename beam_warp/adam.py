@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from beam_warp.checks import require_array, require_choice, require_number, require_same_length
+from beam_warp.checks import require_array, require_choice, require_count, require_number, require_same_length
 from beam_warp.device_arrays import float_rows
 from beam_warp.devices import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -135,9 +135,11 @@ class Adam:
             and visible.shape == (self._row_count,)
             and visible.device == self.device
         ):
-            kind = f"{visible.dtype.__name__} {visible.shape}" if isinstance(visible, wp.array) else type(visible)
+            got = type(visible).__name__
+            if isinstance(visible, wp.array):
+                got = f"{visible.dtype.__name__} {visible.shape} on {visible.device}"
             raise InvalidArrayError(
-                f"visible must be a warp array of {self._row_count} bool on {self.device}, got {kind}. Convert it."
+                f"visible must be a warp array of {self._row_count} bool on {self.device}, got {got}. Convert it."
             )
         launch_step(
             visible,
@@ -186,7 +188,7 @@ class Adam:
         else:
             rows = upload(require_array("indices", indices, (None,), np.int32), int, self.device)
         count = rows.shape[0]
-        kept = count if fresh_from is None else int(require_number("fresh_from", fresh_from, 0, count))
+        kept = count if fresh_from is None else require_count("fresh_from", fresh_from, 0, count)
         parameters = {
             name: Parameters(
                 gather_rows(group.values, rows),
@@ -198,6 +200,8 @@ class Adam:
         options = self._options
         result = Adam(parameters, beta1=options.beta1, beta2=options.beta2, epsilon=options.epsilon)
         wp.copy(result._rates, self._rates)
+        if not kept:  # Warp cuts no array down to nothing
+            return result
         for old, new in zip(self._groups, result._groups, strict=True):
             launch_gather_rows(old.means, rows[:kept], new.means[:kept], self.device)
             launch_gather_rows(old.squares, rows[:kept], new.squares[:kept], self.device)

@@ -39,7 +39,7 @@ class DepthNormals:
 
         Args:
             camera: Its size is that of every image.
-            minimum_alpha: Pixels count above it; at least 0.
+            minimum_alpha: Pixels count above it; in [0, 1].
             largest_jump: Largest step of depth between neighbours, as a fraction of the depth; infinite for any.
             device: Warp device; the first GPU without, or the CPU where there is none.
 

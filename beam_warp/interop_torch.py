@@ -19,7 +19,7 @@ from beam_warp.checks import require_count
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingPackageError
 from beam_warp.kernels.composite import CHANNEL_COUNTS
-from beam_warp.rasterizer import GaussianArrays, RasterImages, Rasterizer, RasterOptions
+from beam_warp.rasterizer import COEFFICIENT_COUNTS, GaussianArrays, RasterImages, Rasterizer, RasterOptions
 from beam_warp.view_images import ViewImages, view_images
 
 try:
@@ -29,9 +29,6 @@ except ImportError as error:
     raise MissingPackageError(
         "torch must be installed to draw its tensors, got no such package. Run pip install 'beam-warp[interop]'."
     ) from error
-
-COEFFICIENT_COUNTS = (0, 1, 4, 9, 16, 25)
-"""Numbers of spherical harmonics of a colour: none, or those of degree 0 to 4."""
 
 
 class TorchImages(NamedTuple):
@@ -92,7 +89,7 @@ class TorchRasterizer:
             gaussian_count: N.
             cameras: At least one, of any sizes.
             value_count: K, the number of the Gaussians' own values that are composited.
-            coefficient_count: Number of spherical harmonics of the captured colour, of `COEFFICIENT_COUNTS`.
+            coefficient_count: Number of spherical harmonics of the captured colour, 1, 4, 9, 16 or 25; 0 for none.
             normals: Whether the normal of the geometry is drawn.
             options: How splats are drawn.
             device: A torch device or its name; None takes the first CUDA device, or the CPU where there is none.
@@ -103,9 +100,10 @@ class TorchRasterizer:
         """
         require_count("gaussian_count", gaussian_count, 0)
         require_count("value_count", value_count, 0)
-        if coefficient_count not in COEFFICIENT_COUNTS:
+        choices = (0, *COEFFICIENT_COUNTS)
+        if coefficient_count not in choices:
             raise InvalidOptionError(
-                f"coefficient_count must be one of {COEFFICIENT_COUNTS}, got {coefficient_count!r}. Choose one of them."
+                f"coefficient_count must be one of {choices}, got {coefficient_count!r}. Choose one of them."
             )
         self._warp_device = resolve_device(None if device is None else _device_name(device))
         self.device = torch.device(str(self._warp_device))

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from beam_warp.cameras import Camera
-from beam_warp.checks import require_choice, require_number
+from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.bin_tiles import (
@@ -39,14 +39,21 @@ from beam_warp.kernels.project import Projection, Splats, View, launch_project, 
 from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
 
 MAX_BAND_PAIRS = 2**24
-"""Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 128: beyond it the images are drawn
-in bands of tile rows."""
+"""Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 128 for each length of rows: beyond
+it the images are drawn in bands of tile rows."""
 
-MAX_ROW_PAIRS = 2**30
-"""Most pairs in one row of tiles, the least that can be drawn: positions in their list are 32-bit."""
+MAX_ROW_PAIRS = 2**29
+"""Most pairs in one row of tiles, the least that can be drawn: with `SPARE_CAPACITY`, and as much again for sorting, a
+list's length is still a 32-bit integer."""
+
+MAX_SPLATS = 2**26 - 1
+"""Most splats, Gaussians times cameras: the up to 32 numbers that the way back sums for each are counted in 32 bits."""
 
 SPARE_CAPACITY = 1.25
 """Room for pairs over what the first frame needs: the next ones need a little more."""
+
+COEFFICIENT_COUNTS = (1, 4, 9, 16, 25)
+"""Numbers of spherical harmonics of a colour: those of degree 0 to 4."""
 
 DEPTH_MODES = ("plane", "exact")
 
@@ -90,7 +97,8 @@ class GaussianArrays(NamedTuple):
         scales: ``(N,)`` vec3 [m].
         opacities: ``(N,)`` float in [0, 1].
         values: ``(N, K)`` float: whatever is to be composited; None for nothing.
-        radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B 1, 4, 9, 16 or 25; None for none.
+        radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B of `COEFFICIENT_COUNTS`, another one in
+            every draw if need be; None for none.
     """
 
     positions: wp.array
@@ -175,8 +183,8 @@ class Rasterizer:
         """Allocate what every frame needs.
 
         Args:
-            gaussian_count: N.
-            cameras: At least one.
+            gaussian_count: N; times the number of cameras at most `MAX_SPLATS`.
+            cameras: At least one, of any sizes.
             value_count: K, the number of the Gaussians' own values that are composited.
             radiance: Whether the captured colour is.
             normals: Whether the normal of the geometry is.
@@ -186,17 +194,18 @@ class Rasterizer:
 
         Raises:
             DeviceError: There is no such device.
-            InvalidOptionError: There is no camera.
+            InvalidOptionError: There is no camera, or a count is out of range.
         """
         if not cameras:
             raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
+        self._count = require_count("gaussian_count", gaussian_count, 0, MAX_SPLATS // len(cameras))
         self.device = resolve_device(device)
         self.cameras = tuple(cameras)
         self.options = options or RasterOptions()
         self.color_channels = range(3 * radiance)
         self.normal_channels = range(self.color_channels.stop, self.color_channels.stop + 3 * normals)
+        value_count = require_count("value_count", value_count, 0)
         self.value_channels = range(self.normal_channels.stop, self.normal_channels.stop + value_count)
-        self._count = gaussian_count
         self._exact = self.options.depth == "exact"
         cuda = self.device.is_cuda
         self._launch_composite = launch_composite_cuda if cuda else launch_composite_cpu
@@ -267,7 +276,7 @@ class Rasterizer:
         self._pair_rows: dict[int, Rows] = {}
 
     def set_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Move cameras or change their lenses; their number and sizes stay.
+        """Move cameras or change their lenses; their number and sizes stay. `backward` wants a draw in between.
 
         Raises:
             InvalidOptionError: A number or size differs.
@@ -316,7 +325,7 @@ class Rasterizer:
                 be listed.
         """
         self._check(gaussians)
-        self._gaussians = gaussians
+        self._gaussians = None  # until all of it is drawn: a frame that is refused cannot be drawn again
         with wp.ScopedDevice(self.device):
             self._project(gaussians)
             self._bands = self._plan_bands()
@@ -325,6 +334,7 @@ class Rasterizer:
                     self._count_pairs(band)
                 self._list_pairs()
                 self._composite()
+        self._gaussians = gaussians
         return self.images
 
     def redraw(self) -> RasterImages:
@@ -384,29 +394,30 @@ class Rasterizer:
 
     def _check(self, gaussians: GaussianArrays) -> None:
         """Refuse arrays that kernels would misread."""
-        count = self._count
-        values = len(self.value_channels)
-        wanted = {
-            "positions": (wp.vec3, (count,)),
-            "orientations": (wp.quat, (count,)),
-            "scales": (wp.vec3, (count,)),
-            "opacities": (wp.float32, (count,)),
-            "values": (wp.float32, (count, values)) if values else None,
-            "radiance": (wp.vec3, (count, None)) if self.color_channels else None,
+        rows, values = (self._count,), (len(self.value_channels),)
+        # Of each array the type, and the lengths that each side may have.
+        wanted: dict[str, tuple[Any, tuple[tuple[int, ...], ...]]] = {
+            "positions": (wp.vec3, (rows,)),
+            "orientations": (wp.quat, (rows,)),
+            "scales": (wp.vec3, (rows,)),
+            "opacities": (wp.float32, (rows,)),
         }
-        for name, contract in wanted.items():
+        if self.value_channels:
+            wanted["values"] = (wp.float32, (rows, values))
+        if self.color_channels:
+            wanted["radiance"] = (wp.vec3, (rows, COEFFICIENT_COUNTS))
+        for name, (dtype, sides) in wanted.items():
             array = getattr(gaussians, name)
-            if contract is None:
+            if not isinstance(array, wp.array):
+                got = "none" if array is None else type(array).__name__
+            elif array.dtype is dtype and array.device == self.device and _fits(array.shape, sides):
                 continue
-            dtype, shape = contract
-            fits = array is not None and array.dtype is dtype and array.device == self.device
-            fits = fits and array.ndim == len(shape)
-            if not (fits and all(want is None or want == got for want, got in zip(shape, array.shape, strict=True))):
-                got = "none" if array is None else f"{array.dtype.__name__} {array.shape} on {array.device}"
-                size = " x ".join("B" if side is None else str(side) for side in shape)
-                raise InvalidArrayError(
-                    f"{name} must be a warp array of {dtype.__name__}, {size}, on {self.device}, got {got}. Convert it."
-                )
+            else:
+                got = f"{array.dtype.__name__} {array.shape} on {array.device}"
+            size = " x ".join(" or ".join(map(str, lengths)) for lengths in sides)
+            raise InvalidArrayError(
+                f"{name} must be a warp array of {dtype.__name__}, {size}, on {self.device}, got {got}. Convert it."
+            )
 
     def _project(self, gaussians: GaussianArrays) -> None:
         """Make splats of the Gaussians, their rows of channels and their order in depth."""
@@ -607,6 +618,11 @@ class _BackwardBuffers:
             array.zero_()
         for sums in self.sums:
             sums.zero_()
+
+
+def _fits(shape: tuple[int, ...], sides: tuple[tuple[int, ...], ...]) -> bool:
+    """Tell whether each side of a shape has one of the lengths that it may have."""
+    return len(shape) == len(sides) and all(n in lengths for n, lengths in zip(shape, sides, strict=True))
 
 
 def _zero_splats(count: int) -> Splats:

@@ -111,26 +111,26 @@ def difference_panels(scene: RasterScene, grazing: RasterScene, device: Any) -> 
     """Yield what the fast composite changes, and what the exact depth does."""
     fast, readable = draw(scene, device), draw(scene, device, readable=True)
     yield stretched(
-        "fast - readable, channels", np.abs(fast.sums.channels - readable.sums.channels).max(axis=1), scene, "", 1e-6
+        "fast - readable, channels", np.abs(fast.sums.channels - readable.sums.channels).max(axis=1), scene, ""
     )
-    yield stretched("fast - readable, mean depth", fast.sums.depth - readable.sums.depth, scene, " m", 1e-6)
-    yield stretched("fast - readable, median", fast.sums.median_depth - readable.sums.median_depth, scene, " m", 1e-6)
+    yield stretched("fast - readable, mean depth", fast.sums.depth - readable.sums.depth, scene, " m")
+    yield stretched("fast - readable, median", fast.sums.median_depth - readable.sums.median_depth, scene, " m")
     plane, exact = draw(grazing, device), draw(grazing, device, depth="exact")
     yield "grazing view", over_background(plane.color, plane.alpha[..., None])
     opaque = (plane.alpha > 0.5).reshape(-1)
-    yield stretched("exact - plane, mean depth", (exact.sums.depth - plane.sums.depth) * opaque, grazing, " m", 1e-6)
+    yield stretched("exact - plane, mean depth", (exact.sums.depth - plane.sums.depth) * opaque, grazing, " m")
     yield stretched(
-        "exact - plane, median", (exact.sums.median_depth - plane.sums.median_depth) * opaque, grazing, " m", 1e-6
+        "exact - plane, median", (exact.sums.median_depth - plane.sums.median_depth) * opaque, grazing, " m"
     )
     for name, view in (("plane", plane), ("exact", exact)):
         yield f"{name}: normals of the mean depth", over_background(*shaded(view.depth_normals, view.alpha))
     yield "normals of the Gaussians", over_background(*shaded(plane.surface_normals, plane.alpha))
 
 
-def stretched(title: str, gap: NDArray[np.floating], scene: RasterScene, unit: str, least: float) -> Panel:
-    """Return absolute differences in grey, white at their 99.9 % but at least ``least``."""
+def stretched(title: str, gap: NDArray[np.floating], scene: RasterScene, unit: str) -> Panel:
+    """Return absolute differences in grey, white at their 99.9 % but at least 1e-6."""
     gap = np.abs(gap).reshape(scene.camera.height, scene.camera.width)
-    white = max(float(np.quantile(gap, 0.999)), least)
+    white = max(float(np.quantile(gap, 0.999)), 1e-6)
     shades = over_background(gray(np.clip(gap / white, 0.0, 1.0)), np.ones((*gap.shape, 1), np.float32))
     return f"{title} (white {white:.1g}{unit}, largest {gap.max():.1g}{unit})", shades
 

@@ -1,7 +1,7 @@
 """What each pixel shows: its tile's splats, front to back. One thread a pixel: the readable form, on CPU and CUDA.
 
 `composite_cpu` and `composite_cuda` do the same sums in the same order, faster. Channels come as rows of a vector whose
-length is fixed at compile time; there are four lengths, so four small modules.
+length is fixed at compile time: four lengths and two modes of depth make eight small modules.
 """
 
 from functools import cache

@@ -142,6 +142,25 @@ class TestTwin:
         assert_close(values_of(adam), twin, 10)
 
 
+def test_rows_without_a_past(device, rng):
+    """The first step of an optimiser whose rows are all fresh; and one without any rows."""
+    values = random_rows(rng, 3)
+    adam = Adam(parameters_of(values, device))
+    set_gradients(adam, random_rows(rng, 3))
+    adam.step()
+    moved, indices = values_of(adam), np.array([2, 0, -1], np.int32)
+    fresh = adam.gather(indices, fresh_from=0)
+    twin = Twin({name: array[indices] * (indices >= 0)[:, None] for name, array in moved.items()}, RATES)
+    gradients = random_rows(rng, 3)
+    set_gradients(fresh, gradients)
+    fresh.step()
+    twin.step(gradients)
+    assert_close(values_of(fresh), twin, 1)
+    empty = fresh.gather(indices[:0])
+    empty.step()
+    assert all(len(group.values) == 0 for group in empty.parameters.values())
+
+
 class TestLearningRates:
     def test_zero_learning_rate_and_zero_gradient(self, device, rng):
         values = random_rows(rng, 9)
@@ -278,7 +297,7 @@ class TestRefusals:
             Adam(self.one(rate=np.nan))
         with pytest.raises(InvalidOptionError, match="name must be one of a, got 'b'"):
             Adam(self.one()).set_learning_rate("b", 0.1)
-        with pytest.raises(InvalidOptionError, match="fresh_from must be a number in"):
+        with pytest.raises(InvalidOptionError, match="fresh_from must be an integer in"):
             Adam(self.one()).gather([0, 1], fresh_from=3)
 
     def test_masks_and_indices(self):

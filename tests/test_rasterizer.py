@@ -99,6 +99,80 @@ def test_gradients_of_captured_colour(device, rng, bands):
         assert error <= GRADIENT_ERROR, name
 
 
+def test_every_draw_may_have_another_number_of_coefficients(device, rng):
+    """The way back makes room for what was drawn last, more or fewer."""
+    made = cloud(rng)
+    drawer = Rasterizer(200, [around()], radiance=True, device=device)
+    for coefficients in (4, 9, 1, 25, 4):
+        fresh = Rasterizer(200, [around()], radiance=True, device=device)
+        radiance = rng.normal(0, 0.5, (200, coefficients, 3)).astype(np.float32)
+        found = []
+        for one in (drawer, fresh):
+            one.draw(upload_gaussians(made, one.device, radiance=radiance))
+            filled(np.random.default_rng(1), one)
+            gradients_found = one.backward()
+            found.append([gradients_found.positions.numpy(), gradients_found.radiance.numpy()])
+        assert found[0][1].shape == radiance.shape
+        assert np.abs(found[0][1]).max() > 0
+        for kept, new in zip(*found, strict=True):
+            np.testing.assert_array_equal(kept, new)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_one_pixel_and_both_ways_twice(device, rng, count):
+    """No Gaussian is no special case: arrays without rows, images without anything; the way back repeats its bits."""
+    made = cloud(rng, count)
+    cameras = [around(), around(1, 1, 90.0)]
+    drawer = Rasterizer(count, cameras, value_count=2, radiance=True, normals=True, device=device)
+    radiance, values = rng.normal(size=(count, 4, 3)).astype(np.float32), np.ones((count, 2), np.float32)
+    filled(np.random.default_rng(1), drawer)  # before anything is drawn
+    drawer.draw(upload_gaussians(made, drawer.device, values=values, radiance=radiance))
+    assert drawer.first_pixels == (0, 40 * 36, 40 * 36 + 1)
+    first = state(drawer)
+    assert bool(drawer.images.alpha.numpy().any()) == bool(drawer.pair_count()) == (count > 0)
+    drawer.redraw()
+    for one, other in zip(first, state(drawer), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert drawer.backward().radiance.shape == (count, 4)
+
+
+def test_arrays_may_be_strided(device, rng):
+    """Every second row, some columns: the same bits as of compact copies."""
+    made = cloud(rng)
+    wide = rng.uniform(0, 1, (200, 8)).astype(np.float32)
+    drawer = Rasterizer(200, [around()], value_count=3, device=device)
+    compact = upload_gaussians(made, drawer.device, values=np.ascontiguousarray(wide[:, 2:5]))
+    strided = compact._replace(
+        positions=upload(np.repeat(made.positions, 2, axis=0), wp.vec3, drawer.device)[::2],
+        values=upload(wide, float, drawer.device)[:, 2:5],
+    )
+    assert not strided.positions.is_contiguous
+    assert not strided.values.is_contiguous
+    filled(rng, drawer)
+    found = []
+    for arrays in (compact, strided):
+        drawer.draw(arrays)
+        found.append(state(drawer))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_frame_that_is_refused_cannot_be_drawn_again(rng, monkeypatch):
+    drawer = Rasterizer(200, [around()], device="cpu")
+    arrays = upload_gaussians(cloud(rng), drawer.device)
+    drawer.draw(arrays)
+    with monkeypatch.context() as limits:
+        limits.setattr(rasterizer, "MAX_ROW_PAIRS", 1)
+        limits.setattr(rasterizer, "MAX_BAND_PAIRS", 1)
+        with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 1 times, got"):
+            drawer.draw(arrays)
+    for call in (drawer.redraw, drawer.backward):
+        with pytest.raises(InvalidOptionError, match="must follow draw"):
+            call()
+    drawer.draw(arrays)
+    drawer.redraw()
+
+
 def state(drawer):
     """Everything drawn and every gradient of it, on the host."""
     found = drawer.backward()
@@ -222,7 +296,7 @@ def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
     made = cloud(rng, base_color=rng.uniform(0, 1, (200, 3)))
     cameras = [around(10, 20), around(33, 5, 70.0), around(16, 16, 140.0)]
     together = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
-    monkeypatch.setattr("beam_warp.rasterizing.MAX_PIXELS", 1)
+    monkeypatch.setattr("beam_warp.rasterizing.GROUP_PIXELS", 1)
     apart = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
     assert rasterize(made, [], channels=(), device=device) == []
     for camera, one, other in zip(cameras, together, apart, strict=True):
@@ -379,6 +453,11 @@ def test_errors_name_the_contract(rng):
     made = cloud(rng, roughness=np.full(200, 0.5))
     with pytest.raises(InvalidOptionError, match="cameras must hold at least one camera"):
         Rasterizer(3, [], device="cpu")
+    for count in (-1, 2.5, rasterizer.MAX_SPLATS // 2 + 1):
+        with pytest.raises(InvalidOptionError, match="gaussian_count must be an integer in"):
+            Rasterizer(count, [around()] * 2, device="cpu")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidOptionError, match="value_count must be an integer in"):
+        Rasterizer(3, [around()], value_count=-1, device="cpu")
     with pytest.raises(InvalidOptionError, match="low_pass must"):
         RasterOptions(low_pass=float("nan"))
     with pytest.raises(InvalidOptionError, match="depth must be one of plane, exact"):
@@ -394,6 +473,13 @@ def test_errors_name_the_contract(rng):
         InvalidArrayError, match=r"positions must be a warp array of vec3f?, 200, on cpu, got vec3f? \(3"
     ):
         drawer.draw(arrays._replace(positions=wp.zeros(3, dtype=wp.vec3, device="cpu")))
+    with pytest.raises(InvalidArrayError, match="positions must be a warp array of vec3f, 200, on cpu, got ndarray"):
+        drawer.draw(arrays._replace(positions=made.positions))  # pyright: ignore[reportArgumentType]
+    colored = Rasterizer(200, [around()], radiance=True, device="cpu")
+    for coefficients in (0, 3, 36):  # kernels read as many as the next degree has
+        radiance = np.zeros((200, coefficients, 3), np.float32)
+        with pytest.raises(InvalidArrayError, match="radiance must be a warp array of vec3f, 200 x 1 or 4 or 9 or 16"):
+            colored.draw(upload_gaussians(made, colored.device, radiance=radiance))
     with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
         drawer.set_cameras([around(41)])
     with pytest.raises(InvalidOptionError, match="adjoints must be one of alpha, depth, median_depth, roughness"):
