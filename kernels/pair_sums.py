@@ -30,7 +30,8 @@ def sum_pairs_kernel(first: int, pairs: Pairs, out_sums: wp.array2d[float]):
     if count <= 0:
         return
     total = float(0.0)
-    for row in range(pairs.ends[place] - count, wp.min(pairs.ends[place], pairs.rows.shape[0])):
+    # Ends beyond the range of integers come out negative: what was not listed has no rows.
+    for row in range(wp.max(pairs.ends[place] - count, 0), wp.min(pairs.ends[place], pairs.rows.shape[0])):
         total += pairs.rows[row, column]
     splat = pairs.order[place]
     out_sums[splat, column] = out_sums[splat, column] + total
