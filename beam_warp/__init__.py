@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from beam_warp.pipeline import RunOptions as RunOptions
     from beam_warp.pipeline import RunResult as RunResult
     from beam_warp.pipeline import run as run
-    from beam_warp.rasterizer import GaussianArrays as GaussianArrays
+    from beam_warp.raster_records import GaussianArrays as GaussianArrays
+    from beam_warp.raster_records import RasterOptions as RasterOptions
     from beam_warp.rasterizer import Rasterizer as Rasterizer
-    from beam_warp.rasterizer import RasterOptions as RasterOptions
     from beam_warp.rasterizing import GBuffer as GBuffer
     from beam_warp.rasterizing import rasterize as rasterize
     from beam_warp.rasterizing import rasterize_backward as rasterize_backward
@@ -58,7 +58,7 @@ _HOMES = {
     "DepthNormals": "depth_normals",
     "EnvironmentMap": "environments",
     "GBuffer": "rasterizing",
-    "GaussianArrays": "rasterizer",
+    "GaussianArrays": "raster_records",
     "GaussianCloud": "assets",
     "GaussianSequence": "assets",
     "Irradiance": "incident_light",
@@ -67,7 +67,7 @@ _HOMES = {
     "NormalLoss": "image_losses",
     "Observability": "assets",
     "Parameters": "adam",
-    "RasterOptions": "rasterizer",
+    "RasterOptions": "raster_records",
     "Rasterizer": "rasterizer",
     "RunOptions": "pipeline",
     "RunResult": "pipeline",

@@ -26,7 +26,7 @@ from beam_warp.images import display_image, linear_to_srgb, write_exr, write_png
 from beam_warp.material_mesh import MaterialMesh
 from beam_warp.mesh_path_tracing import TracedChannels, TracedMesh, outgoing_radiance, trace_channels, trace_radiance
 from beam_warp.pipeline import OverviewOptions, Progress, RunOptions, RunResult, no_progress, run
-from beam_warp.rasterizer import RasterOptions
+from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import GBuffer, rasterize
 from beam_warp.reporting import write_report
 from beam_warp.spherical_harmonics import sh_basis

@@ -15,7 +15,7 @@ from beam_warp.cameras import Camera
 from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import BeamError, InvalidArrayError, InvalidOptionError
 from beam_warp.interop_torch import TorchImages, TorchRasterizer  # says what is missing, where torch is
-from beam_warp.rasterizer import DepthMode, RasterOptions
+from beam_warp.raster_records import DepthMode, RasterOptions
 
 # isort: split
 import torch  # noqa: TID251  # pyright: ignore[reportMissingImports]
@@ -107,7 +107,7 @@ def rasterization(
         render_mode: ``"D"`` sums depths weighted by visibility, ``"ED"`` is their mean; along the optical axis.
         rasterize_mode: ``"antialiased"`` keeps a splat's total opacity when the pixel filter widens it.
         return_normals: Whether ``meta`` holds normals.
-        depth: ``"plane"`` or ``"exact"``, see `beam_warp.rasterizer.RasterOptions`.
+        depth: ``"plane"`` or ``"exact"``, see `beam_warp.raster_records.RasterOptions`.
         others: gsplat's other arguments. `HINTS` have no effect; `REFUSED` must have the value that asks for nothing.
 
     Returns:

@@ -19,7 +19,8 @@ from beam_warp.checks import require_count
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingPackageError
 from beam_warp.kernels.composite import CHANNEL_COUNTS
-from beam_warp.rasterizer import COEFFICIENT_COUNTS, GaussianArrays, RasterImages, Rasterizer, RasterOptions
+from beam_warp.raster_records import COEFFICIENT_COUNTS, GaussianArrays, RasterImages, RasterOptions
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.view_images import ViewImages, view_images
 
 try:

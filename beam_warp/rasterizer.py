@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from beam_warp.cameras import Camera
-from beam_warp.checks import require_choice, require_count, require_number
+from beam_warp.checks import require_count
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.bin_tiles import (
@@ -37,6 +37,13 @@ from beam_warp.kernels.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.project import Projection, Splats, View, launch_project, launch_project_adjoint
 from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
+from beam_warp.raster_records import (
+    COEFFICIENT_COUNTS,
+    GaussianArrays,
+    GaussianGradients,
+    RasterImages,
+    RasterOptions,
+)
 
 MAX_BAND_PAIRS = 2**24
 """Most (tile, splat) pairs held at a time, 24 bytes each, and on the way back up to 128 for each length of rows: beyond
@@ -51,100 +58,6 @@ MAX_SPLATS = 2**26 - 1
 
 SPARE_CAPACITY = 1.25
 """Room for pairs over what the first frame needs: the next ones need a little more."""
-
-COEFFICIENT_COUNTS = (1, 4, 9, 16, 25)
-"""Numbers of spherical harmonics of a colour: those of degree 0 to 4."""
-
-DEPTH_MODES = ("plane", "exact")
-
-DepthMode = Literal["plane", "exact"]
-
-
-@dataclass(frozen=True)
-class RasterOptions:
-    """How splats are drawn.
-
-    Attributes:
-        antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
-            views from further away than the training views (Yu et al. 2024, Eq. 9).
-        low_pass: Variance of the pixel filter that every splat is widened by [pixel^2], above 0.
-        near: Depth before which a Gaussian's centre is not drawn [m], above 0: perspective explodes there.
-        depth: ``"plane"``: a splat's depth is its tangent plane's, exact for flat Gaussians. ``"exact"``: that of the
-            largest response on every ray, for thick ones and grazing views; costs a few operations a pixel.
-
-    Raises:
-        InvalidOptionError: An option is out of range.
-    """
-
-    antialiased: bool = False
-    low_pass: float = 0.3
-    near: float = 0.01
-    depth: DepthMode = "plane"
-
-    def __post_init__(self) -> None:
-        """Check every option once."""
-        require_number("low_pass", self.low_pass, 1e-6, 1e6)
-        require_number("near", self.near, 1e-9, 1e9)
-        require_choice("depth", self.depth, DEPTH_MODES)
-
-
-class GaussianArrays(NamedTuple):
-    """Gaussians on a device.
-
-    Attributes:
-        positions: ``(N,)`` vec3 [m].
-        orientations: ``(N,)`` quat xyzw; normalised where they are used.
-        scales: ``(N,)`` vec3 [m].
-        opacities: ``(N,)`` float in [0, 1].
-        values: ``(N, K)`` float: whatever is to be composited; None for nothing.
-        radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B of `COEFFICIENT_COUNTS`, another one in
-            every draw if need be; None for none.
-    """
-
-    positions: wp.array
-    orientations: wp.array
-    scales: wp.array
-    opacities: wp.array
-    values: wp.array | None = None
-    radiance: wp.array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class RasterImages:
-    """Images of all views, one view after the other and row by row, on the device; or a loss's derivatives to them.
-
-    Attributes:
-        channels: Sums of channels weighted by visibility, ``(P, K)`` float each: passes of 16 channels, the last of 4,
-            8, 12 or 16, padded with zeros.
-        alpha: Sum of the weights, ``(P,)`` float, at most 1 but for rounding.
-        depth: Mean depth along the optical axis [m], ``(P,)``; 0 where nothing is seen.
-        median_depth: Depth of the last splat that more than half of the light passes before [m], ``(P,)``.
-    """
-
-    channels: tuple[wp.array, ...]
-    alpha: wp.array
-    depth: wp.array
-    median_depth: wp.array
-
-    def zero_(self) -> None:
-        """Set everything to 0."""
-        for array in (*self.channels, self.alpha, self.depth, self.median_depth):
-            array.zero_()
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianGradients:
-    """Derivatives of a loss with respect to Gaussians, on the device; attributes as in `GaussianArrays`.
-
-    ``orientations`` are to the quaternions as given, and orthogonal to them.
-    """
-
-    positions: wp.array
-    orientations: wp.array
-    scales: wp.array
-    opacities: wp.array
-    values: wp.array | None
-    radiance: wp.array | None
 
 
 class Rasterizer:

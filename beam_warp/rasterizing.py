@@ -16,7 +16,8 @@ from beam_warp.cameras import Camera
 from beam_warp.checks import require_array, require_choice, require_finite, require_same_length
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.rasterizer import GaussianArrays, GaussianGradients, RasterImages, Rasterizer, RasterOptions
+from beam_warp.raster_records import GaussianArrays, GaussianGradients, RasterImages, RasterOptions
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.scene import Scene
 
 MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")

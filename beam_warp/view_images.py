@@ -23,7 +23,7 @@ class ViewImages:
         channels: ``(H, W, K)`` float each, a pass of channels, K 4, 8, 12 or 16, the last padded with zeros. Compact,
             as JAX wants them.
         alpha: ``(H, W)`` float.
-        depth: ``(H, W)`` float [m]; this and the others as in `beam_warp.rasterizer.RasterImages`.
+        depth: ``(H, W)`` float [m]; this and the others as in `beam_warp.raster_records.RasterImages`.
         median_depth: ``(H, W)`` float [m].
         gaussian_ids: ``(H, W)`` int.
     """

@@ -45,7 +45,7 @@ from raster_truth import Truth, brute_force
 from timing import commit, launch_threads, machine
 
 from beam_warp.devices import resolve_device
-from beam_warp.rasterizer import RasterOptions
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reporting import versions
 
 Row = dict[str, Any]

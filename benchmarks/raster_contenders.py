@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from raster_scenes import RasterScene
 from timing import Task, Times, take_turns
 
-from beam_warp.rasterizer import Rasterizer, RasterOptions
+from beam_warp.raster_records import RasterOptions
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.rasterizing import upload_gaussians
 
 GEOMETRY = ("positions", "orientations", "scales", "opacities")

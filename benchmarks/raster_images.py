@@ -34,7 +34,7 @@ from beam_warp.contact_sheet import Panel, lay_out, over_background
 from beam_warp.depth_normals import DepthNormals
 from beam_warp.devices import resolve_device
 from beam_warp.images import display_image
-from beam_warp.rasterizer import DepthMode, RasterOptions
+from beam_warp.raster_records import DepthMode, RasterOptions
 
 LARGEST_FILE = 300_000
 COLUMNS = 3

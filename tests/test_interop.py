@@ -8,7 +8,8 @@ from reference import rasterizing as reference
 from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.rasterizer import GaussianArrays, Rasterizer, RasterOptions
+from beam_warp.raster_records import GaussianArrays, RasterOptions
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.rasterizing import rasterize_values
 from beam_warp.spherical_harmonics import sh_color
 

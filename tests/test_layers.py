@@ -47,6 +47,7 @@ RANKS = {
     "beam_warp.sampling": 5,
     "beam_warp.environment_sampling": 5,
     "beam_warp.raster_layout": 5,
+    "beam_warp.raster_records": 5,
     "beam_warp.rasterizer": 6,
     "beam_warp.rasterizing": 8,
     "beam_warp.view_images": 7,

@@ -14,7 +14,7 @@ from raster_stages import BACKWARD, FORWARD, REST, STAGES, measure_stages
 from raster_truth import brute_force
 from reference import rasterizing as reference
 
-from beam_warp import rasterizer
+from beam_warp import raster_records, rasterizer
 from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.devices import resolve_device
@@ -150,7 +150,7 @@ def test_adjoints_reach_every_channel(device):
     written = np.concatenate([rows.numpy() for rows in drawing.rasterizer.adjoints().channels], axis=1)
     np.testing.assert_array_equal(written[:, :14], adjoints.channels)
     assert not written[:, 14:].any()
-    assert set(drawing.gradients()) == {*rasterizer.GaussianGradients.__annotations__}
+    assert set(drawing.gradients()) == {*raster_records.GaussianGradients.__annotations__}
 
 
 def test_everything_is_measured(device, tmp_path):

@@ -12,7 +12,8 @@ from reference.rasterizing import RasterImage, decide, replay
 from reference.single_precision import ROUNDING, rounded
 
 from beam_warp.devices import upload
-from beam_warp.rasterizer import GaussianArrays, Rasterizer, RasterOptions
+from beam_warp.raster_records import GaussianArrays, RasterOptions
+from beam_warp.rasterizer import Rasterizer
 
 STABILITY = 10.0
 """How many times the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""

@@ -10,7 +10,8 @@ from reference.rasterizing import decide, replay
 from beam_warp import Camera, GaussianCloud, Scene, rasterize, rasterize_backward, rasterizer
 from beam_warp.devices import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.rasterizer import GaussianArrays, Rasterizer, RasterOptions
+from beam_warp.raster_records import GaussianArrays, RasterOptions
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.rasterizing import upload_gaussians
 from beam_warp.spherical_harmonics import sh_color
 

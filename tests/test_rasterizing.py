@@ -8,7 +8,7 @@ from beam_warp import rasterizer, rasterizing
 from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
-from beam_warp.rasterizer import RasterOptions
+from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize, rasterize_values
 from beam_warp.spherical_harmonics import sh_color
 

@@ -10,7 +10,8 @@ import warp as wp
 from beam_warp.cameras import Camera
 from beam_warp.devices import upload
 from beam_warp.errors import BeamError, InvalidOptionError, MissingPackageError
-from beam_warp.rasterizer import GaussianArrays, Rasterizer
+from beam_warp.raster_records import GaussianArrays
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.view_images import view_images
 
 

@@ -261,7 +261,7 @@ def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianClou
 def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting) -> None:
     """Draw one image and write it."""
     from beam_warp.deferred import relight
-    from beam_warp.rasterizer import RasterOptions
+    from beam_warp.raster_records import RasterOptions
     from beam_warp.rasterizing import rasterize
 
     options = RasterOptions(antialiased=args.antialiased)
