@@ -2,7 +2,7 @@
 
     python benchmarks/raster_gradients.py [--device cuda:0] [--out results.json]
 
-For random scenes and for every hazard of ``tests/raster_hazards.py``: relative L2 errors of the gradients to each array,
+For random scenes and every hazard of ``tests/raster_hazards.py``: relative L2 errors of the gradients to each array,
 of a loss with random derivatives to every image, against complex steps of the float64 rasteriser of
 ``tests/reference``; beside them what one rounding of the inputs to single precision changes, which no program that
 reads single precision can be better than. Prints Markdown and writes JSON.
