@@ -107,10 +107,9 @@ class Rasterizer:
 
         Raises:
             DeviceError: There is no such device.
-            InvalidOptionError: There is no camera, or a count is out of range.
+            InvalidOptionError: ``cameras`` is no sequence of at least one camera, or a count is out of range.
         """
-        if not cameras:
-            raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
+        require_cameras(cameras)
         self._count = require_count("gaussian_count", gaussian_count, 0, MAX_SPLATS // len(cameras))
         self.device = resolve_device(device)
         self.cameras = tuple(cameras)
@@ -531,6 +530,21 @@ class _BackwardBuffers:
             array.zero_()
         for sums in self.sums:
             sums.zero_()
+
+
+def require_cameras(cameras: Any) -> None:
+    """Refuse what is not a sequence of at least one camera."""
+    if not isinstance(cameras, Sequence):
+        raise InvalidOptionError(
+            f"cameras must be a sequence of cameras, got {type(cameras).__name__}. Put a single one in a list."
+        )
+    if not cameras:
+        raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
+    for i, camera in enumerate(cameras):
+        if not isinstance(camera, Camera):
+            raise InvalidOptionError(
+                f"cameras must hold cameras, got {type(camera).__name__} at place {i}. Make it a beam_warp.Camera."
+            )
 
 
 def _fits(shape: tuple[int, ...], sides: tuple[tuple[int, ...], ...]) -> bool:

@@ -17,7 +17,7 @@ from beam_warp.checks import require_array, require_choice, require_finite, requ
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster_records import GaussianArrays, GaussianGradients, RasterImages, RasterOptions
-from beam_warp.rasterizer import Rasterizer
+from beam_warp.rasterizer import Rasterizer, require_cameras
 from beam_warp.scene import Scene
 
 MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
@@ -254,6 +254,7 @@ def rasterize_backward(
     Source: see `Rasterizer.backward`.
     """
     views = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    require_cameras(views)
     given = [adjoints] if isinstance(adjoints, Mapping) else list(adjoints)
     if len(given) != len(views):
         raise InvalidOptionError(
@@ -270,8 +271,6 @@ def rasterize_backward(
             drawn.set_adjoints(rasterizer, images, place, given[index])
         for name, array in drawn.gradients(rasterizer.backward()).items():
             totals[name] = totals[name] + array if name in totals else array
-    if not totals:  # no camera
-        raise InvalidOptionError("cameras must hold at least one camera, got none. Pass what sees the scene.")
     return CloudGradients(**{name: totals.pop(name) for name in GEOMETRY}, channels=totals)
 
 
@@ -319,6 +318,8 @@ class _Source:
         self, cameras: Sequence[Camera], options: RasterOptions | None
     ) -> Iterator[tuple[Rasterizer, RasterImages, range]]:
         """Draw for as many cameras at a time as memory allows: what drew them, the images, and which ones."""
+        if cameras:
+            require_cameras(cameras)
         first = 0
         while first < len(cameras):
             end = first + 1

@@ -459,6 +459,10 @@ def test_errors_name_the_contract(rng):
             Rasterizer(count, [around()] * 2, device="cpu")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InvalidOptionError, match="value_count must be an integer in"):
         Rasterizer(3, [around()], value_count=-1, device="cpu")
+    with pytest.raises(InvalidOptionError, match="cameras must be a sequence of cameras, got Camera"):
+        Rasterizer(3, around(), device="cpu")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidOptionError, match="cameras must hold cameras, got int at place 1"):
+        rasterize(made, [around(), 7], channels=(), device="cpu")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InvalidOptionError, match="low_pass must"):
         RasterOptions(low_pass=float("nan"))
     with pytest.raises(InvalidOptionError, match="depth must be one of plane, exact"):
