@@ -13,6 +13,7 @@ finite.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import warp as wp
@@ -224,7 +225,4 @@ class NormalLoss(_Term):
 
 def _scale(weight: float, shape: tuple[int, ...]) -> float:
     """Return the factor of a sum that makes it a weighted mean."""
-    count = 1
-    for side in shape:
-        count *= side
-    return require_number("weight", weight, 0.0) / count
+    return require_number("weight", weight, 0.0) / math.prod(shape)

@@ -157,7 +157,7 @@ def rasterize(
         What the camera sees; for a sequence of cameras, what each one sees.
 
     Raises:
-        InvalidOptionError: A channel is unknown, or the cloud is in other axes.
+        InvalidOptionError: A channel is unknown, ``cameras`` holds something else, or the cloud is in other axes.
         InvalidArrayError: The cloud lacks a channel, or it covers an image too often to be drawn.
         DeviceError: The device is not there.
 

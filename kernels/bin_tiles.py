@@ -29,7 +29,8 @@ wp.set_module_options({"enable_backward": False})
 
 TILE = 16
 """Side of a tile [pixel]. Fast composites look at a tile's list part by part, so that small tiles would only make more
-pairs to sort: 8 pixels make 2.5 times as many for a figure of 140,000 Gaussians at 1080p."""
+pairs to sort: 8 pixels make 2.2 times as many for a figure of 140,000 Gaussians at 1080p. The composite's adjoint on
+CUDA is written for 16."""
 
 SIDE = wp.constant(TILE)
 LAST = wp.constant(float(TILE - 1))

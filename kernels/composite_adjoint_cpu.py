@@ -11,7 +11,7 @@ from beam_warp.kernels.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, load_state, rows_in, store_state, tile_box
+from beam_warp.kernels.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.project import LOG_CUT
 from beam_warp.kernels.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
@@ -72,7 +72,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                     log_alpha = log_alpha_of(center, e)
                     if not (log_alpha >= -LOG_CUT):
                         continue
-                    state = load_state(images.states, pixel)
+                    state = images.states[pixel]
                     is_median = k == images.medians[pixel]
                     to_median = float(0.0)
                     if is_median and adjoints.median_depth.shape[0] > 0:
@@ -94,7 +94,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
                         e,
                         row,
                     )
-                    store_state(images.states, pixel, wp.vec4(before, behind, state[2], state[3]))
+                    images.states[pixel] = wp.vec4(before, behind, state[2], state[3])
             out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel

@@ -60,51 +60,11 @@ def columns_in(box: wp.vec4i, center: wp.vec4, row: RowReach, y: int) -> wp.vec2
     )
 
 
-@wp.func_native("""
-    return states.data[pixel];
-""")
-def load_state(states: wp.array[wp.vec4], pixel: int) -> wp.vec4:
-    """Return ``states[pixel]``, without the six instructions by which Warp also takes negative numbers."""
-    ...
-
-
-@wp.func_native("""
-    states.data[pixel] = state;
-""")
-def store_state(states: wp.array[wp.vec4], pixel: int, state: wp.vec4):
-    """Set ``states[pixel]``."""
-    ...
-
-
-_ADD_ROW = """
-#if !defined(__CUDA_ARCH__)
-    typedef float quad __attribute__((vector_size(16), aligned(4)));
-    const quad* source = reinterpret_cast<const quad*>(rows.data + row);
-    quad* target = reinterpret_cast<quad*>(out_images.data + pixel);
-    ADDITIONS
-#endif
-"""
-
-
-@cache
-def add_row_function(channel_count: int):
-    """Return the function that adds a row of channels to a pixel's, in vector instructions and in place."""
-    Channels = channel_vector(channel_count)
-
-    additions = "".join(f"target[{i}] += source[{i}] * weight; " for i in range(channel_count // 4))
-
-    @wp.func_native(_ADD_ROW.replace("ADDITIONS", additions))
-    def add_row(rows: wp.array[Channels], row: int, weight: float, out_images: wp.array[Channels], pixel: int): ...
-
-    return add_row
-
-
 @cache
 def composite_cpu_kernel(channel_count: int, exact: bool):
     """Return the kernel that composites ``channel_count`` channels, one tile an item."""
     Channels = channel_vector(channel_count)
     depth_at = depth_function(exact)
-    add_row = add_row_function(channel_count)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_kernel(
@@ -132,6 +92,7 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
             shape = frame.splats.shapes[splat]
             slope = frame.splats.slopes[splat]
             bend = frame.splats.bends[splat]
+            row = channels[splat]
             rows = rows_in(box, center, shape)
             reach = row_reach(shape, squared_extent(center[2]))
             for y in range(rows[0], rows[1]):
@@ -139,7 +100,7 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                 start = view.first_pixel + y * view.width
                 for x in range(columns[0], columns[1]):
                     pixel = start + x
-                    state = load_state(out_images.states, pixel)
+                    state = out_images.states[pixel]
                     transmittance = state[0]
                     if not (transmittance >= TRANSMITTANCE_STOP):
                         continue
@@ -150,18 +111,14 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                     alpha = alpha_of(log_alpha)
                     weight = alpha * transmittance
                     z = depth_at(center, shape, slope, bend, frame.near, offset)
-                    add_row(channels, splat, weight, out_channels, pixel)
+                    out_channels[pixel] = out_channels[pixel] + row * weight
                     median = state[3]
                     if transmittance > MEDIAN:
                         median = z
                         out_images.medians[pixel] = k
                     out_images.ends[pixel] = k + 1
                     transmittance *= 1.0 - alpha
-                    store_state(
-                        out_images.states,
-                        pixel,
-                        wp.vec4(transmittance, state[1] + weight, state[2] + z * weight, median),
-                    )
+                    out_images.states[pixel] = wp.vec4(transmittance, state[1] + weight, state[2] + z * weight, median)
                     if transmittance < TRANSMITTANCE_STOP:
                         open_pixels -= 1
         for y in range(box[1], box[3]):
