@@ -24,7 +24,8 @@ from beam_warp.cameras import Camera
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.images import Image, read_image
-from beam_warp.undistortion import COEFFICIENT_NAMES, MAX_COEFFICIENT, Intrinsics, Lens, Undistortion
+from beam_warp.lenses import COEFFICIENT_NAMES, MAX_COEFFICIENT, Lens
+from beam_warp.undistortion import Intrinsics, Undistortion
 
 FILE_NAME = "transforms.json"
 """The file that makes a folder a capture."""

@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.images import Image, linear_to_srgb
-from beam_warp.undistortion import MAX_ANGLE, Intrinsics, Lens, Undistortion
+from beam_warp.lenses import Lens
+from beam_warp.undistortion import MAX_ANGLE, Intrinsics, Undistortion
 
 PHOTOGRAPH = Intrinsics(160, 120, 150.0, 140.0, 83.0, 58.0)
 BARREL = Lens((-0.25, 0.08, -0.01, 0.002, 0.001, -0.0015))
