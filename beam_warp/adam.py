@@ -16,6 +16,8 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.adam import (
     AdamOptions,
     ParameterGroup,
+    launch_clear_rows,
+    launch_clear_steps,
     launch_gather_rows,
     launch_gather_steps,
     launch_step,
@@ -160,6 +162,21 @@ class Adam:
         """
         index = self._names.index(require_choice("name", name, self._names))
         self._rates[index : index + 1].fill_(require_number("learning_rate", learning_rate, 0.0))
+
+    def restart(self, rows: Any) -> None:
+        """Forget the moments and steps of some rows, whose values were replaced; arrays stay where they are.
+
+        Args:
+            rows: ``(N,)`` bool NumPy, True for rows to begin again.
+
+        Raises:
+            InvalidArrayError: ``rows`` has another shape.
+        """
+        marks = upload(require_array("rows", rows, (self._row_count,), np.bool_), wp.bool, self.device)
+        for group in self._groups:
+            launch_clear_rows(marks, group.means, self.device)
+            launch_clear_rows(marks, group.squares, self.device)
+        launch_clear_steps(marks, self._steps, self.device)
 
     def gather(self, indices: Any, *, fresh_from: int | None = None) -> Adam:
         """Return an optimiser of some of the rows: how rows are dropped, repeated and added.

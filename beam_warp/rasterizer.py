@@ -187,19 +187,31 @@ class Rasterizer:
         self._frame.lists = lists
         self._pair_rows: dict[int, Rows] = {}
 
-    def set_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Move cameras or change their lenses; their number and sizes stay. `backward` wants a draw in between.
+    def prepare_cameras(self, cameras: Sequence[Camera]) -> PreparedCameras:
+        """Bring other cameras to the device, so that `set_cameras` takes them without waiting.
 
         Raises:
-            InvalidOptionError: A number or size differs.
+            InvalidOptionError: A number or size differs from this rasteriser's.
         """
         sizes = [(camera.width, camera.height) for camera in self.cameras]
         given = [(camera.width, camera.height) for camera in cameras]
         if given != sizes:
             raise InvalidOptionError(f"cameras must have the sizes {sizes}, got {given}. Make another Rasterizer.")
-        self.cameras = tuple(cameras)
-        self._layout = ViewLayout.of(self.cameras)
-        self._views.assign(wp.array(self._layout.views, dtype=View, device="cpu"))
+        layout = ViewLayout.of(cameras)
+        return PreparedCameras(tuple(cameras), layout, wp.array(layout.views, dtype=View, device=self.device))
+
+    def set_cameras(self, cameras: Sequence[Camera] | PreparedCameras) -> None:
+        """Move cameras or change their lenses; their number and sizes stay. `backward` wants a draw in between.
+
+        With cameras that `prepare_cameras` brought, the call may be captured in a CUDA graph.
+
+        Raises:
+            InvalidOptionError: A number or size differs.
+        """
+        prepared = cameras if isinstance(cameras, PreparedCameras) else self.prepare_cameras(cameras)
+        self.cameras = prepared.cameras
+        self._layout = prepared.layout
+        wp.copy(self._views, prepared.views)
 
     @property
     def first_pixels(self) -> tuple[int, ...]:
@@ -468,6 +480,15 @@ class Rasterizer:
             self.device,
         )
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedCameras:
+    """Cameras on a device, for `Rasterizer.set_cameras`."""
+
+    cameras: tuple[Camera, ...]
+    layout: ViewLayout
+    views: wp.array
 
 
 @dataclass(eq=False)

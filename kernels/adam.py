@@ -114,6 +114,21 @@ def gather_steps_kernel(first: int, steps: wp.array[int], indices: wp.array[int]
     out_steps[item] = step
 
 
+@wp.kernel
+def clear_rows_kernel(first: int, marks: wp.array[bool], out_rows: wp.array2d[float]):
+    item = first + wp.tid()
+    width = out_rows.shape[1]
+    if marks[item / width]:
+        out_rows[item / width, item % width] = 0.0
+
+
+@wp.kernel
+def clear_steps_kernel(first: int, marks: wp.array[bool], out_steps: wp.array[int]):
+    item = first + wp.tid()
+    if marks[item]:
+        out_steps[item] = 0
+
+
 def launch_step(
     visible: Any,
     groups: Any,
@@ -149,3 +164,13 @@ def launch_gather_rows(rows: Any, indices: Any, out_rows: Any, device: Any) -> N
 def launch_gather_steps(steps: Any, indices: Any, out_steps: Any, device: Any) -> None:
     """Copy counts by index; those without one are 0."""
     launch(gather_steps_kernel, out_steps.size, inputs=[steps, indices], outputs=[out_steps], device=device)
+
+
+def launch_clear_rows(marks: Any, out_rows: Any, device: Any) -> None:
+    """Set marked rows to 0."""
+    launch(clear_rows_kernel, out_rows.size, inputs=[marks], outputs=[out_rows], device=device)
+
+
+def launch_clear_steps(marks: Any, out_steps: Any, device: Any) -> None:
+    """Set marked counts to 0."""
+    launch(clear_steps_kernel, out_steps.size, inputs=[marks], outputs=[out_steps], device=device)
