@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,8 +17,9 @@ from beam_warp.checks import require_array, require_count, require_finite, requi
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.even_points import launch_push_apart
-from beam_warp.kernels.seen_colors import ColorView, launch_agree_colors, launch_sample_colors
+from beam_warp.kernels.seen_colors import launch_agree_colors, launch_sample_colors
 from beam_warp.morton_order import morton_order
+from beam_warp.raster_layout import ViewLayout
 from beam_warp.raster_records import GaussianArrays
 from beam_warp.rasterizer import Rasterizer
 from beam_warp.visual_hull import masked_views, viewing_focus, visual_hull
@@ -43,8 +43,11 @@ BALL_OPACITY = 0.1
 HEXAGONAL = (2.0 / np.sqrt(3.0)) ** 0.5
 """Distance of neighbours in the densest arrangement of one point for each unit of area."""
 
-RELAXATIONS = 5
-NEIGHBORS = 9
+RELAXATIONS = 3
+PUSHES = 2
+"""Times that neighbours are looked up, and that they then push each other: they hardly change from push to push."""
+
+NEIGHBORS = 10
 """Points that a point may have to keep away from, itself included: six surround it where all is even."""
 
 LEAST_FACING = 0.2
@@ -227,7 +230,7 @@ def seen_colors(
         launch_sample_colors(
             gaussians.positions,
             directions,
-            _color_view(view),
+            ViewLayout.of([view.camera]).views[0],
             upload(view.color.reshape(-1, 3), wp.vec3, target),
             upload(alpha, float, target),
             images.median_depth,
@@ -246,17 +249,6 @@ def seen_colors(
     if not known.all():
         result[~known] = result[known][cKDTree(positions[known]).query(positions[~known], workers=-1)[1]]
     return result
-
-
-def _color_view(view: CapturedView) -> Any:
-    camera = view.camera
-    record = ColorView()
-    record.world_to_camera = wp.mat33(np.linalg.inv(camera.camera_to_world[:3, :3]).astype(np.float32))
-    record.position = wp.vec3(*camera.position)
-    record.focal = wp.vec2(camera.focal_x, camera.focal_y)
-    record.center = wp.vec2(camera.center_x, camera.center_y)
-    record.width, record.height = camera.width, camera.height
-    return record
 
 
 def _facing_orientations(normals: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -17,6 +17,7 @@ from beam_warp.captured_views import CapturedView
 from beam_warp.checks import require_array, require_count, require_finite
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.project import View
 from beam_warp.kernels.silhouettes import launch_measure_silhouette
 from beam_warp.kernels.visual_hull import (
     BLOCK,
@@ -25,12 +26,12 @@ from beam_warp.kernels.visual_hull import (
     MOST_TOLERATED,
     OUTSIDE,
     SURFACE,
-    MaskView,
     launch_fill_blocks,
     launch_find_cells,
     launch_gather_cells,
     launch_judge_blocks,
 )
+from beam_warp.raster_layout import ViewLayout
 
 MIN_RESOLUTION = 16
 MAX_RESOLUTION = 1024
@@ -238,24 +239,20 @@ class _Cones:
         self.captured = list(views)
         self.tolerance = tolerance
         self.device = device
-        pixels = [view.camera.width * view.camera.height for view in views]
-        if sum(pixels) > 2**31 - 1:
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        if pixels > 2**31 - 1:
             raise InvalidArrayError(
-                f"masks must have at most {2**31 - 1} pixels in all, got {sum(pixels)}. Reduce the views."
+                f"masks must have at most {2**31 - 1} pixels in all, got {pixels}. Reduce the views."
             )
-        self.distances = wp.empty(sum(pixels), dtype=float, device=device)
-        self.records: list[Any] = []
-        first = 0
-        for view, size in zip(views, pixels, strict=True):
+        self.records = ViewLayout.of([view.camera for view in views]).views
+        self.views = wp.array(self.records, dtype=View, device=device)
+        self.distances = wp.empty(pixels, dtype=float, device=device)
+        for view, record in zip(views, self.records, strict=True):
             shape = (view.camera.height, view.camera.width)
-            gaps = [wp.empty(shape, dtype=float, device=device) for _ in range(2)]
+            column_gaps, row_gaps = (wp.empty(shape, dtype=float, device=device) for _ in range(2))
             limit = max(DISTANCE_LIMIT[0], max(shape) / DISTANCE_LIMIT[1])
-            assert view.alpha is not None
-            alpha = upload(view.alpha, float, device)
-            launch_measure_silhouette(alpha, limit, gaps[0], gaps[1], first, self.distances, device)
-            self.records.append(_mask_view(view, first))
-            first += size
-        self.views = wp.array(self.records, dtype=MaskView, device=device)
+            alpha = upload(np.asarray(view.alpha), float, device)
+            launch_measure_silhouette(alpha, limit, column_gaps, row_gaps, record.first_pixel, self.distances, device)
 
     def search(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of a box that holds the hull, with up to a block of a late round to spare.
@@ -350,24 +347,12 @@ class _Cones:
         return trimesh.Trimesh(vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1], process=False)
 
 
-def _mask_view(view: CapturedView, first_pixel: int) -> Any:
-    camera = view.camera
-    record = MaskView()
-    inverse = np.linalg.inv(camera.camera_to_world[:3, :3])
-    record.world_to_camera = wp.mat33(inverse.astype(np.float32))
-    record.position = wp.vec3(*camera.position)
-    record.focal = wp.vec2(camera.focal_x, camera.focal_y)
-    record.center = wp.vec2(camera.center_x, camera.center_y)
-    record.width, record.height, record.first_pixel = camera.width, camera.height, first_pixel
-    return record
-
-
 def _no_volume(views: Sequence[CapturedView], cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
     """Say that nothing is left, and which views are to blame where leaving out one is enough."""
     size, count = _blocks(box)
     blamed = []
     for i in range(len(views) if len(views) > 2 else 0):
-        cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=MaskView, device=cones.device)
+        cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=View, device=cones.device)
         if (cones.judge(box[0], size, count)[0] != OUTSIDE).any():
             blamed.append(views[i].name)
     if blamed:

@@ -5,6 +5,8 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.launching import launch
+from beam_warp.kernels.pinholes import camera_point, image_point, room_around
+from beam_warp.kernels.project import View
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,24 +21,12 @@ LEAST_SPREAD = wp.constant(0.01)
 """Deviation of a colour at which it counts half: a tenth of the mean, and for dark ones no less than this."""
 
 
-@wp.struct
-class ColorView:
-    """A camera whose image is read."""
-
-    world_to_camera: wp.mat33
-    position: wp.vec3
-    focal: wp.vec2  # pixel
-    center: wp.vec2  # pixel
-    width: int
-    height: int
-
-
 @wp.kernel
 def sample_colors_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    view: ColorView,
+    view: View,
     color: wp.array[wp.vec3],
     alpha: wp.array[float],
     depth: wp.array[float],
@@ -47,18 +37,16 @@ def sample_colors_kernel(
 ):
     i = first + wp.tid()
     sample = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    away = positions[i] - view.position
-    p = view.world_to_camera * away
+    p = camera_point(view, positions[i])
     z = p[2]
     normal = normals[i]
-    facing = -wp.dot(normal, wp.normalize(away))
+    facing = wp.dot(normal, wp.normalize(view.position - positions[i]))
     if wp.length_sq(normal) == 0.0:
         facing = 1.0
     if z > 0.0 and facing > least_facing:
-        x = view.focal[0] * p[0] / z + view.center[0]
-        y = view.focal[1] * p[1] / z + view.center[1]
-        if x >= 0.0 and y >= 0.0 and x < float(view.width) and y < float(view.height):
-            pixel = int(y) * view.width + int(x)
+        place = image_point(view, p)
+        if room_around(view, place) > 0.0:
+            pixel = int(place[1]) * view.width + int(place[0])
             coverage = alpha[pixel]
             seen = depth[pixel]
             if coverage >= LEAST_COVERAGE and seen > 0.0 and z <= seen + slack:

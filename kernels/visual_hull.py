@@ -10,6 +10,8 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.launching import launch
+from beam_warp.kernels.pinholes import camera_point, image_point, room_around
+from beam_warp.kernels.project import View
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,24 +38,11 @@ SURFACE = wp.constant(1)
 INSIDE = wp.constant(2)
 
 
-@wp.struct
-class MaskView:
-    """A camera, and where its silhouette's distances are among those of all."""
-
-    world_to_camera: wp.mat33
-    position: wp.vec3
-    focal: wp.vec2  # pixel
-    center: wp.vec2  # pixel
-    width: int
-    height: int
-    first_pixel: int
-
-
 @wp.func
-def silhouette_distance(view: MaskView, distances: wp.array[float], x: float, y: float) -> float:
+def silhouette_distance(view: View, distances: wp.array[float], pixel: wp.vec2) -> float:
     """Signed distance [pixel] at a place of the image, bilinear between centres; constant beyond the outermost."""
-    column = wp.clamp(x - 0.5, 0.0, float(view.width - 1))
-    row = wp.clamp(y - 0.5, 0.0, float(view.height - 1))
+    column = wp.clamp(pixel[0] - 0.5, 0.0, float(view.width - 1))
+    row = wp.clamp(pixel[1] - 0.5, 0.0, float(view.height - 1))
     left = wp.min(int(column), wp.max(view.width - 2, 0))
     top = wp.min(int(row), wp.max(view.height - 2, 0))
     right = wp.min(left + 1, view.width - 1)
@@ -68,13 +57,13 @@ def silhouette_distance(view: MaskView, distances: wp.array[float], x: float, y:
 
 
 @wp.func
-def mean_focal(view: MaskView) -> float:
+def mean_focal(view: View) -> float:
     return 0.5 * (view.focal[0] + view.focal[1])
 
 
 @wp.func
 def hull_depth(
-    point: wp.vec3, views: wp.array[MaskView], distances: wp.array[float], tolerance: int, unseen: float
+    point: wp.vec3, views: wp.array[View], distances: wp.array[float], tolerance: int, unseen: float
 ) -> float:
     """Depth [m] in the cones: the least of all views that see the point, ``tolerance`` lesser ones left out.
 
@@ -84,14 +73,12 @@ def hull_depth(
     seen = int(0)
     for i in range(views.shape[0]):
         view = views[i]
-        p = view.world_to_camera * (point - view.position)
-        z = p[2]
-        if z > NEAR:
-            x = view.focal[0] * p[0] / z + view.center[0]
-            y = view.focal[1] * p[1] / z + view.center[1]
-            if x >= 0.0 and y >= 0.0 and x <= float(view.width) and y <= float(view.height):
+        p = camera_point(view, point)
+        if p[2] > NEAR:
+            pixel = image_point(view, p)
+            if room_around(view, pixel) >= 0.0:
                 seen += 1
-                depth = silhouette_distance(view, distances, x, y) * z / mean_focal(view)
+                depth = silhouette_distance(view, distances, pixel) * p[2] / mean_focal(view)
                 for k in range(4):
                     if depth < least[k]:
                         swapped = least[k]
@@ -108,7 +95,7 @@ def judge_blocks_kernel(
     origin: wp.vec3,
     size: float,
     count: wp.vec3i,
-    views: wp.array[MaskView],
+    views: wp.array[View],
     distances: wp.array[float],
     tolerance: int,
     out_states: wp.array[int],
@@ -125,20 +112,19 @@ def judge_blocks_kernel(
     agreeing = int(0)  # that see all of it inside
     for v in range(views.shape[0]):
         view = views[v]
-        p = view.world_to_camera * (center - view.position)
+        p = camera_point(view, center)
         z = p[2]
         if z > radius + NEAR:
             a = p[0] / z
             b = p[1] / z
-            x = view.focal[0] * a + view.center[0]
-            y = view.focal[1] * b + view.center[1]
+            pixel = image_point(view, p)
             # A step e of the ball moves the image by (e_xy - (a, b) e_z) / (z + e_z).
             reach = wp.max(view.focal[0], view.focal[1]) * radius * wp.sqrt(1.0 + a * a + b * b) / (z - radius)
-            room = wp.min(wp.min(x, float(view.width) - x), wp.min(y, float(view.height) - y))
+            room = room_around(view, pixel)
             if room > -reach:
                 possible += 1
             if room > reach:
-                distance = silhouette_distance(view, distances, x, y)
+                distance = silhouette_distance(view, distances, pixel)
                 if distance < -(reach + PIXEL_MARGIN):
                     against += 1
                 elif distance > reach + PIXEL_MARGIN:
@@ -161,7 +147,7 @@ def fill_blocks_kernel(
     origin: wp.vec3,
     voxel: float,
     count: wp.vec3i,
-    views: wp.array[MaskView],
+    views: wp.array[View],
     distances: wp.array[float],
     tolerance: int,
     out_depths: wp.array[float],

@@ -27,7 +27,7 @@ RANKS = {
     "beam_warp.captured_views": 4,
     "beam_warp.captures": 5,
     "beam_warp.visual_hull": 6,
-    "beam_warp.initialization": 9,
+    "beam_warp.initialization": 7,
     "beam_warp.sampling_limits": 6,
     "beam_warp.regularizers": 6,
     "beam_warp.schema": 4,
