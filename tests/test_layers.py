@@ -71,6 +71,7 @@ RANKS = {
     "beam_warp.mesh_path_tracing": 6,
     "beam_warp.demo_gaussians": 7,
     "beam_warp.demo_capture": 7,
+    "beam_warp.surface_distances": 6,
     "beam_warp.exposure": 12,
     "beam_warp.reporting": 12,
     "beam_warp.pipeline": 13,
