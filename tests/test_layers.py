@@ -72,6 +72,8 @@ RANKS = {
     "beam_warp.demo_gaussians": 7,
     "beam_warp.demo_capture": 7,
     "beam_warp.surface_distances": 6,
+    "beam_warp.tracking_drift": 7,
+    "beam_warp.reconstruction_scores": 10,
     "beam_warp.exposure": 12,
     "beam_warp.reporting": 12,
     "beam_warp.pipeline": 13,
