@@ -4,7 +4,7 @@ import warp as wp
 
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.mesh_surface import MeshSurface, closest_hit, is_open, surface_point
-from beam_warp.kernels.pixel_sampling import PixelRays, pixel_direction, sample_pair
+from beam_warp.kernels.pixel_sampling import PIXEL_CHUNK, PixelRays, pixel_direction, sample_pair
 from beam_warp.kernels.sampling import square_to_cosine_hemisphere, stream_of, tangent_frame
 
 wp.set_module_options({"enable_backward": False})
@@ -75,4 +75,5 @@ def launch_trace_channels(surface, rays, seed, sample_count, visibility_count, o
         outputs=[out_channels],
         device=out_channels.depth.device,
         block_dim=64,
+        min_chunk=PIXEL_CHUNK,
     )

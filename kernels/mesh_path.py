@@ -17,7 +17,7 @@ from beam_warp.kernels.environment_sampling import (
 from beam_warp.kernels.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.mesh_surface import MeshSurface, SurfacePoint, closest_hit, is_open, surface_point
-from beam_warp.kernels.pixel_sampling import PixelRays, pixel_direction, sample_pair
+from beam_warp.kernels.pixel_sampling import PIXEL_CHUNK, PixelRays, pixel_direction, sample_pair
 from beam_warp.kernels.sampling import square_to_cosine_hemisphere, stream_of, tangent_frame
 
 wp.set_module_options({"enable_backward": False})
@@ -221,6 +221,7 @@ def launch_trace_pixels(
         outputs=[out_radiance, out_alpha],
         device=out_alpha.device,
         block_dim=64,
+        min_chunk=PIXEL_CHUNK,
     )
 
 

@@ -4,6 +4,9 @@ import warp as wp
 
 from beam_warp.kernels.sampling import hash_combine, owen_scramble, owen_sobol_x, owen_sobol_y, unit_float
 
+PIXEL_CHUNK = 128
+"""Fewest pixels of one launch on the CPU: each is many rays."""
+
 
 @wp.struct
 class PixelRays:

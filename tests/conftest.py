@@ -34,3 +34,12 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"external data folder {path} is absent (set BEAM_DATA)")
     return path
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(tmp_path_factory):
+    """A capture of the demo figure with truth: 6 training cameras and 1 test camera, 2 frames of 64 x 64. Read only."""
+    from beam_warp.demo_capture import write_demo_capture
+
+    folder = tmp_path_factory.mktemp("captures") / "tiny"
+    return write_demo_capture(folder, frame_count=2, camera_count=6, test_camera_count=1, size=64, device="cpu")
