@@ -1,0 +1,85 @@
+"""How far the depth images of several views agree about the points that one of them shows.
+
+Another view confirms a point where it shows a surface at it, within a tolerance; it contradicts it where it looks
+through it, at something behind or at nothing; where something is in front of the point, or where the point is outside
+the image or at an edge, the view says nothing.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.depth_pixels import DepthCamera, footprint, pixel_point, project_point, sample_pixels
+from beam_warp.kernels.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def is_background(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: float) -> bool:
+    """Whether a place on the image, and the pixels around it, show nothing at all."""
+    column = int(wp.floor(x))
+    row = int(wp.floor(y))
+    if column < 1 or row < 1 or column + 1 >= camera.width or row + 1 >= camera.height:
+        return False
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            if pixels[camera.first_pixel + (row + dy) * camera.width + column + dx][0] > 0.0:
+                return False
+    return True
+
+
+@wp.kernel
+def compare_depths_kernel(
+    first: int,
+    view: int,
+    cameras: wp.array[DepthCamera],
+    pixels: wp.array[wp.vec3],
+    tolerance: float,
+    out_confirmed: wp.array[int],
+    out_contradicted: wp.array[int],
+    out_residuals: wp.array[float],
+):
+    """``tolerance`` in widths of the coarser of the two pixels; residuals [m] are means over confirming views."""
+    pixel = first + wp.tid()
+    own = cameras[view]
+    value = pixels[own.first_pixel + pixel]
+    confirmed = int(0)
+    contradicted = int(0)
+    residual = float(0.0)
+    if value[2] > 0.0:
+        x = float(pixel % own.width) + 0.5
+        y = float(pixel / own.width) + 0.5
+        point = pixel_point(own, x, y, value[0])
+        for i in range(cameras.shape[0]):
+            if i != view:
+                camera = cameras[i]
+                at = project_point(camera, point)
+                # Far outside, the place on the image would overflow an integer.
+                inside = at[0] >= 0.0 and at[1] >= 0.0 and at[0] < float(camera.width) and at[1] < float(camera.height)
+                if at[2] > 0.0 and inside:
+                    other = sample_pixels(pixels, camera, at[0], at[1])
+                    if other[2] > 0.0:
+                        distance = (1.0 / other[0] - at[2]) * other[1]
+                        allowed = tolerance * wp.max(footprint(own, value[0]), footprint(camera, other[0]))
+                        if wp.abs(distance) <= allowed:
+                            confirmed += 1
+                            residual += wp.abs(distance)
+                        elif distance > allowed:
+                            contradicted += 1
+                    elif is_background(pixels, camera, at[0], at[1]):
+                        contradicted += 1
+    if confirmed > 0:
+        residual /= float(confirmed)
+    out_confirmed[own.first_pixel + pixel] = confirmed
+    out_contradicted[own.first_pixel + pixel] = contradicted
+    out_residuals[own.first_pixel + pixel] = residual
+
+
+def launch_compare_depths(view, pixel_count, cameras, pixels, tolerance, confirmed, contradicted, residuals, device):
+    """Compare the points of one view with all others."""
+    launch(
+        compare_depths_kernel,
+        pixel_count,
+        inputs=[view, cameras, pixels, tolerance],
+        outputs=[confirmed, contradicted, residuals],
+        device=device,
+    )
