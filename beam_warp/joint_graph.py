@@ -1,11 +1,12 @@
 """Which joints hang together, and which joints a point is near: nearest neighbours with weights, on the host.
 
-Lengths are measured in joint spacings, the median distance from a joint to the nearest other one, never in metres: a
-subject of 2 m and one of 2 mm get the same graph.
+Lengths are measured in joint spacings, the median distance from a joint to the nearest one that it goes with, never in
+metres: a subject of 2 m and one of 2 mm get the same graph.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,7 @@ class JointGraph:
         incoming: Edges by the joint at their end, as numbers ``joint * k + slot``, ``(E,)`` int32, ascending for each
             joint. What an energy of the edges tells a joint is read off these, so no sum is shared.
         incoming_starts: Where each joint's begin, and the end of the last, ``(M + 1,)`` int32.
-        spacing: Median distance from a joint to the nearest other one, in the units of the positions; 1 for one joint.
+        spacing: Median length of the shortest edge of a joint, in the units of the positions; 1 for one joint.
     """
 
     neighbors: NDArray[np.int32]
@@ -66,8 +67,8 @@ class JointGraph:
         joints = require_points("joint_positions", joint_positions)
         count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints) - 1)
         facing = _normals("normals", normals, len(joints))
-        spacing = joint_spacing(joints)
         ends, squared = _nearest(joints, joints, count, facing, facing, themselves=True)
+        spacing = _spacing(squared)
         weights = proximity_weights(squared, REACH * spacing)
         there = weights > 0.0
         ends = np.where(there, ends, np.arange(len(joints))[:, None]).astype(np.int32)
@@ -122,21 +123,15 @@ def stretch(graph: JointGraph, rest_positions: ArrayLike, positions: ArrayLike) 
     return Stretch(ratios, float(found.min()), float(np.median(found)), float(found.max()), float(torn.mean()))
 
 
-def joint_spacing(joints: NDArray[np.float64]) -> float:
-    """Return the median distance from a joint to the nearest other one; 1 for one joint.
+def joint_spacing(joints: NDArray[np.float64], normals: ArrayLike | None = None) -> float:
+    """Return the median distance from a joint to the nearest other one that goes with it; 1 for one joint.
 
     Raises:
         InvalidArrayError: It is 0: at least half of the joints coincide with others.
     """
-    if len(joints) == 1:
-        return 1.0
-    spacing = float(np.median(cKDTree(joints).query(joints, k=2)[0][:, 1]))
-    if not spacing > 0.0:
-        raise InvalidArrayError(
-            f"joint_positions must be apart, got {len(joints)} joints of which half coincide with others. "
-            "Take them from select_joints."
-        )
-    return spacing
+    facing = _normals("joint_normals", normals, len(joints))
+    _, squared = _nearest(joints, joints, min(8, len(joints) - 1), facing, facing, themselves=True)
+    return _spacing(squared)
 
 
 def nearest_joints(
@@ -195,6 +190,19 @@ def require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:
         raise InvalidArrayError(f"{name} must hold at least one point, got none. Pass some.")
     require_finite(name, points)
     return points
+
+
+def _spacing(squared: NDArray[np.float64]) -> float:
+    """Return the median distance of joints to their nearest, of ascending squared ones; 1 for one joint."""
+    if squared.shape[1] == 0:
+        return 1.0
+    spacing = math.sqrt(np.median(squared[:, 0]))
+    if not spacing > 0.0:
+        raise InvalidArrayError(
+            f"joint_positions must be apart, got {len(squared)} joints of which half coincide with others. "
+            "Take them from select_joints."
+        )
+    return spacing
 
 
 def _normals(name: str, value: ArrayLike | None, count: int) -> NDArray[np.float64] | None:

@@ -76,7 +76,8 @@ class Anchors:
         skins, joints = require_points("positions", positions), require_points("joint_positions", joint_positions)
         count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints))
         nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals)
-        return cls(nearest.astype(np.int32), proximity_weights(squared, REACH * joint_spacing(joints)))
+        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals)
+        return cls(nearest.astype(np.int32), proximity_weights(squared, reach))
 
 
 class Skin:

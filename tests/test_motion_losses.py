@@ -180,11 +180,9 @@ class TestRigidity:
     def test_refusals(self, rng):
         poses = [vectors(pose, "cpu") for pose in motion(rng, 5, angle=0.5, shift=0.1)]
         loss = RigidityLoss(JointGraph.build(poses[3].numpy()), device="cpu")
-        with pytest.raises(InvalidArrayError, match="positions must be a contiguous warp array of 5 vec3 on cpu, got "):
+        with pytest.raises(InvalidArrayError, match="positions must be a contiguous warp array of 5 vec3 on cpu"):
             loss(poses[0], poses[0], *poses[2:])
-        with pytest.raises(
-            InvalidArrayError, match="rotations must be a contiguous warp array of 5 quat on cpu, got nd"
-        ):
+        with pytest.raises(InvalidArrayError, match="rotations must be a contiguous warp array of 5 quat on cpu"):
             loss(poses[0].numpy(), *poses[1:])
         with pytest.raises(InvalidOptionError, match="weight must be a number in"):
             loss(*poses, weight=float("nan"))
@@ -198,15 +196,12 @@ class TestTemporal:
         assert value(loss) == 0.5
         assert (gradient.numpy() == 2.0 * 2.0 * 0.25 / 0.25 / 4.0).all()
 
-    @pytest.mark.parametrize("kind", [wp.float32, wp.vec3, wp.quat, wp.vec4, 5])
+    @pytest.mark.parametrize(("kind", "width"), [(float, None), (float, 5), (wp.vec3, 3), (wp.quat, 4), (wp.vec4, 4)])
     @pytest.mark.parametrize("count", [1, 1023, 1025])
-    def test_twin(self, device, rng, kind, count):
-        shape = (count, kind if isinstance(kind, int) else wp.types.type_length(kind) if kind != wp.float32 else 1)
+    def test_twin(self, device, rng, kind, width, count):
+        shape = (count,) if width is None else (count, width)
         now, before = (single(rng.standard_normal(shape)) for _ in range(2))
-        if kind is wp.float32:
-            now, before, shape = now[:, 0], before[:, 0], (count,)
-        dtype = float if isinstance(kind, int) else kind
-        arrays = [wp.array(a.astype(np.float32), dtype=dtype, device=device) for a in (now, before, 0.0 * now)]
+        arrays = [wp.array(a.astype(np.float32), dtype=kind, device=device) for a in (now, before, 0.0 * now)]
         loss = TemporalLoss(shape, device=device)(*arrays[:2], weight=0.3, unit=0.1, gradient=arrays[2])
         assert value(loss) == pytest.approx(0.3 * twin.temporal(now, before, 0.1), rel=8.0 * EPSILON)
         expected = 2.0 * 0.3 * (now - before) / 0.1**2 / now.size
