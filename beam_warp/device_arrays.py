@@ -83,3 +83,27 @@ def pixel_channels(rows: wp.array, height: int, width: int, first: int, count: i
             f"{floats.shape} with strides {floats.strides}. Pass one row per pixel."
         )
     return floats.reshape((height, width, floats.shape[1]))[:, :, first : first + count]
+
+
+def require_vectors(name: str, value: Any, count: int, width: int, device: Any) -> wp.array:
+    """Return ``count`` contiguous vectors on a device: vec3 as they are, quaternions and vec4 as vec4.
+
+    Raises:
+        InvalidArrayError: The array has another type, length or device, or is not contiguous.
+    """
+    kinds = (wp.vec3,) if width == 3 else (wp.quat, wp.vec4)
+    if not (
+        isinstance(value, wp.array)
+        and value.dtype in kinds
+        and value.shape == (count,)
+        and value.device == device
+        and value.is_contiguous
+    ):
+        got = type(value).__name__
+        if isinstance(value, wp.array):
+            got = f"{value.dtype.__name__} {value.shape} on {value.device}, strides {value.strides}"
+        raise InvalidArrayError(
+            f"{name} must be a contiguous warp array of {count} {'vec3' if width == 3 else 'quat'} on {device}, "
+            f"got {got}. Upload, convert or copy it."
+        )
+    return value if width == 3 else value.view(wp.vec4)
