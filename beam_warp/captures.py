@@ -13,19 +13,21 @@ import json
 import math
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.cameras import Camera
+from beam_warp.captured_views import CapturedView
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.images import Image, read_image
 from beam_warp.lenses import COEFFICIENT_NAMES, MAX_COEFFICIENT, Lens
-from beam_warp.undistortion import Intrinsics, Undistortion
+from beam_warp.undistortion import COLORS, Intrinsics, Undistortion
 
 FILE_NAME = "transforms.json"
 """The file that makes a folder a capture."""
@@ -45,6 +47,16 @@ LENS_MODELS = {
 }
 """Camera models of nerfstudio that are read, and what undistorts them: all but the last one are the same to it too."""
 
+ALPHA_ROUNDING = 2.0**-10
+"""Alpha this far outside [0, 1] is the rounding of a half float, two of which are added by a renderer's filter."""
+
+COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
+"""What ``color_space`` may say of image files, for all records or one; without it each format's custom holds."""
+
+IMAGE_FOLDER = "images"
+MASK_FOLDER = "masks"
+"""Where a capture names no masks, ``images/a/0.jpg`` has ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``."""
+
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -59,6 +71,8 @@ class CaptureRecord:
         split: What it is for: ``train``, ``test``, ….
         camera: The pinhole that `image` was taken by.
         image_path: The image file, as photographed.
+        mask_path: An image file, as photographed, that is white where the subject is; None if there is none.
+        color_space: Of the image file, `assets.LINEAR_REC709` or `DISPLAY_SRGB`; None for the custom of its format.
         truth_path: An EXR of exact channels, where the capture is synthetic.
         relit_paths: By name of the light, the exact image under it.
         undistortion: What straightens the files, all of them, as they are read; None where a pinhole took them.
@@ -70,6 +84,8 @@ class CaptureRecord:
     split: str
     camera: Camera
     image_path: Path
+    mask_path: Path | None = None
+    color_space: str | None = None
     truth_path: Path | None = None
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
     undistortion: Undistortion | None = None
@@ -97,7 +113,38 @@ class CaptureRecord:
             MissingFileError: It is not there.
             AssetFormatError: It is damaged, or its size is not the camera's.
         """
-        return self._read(self.image_path)
+        return self._undistorted(self._photograph())
+
+    def view(self) -> CapturedView:
+        """Read what reconstruction sees: scene-linear colour, undistorted, and the coverage of the subject.
+
+        Coverage is the image's alpha; a mask file multiplies it, or stands for it where the image has none. The mask
+        is applied to the photograph before that is undistorted, so that edges of both are filtered alike. Without
+        either, coverage is not known: alpha is None. Nothing is kept: each call reads the files again.
+
+        Raises:
+            MissingFileError: The image or the mask that the capture names is not there.
+            AssetFormatError: One is damaged, not of the camera's size, or holds values that no image has.
+        """
+        image = self._photograph()
+        if self.mask_path is not None:
+            image = _masked(image, self._sized(read_image(self.mask_path), "mask"))
+        image = self._undistorted(image)
+        rgba = image.linear_rgba()
+        alpha = None if image.alpha is None else rgba[..., 3]
+        if alpha is not None:
+            if not ((alpha >= -ALPHA_ROUNDING) & (alpha <= 1.0 + ALPHA_ROUNDING)).all():
+                raise AssetFormatError(
+                    f"alpha must lie in [0, 1], got {np.nanmin(alpha):g} to {np.nanmax(alpha):g}"
+                    f"{' and NaN' if np.isnan(alpha).any() else ''} at {self.image_path}. Export the image again."
+                )
+            alpha = np.clip(alpha, 0.0, 1.0)
+        if not np.isfinite(rgba).all():
+            raise AssetFormatError(
+                f"image must be finite, got NaN or infinity in {int((~np.isfinite(rgba)).any(axis=-1).sum())} pixels "
+                f"at {self.image_path}. Export it again, or repair those pixels."
+            )
+        return CapturedView(name=self.name, camera=self.camera, color=rgba[..., :3], alpha=alpha)
 
     def truth(self) -> Image:
         """Read the exact channels, undistorted like the image.
@@ -108,16 +155,37 @@ class CaptureRecord:
         """
         if self.truth_path is None:
             raise MissingFileError(f"truth must be given for {self.name}, got none. Choose a record that has it.")
-        return self._read(self.truth_path)
+        return self._undistorted(self._sized(read_image(self.truth_path), "image"))
 
-    def _read(self, path: Path) -> Image:
-        image = read_image(path)
+    def _photograph(self) -> Image:
+        return self._sized(read_image(self.image_path, color_space=self.color_space), "image")
+
+    def _sized(self, image: Image, what: str) -> Image:
         if (image.width, image.height) != (self.camera.width, self.camera.height):
             raise AssetFormatError(
-                f"image must be {self.camera.width} x {self.camera.height} as {FILE_NAME} says, "
-                f"got {image.width} x {image.height} at {path}. Correct w and h, or the image."
+                f"{what} must be {self.camera.width} x {self.camera.height} as the capture says, "
+                f"got {image.width} x {image.height} at {image.path}. Correct the size there, or the {what}."
             )
+        return image
+
+    def _undistorted(self, image: Image) -> Image:
         return image if self.undistortion is None else self.undistortion.image(image)
+
+
+def _masked(image: Image, mask: Image) -> Image:
+    """Return an image whose alpha is multiplied by a mask's brightness, as the file has it: coverage has no curve."""
+    rgb = mask.rgb()
+    coverage = rgb[..., 0] if (rgb == rgb[..., :1]).all() else rgb.mean(axis=-1, dtype=np.float32)
+    channels = dict(image.channels)
+    if image.premultiplied:
+        if image.color_space == DISPLAY_SRGB:
+            raise AssetFormatError(
+                f"image must be scene-linear or have straight alpha to be masked, got sRGB premultiplied at "
+                f"{image.path}. State its colour space, or convert it."
+            )
+        channels.update((name, channels[name] * coverage) for name in COLORS if name in channels)
+    channels["A"] = coverage if image.alpha is None else image.alpha * coverage
+    return replace(image, channels=channels)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -188,12 +256,13 @@ class Capture:
             for split in ("train", "val", "test")
             for name in _Fields(content, str(path)).texts(f"{split}_filenames")
         }
+        has_masks = (root / MASK_FOLDER).is_dir()
         records, seen = [], {}
         for index, entry in enumerate(listed):
             where = f"{path}, frames[{index}]"
             if not isinstance(entry, dict):
                 raise AssetFormatError(f"record must be an object, got {_shown(entry)} at {where}. Write it as one.")
-            record = _record(_Fields({**_shared(content), **entry}, where), root, splits, keep)
+            record = _record(_Fields({**_shared(content), **entry}, where), root, splits, keep, has_masks)
             if record.name in seen:
                 raise AssetFormatError(
                     f"camera and frame must be another pair in each record, got {record.name} "
@@ -287,7 +356,7 @@ class _Fields:
         return default if value is None else value
 
 
-_SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "camera_model")
+_SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "camera_model", "color_space")
 
 
 def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -295,7 +364,7 @@ def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: content[name] for name in _SHARED_NAMES if name in content}
 
 
-def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float) -> CaptureRecord:
+def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float, has_masks: bool) -> CaptureRecord:
     """Read one record."""
     model = fields.text("camera_model", "OPENCV")
     if model not in LENS_MODELS:
@@ -321,6 +390,7 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float)
     except BeamError as error:  # the pose is not rigid: say where
         raise AssetFormatError(f"transform_matrix is no camera pose at {fields.where}: {error}") from error
     file_path = fields.text("file_path")
+    beside = mask_beside(root, file_path) if has_masks else None
     image_name = PurePosixPath(file_path.replace("\\", "/"))
     parts = [*(part for part in image_name.parts[:-1] if part not in ("/", "..")), image_name.stem]
     return CaptureRecord(
@@ -330,10 +400,33 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float)
         split=fields.text("split", splits.get(file_path, "train")),
         camera=camera,
         image_path=root / file_path,
+        mask_path=root / fields.text("mask_path") if fields.values.get("mask_path") is not None else beside,
+        color_space=_color_space(fields),
         truth_path=root / fields.text("truth") if fields.values.get("truth") is not None else None,
         relit_paths=fields.paths("relit", root),
         undistortion=None if undistortion.lens.is_straight else undistortion,
     )
+
+
+def _color_space(fields: _Fields) -> str | None:
+    if fields.values.get("color_space") is None:
+        return None
+    name = fields.text("color_space")
+    if name not in COLOR_SPACES:
+        raise fields.error("color_space", f"one of {', '.join(COLOR_SPACES)}", name)
+    return COLOR_SPACES[name]
+
+
+def mask_beside(root: Path, file_path: str) -> Path | None:
+    """Return the mask that lies in a capture's folder of masks where the image lies in that of images, if it does."""
+    image = PurePosixPath(file_path.replace("\\", "/"))
+    parts = image.parts[1:] if image.parts[:1] == (IMAGE_FOLDER,) else image.parts
+    inner = PurePosixPath(*parts)
+    for name in (inner.with_suffix(".png"), inner.with_name(inner.name + ".png")):
+        path = root / MASK_FOLDER / name
+        if path.is_file():
+            return path
+    return None
 
 
 def _read_json(path: Path) -> dict[str, Any]:
