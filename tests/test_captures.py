@@ -175,7 +175,9 @@ def test_a_broken_file_is_one_line(tmp_path, text, message):
 
 
 def test_missing_files(tmp_path):
-    with pytest.raises(MissingFileError, match=r"capture must be a folder with transforms\.json, got"):
+    with pytest.raises(
+        MissingFileError, match=r"capture must be a folder with transforms\.json, a COLMAP model .*, got"
+    ):
         Capture.read(tmp_path)
     with pytest.raises(MissingFileError, match="capture must be a folder"):
         Capture.read(tmp_path / "nowhere")
@@ -335,3 +337,23 @@ def test_views_that_cannot_be_read(tmp_path):
         AssetFormatError, match=r"color_space must be one of srgb, linear, got 'adobe' at .*frames\[0\]"
     ):
         Capture.read(tmp_path)
+
+
+def test_sparse_points(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {n}\n" for n in "xyz")
+    colors = "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
+    write_capture(tmp_path, [record()], ply_file_path="points.ply")
+    capture = Capture.read(tmp_path)
+    with pytest.raises(MissingFileError):
+        capture.points()
+    (tmp_path / "points.ply").write_text(f"{header}{colors}end_header\n1 2 3 255 0 128\n0 0 0.5 1 1 1\n")
+    points = capture.points()
+    np.testing.assert_array_equal(points.positions, [(1, 2, 3), (0, 0, 0.5)])
+    np.testing.assert_allclose(points.colors[0], (1.0, 0.0, 0.2158605), atol=1e-6)
+    (tmp_path / "points.ply").write_text(f"{header}end_header\n1 2 3\n0 0 0.5\n")
+    assert capture.points().colors is None
+    (tmp_path / "points.ply").write_text(f"{header}end_header\n1 2 3\n0 nan 0.5\n")
+    with pytest.raises(AssetFormatError, match="points must be finite"):
+        capture.points()
+    write_capture(tmp_path, [record()])
+    assert Capture.read(tmp_path).points() is None
