@@ -31,6 +31,9 @@ MAX_PIXELS = 512 * 2**20
 MAX_CHANNELS = 64
 """Most channels read from one EXR."""
 
+SUFFIXES = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
+"""Files that are read, by the end of their lower-case names."""
+
 HALF_MAX = 65504.0
 """Largest finite half-precision value."""
 
@@ -155,12 +158,7 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
     if color_space is not None:
         require_choice("color_space", color_space, COLOR_SPACES)
     suffix = path.suffix.lower()
-    if suffix not in (".exr", ".hdr", ".png", ".jpg", ".jpeg"):
-        raise AssetFormatError(
-            f"image must be an .exr, .hdr, .png, .jpg or .jpeg file, got {path}. Convert it to one of them."
-        )
-    if not path.is_file():
-        raise MissingFileError(f"image must be a readable file, got {path} (no such file). Check the path.")
+    _require_file(path)
     if suffix == ".exr":
         return Image(path, _read_exr(path), color_space or LINEAR_REC709, premultiplied=True)
     if suffix == ".hdr":
@@ -168,6 +166,51 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
         channels = {name: rgb[..., index] for index, name in enumerate("RGB")}
         return Image(path, channels, color_space or LINEAR_REC709, premultiplied=True)
     return Image(path, _read_pillow(path), color_space or DISPLAY_SRGB, premultiplied=False)
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return the width and height of an image file; pixels are decoded of an .hdr only.
+
+    Raises:
+        MissingFileError: There is no such file, or it cannot be read.
+        AssetFormatError: It is not an image that `read_image` reads, as far as its header tells.
+    """
+    path = Path(path)
+    _require_file(path)
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        image = read_image(path)
+        return image.width, image.height
+    if suffix == ".exr":
+        import OpenEXR
+
+        try:
+            first, end = _window(path, OpenEXR.File(str(path), header_only=True).header(), "displayWindow")
+        except AssetFormatError:
+            raise
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise _damaged(path, error) from error
+        width, height = (end - first).tolist()
+        return width, height
+    from PIL import Image as PillowImage
+
+    try:
+        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
+            _require_size(path, *picture.size)
+            return picture.size
+    except AssetFormatError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, PillowImage.DecompressionBombError) as error:
+        raise _damaged(path, error) from error
+
+
+def _require_file(path: Path) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        raise AssetFormatError(
+            f"image must be an .exr, .hdr, .png, .jpg or .jpeg file, got {path}. Convert it to one of them."
+        )
+    if not path.is_file():
+        raise MissingFileError(f"image must be a readable file, got {path} (no such file). Check the path.")
 
 
 def _require_size(path: Path, width: int, height: int) -> None:

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
 from beam_warp.captures import Capture
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
@@ -174,7 +175,9 @@ def test_a_broken_file_is_one_line(tmp_path, text, message):
 
 
 def test_missing_files(tmp_path):
-    with pytest.raises(MissingFileError, match=r"capture must be a folder with transforms\.json, got"):
+    with pytest.raises(
+        MissingFileError, match=r"capture must be a folder with transforms\.json, a COLMAP model .*, got"
+    ):
         Capture.read(tmp_path)
     with pytest.raises(MissingFileError, match="capture must be a folder"):
         Capture.read(tmp_path / "nowhere")
@@ -228,3 +231,129 @@ def test_the_walker(data_dir):
         assert coverage is not None
         # Two renders of one view with different samples: they differ at the silhouette, a few percent of the pixels.
         assert np.abs(coverage - row.truth().channels["A"]).mean() < 1e-2
+
+
+def write_pair(folder, name, rgb, alpha=None):
+    """A PNG of 8 x 6 of one colour; its alpha, if any, is straight."""
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.broadcast_to(np.asarray(rgb, np.uint8), (6, 8, 3))
+    if alpha is not None:
+        pixels = np.concatenate([pixels, np.broadcast_to(np.asarray(alpha, np.uint8), (6, 8))[..., None]], axis=-1)
+    PillowImage.fromarray(np.ascontiguousarray(pixels)).save(folder / name)
+
+
+def test_a_view_is_linear_and_premultiplied(tmp_path):
+    half = np.full((6, 8), 0.5, np.float32)
+    (tmp_path / "images").mkdir()
+    write_exr(tmp_path / "images/x.exr", {"R": 0.5 * half, "G": half, "B": 4 * half, "A": half})
+    write_pair(tmp_path, "images/y.png", (128, 0, 255), alpha=51)
+    write_capture(
+        tmp_path,
+        [
+            record(file_path="images/x.exr", camera="x"),
+            record(file_path="images/y.png", camera="y"),
+            record(file_path="images/y.png", camera="z", color_space="linear"),
+        ],
+    )
+    x, y, z = (row.view() for row in Capture.read(tmp_path).records)
+    np.testing.assert_array_equal(x.color[3, 4], (0.25, 0.5, 2.0))
+    np.testing.assert_array_equal(x.alpha, half)
+    np.testing.assert_allclose(y.color[0, 0], (0.2158605 * 0.2, 0, 0.2), atol=1e-6)  # sRGB 128 is 0.2158605 of white
+    np.testing.assert_allclose(z.color[0, 0], (128 / 255 * 0.2, 0, 0.2), atol=1e-7)
+    assert (y.name, y.camera.focal_x, y.color.dtype, y.alpha.dtype) == ("y_0000", 10.0, np.float32, np.float32)
+    np.testing.assert_allclose(y.alpha, 0.2, atol=1e-7)
+
+
+def test_masks_named_and_beside(tmp_path):
+    mask = np.zeros((6, 8), np.uint8)
+    mask[2:, :4] = 255
+    mask[0, 0] = 51
+    for image in ("images/a/0.png", "images/b/0.png", "images/c.png", "images/d.png", "other/e.png"):
+        write_pair(tmp_path, image, (255, 255, 255))
+    write_pair(tmp_path, "images/f.png", (255, 255, 255), alpha=128)
+    for name in ("masks/a/0.png", "masks/b/0.png.png", "masks/other/e.png", "masks/f.png", "elsewhere.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        PillowImage.fromarray(mask).save(tmp_path / name)
+    images = ("images/a/0.png", "images/b/0.png", "images/c.png", "images/d.png", "other/e.png", "images/f.png")
+    records = [record(file_path=image, camera=name) for image, name in zip(images, "abcdef", strict=True)]
+    records[2]["mask_path"] = "elsewhere.png"
+    write_capture(tmp_path, records)
+    views = [row.view() for row in Capture.read(tmp_path).records]
+    expected = mask.astype(np.float32) / np.float32(255)
+    for index in (0, 1, 2, 4):
+        np.testing.assert_array_equal(views[index].alpha, expected)
+        np.testing.assert_array_equal(views[index].color, np.repeat(expected[..., None], 3, axis=-1))
+    assert views[3].alpha is None
+    np.testing.assert_array_equal(views[3].color, np.ones((6, 8, 3)))
+    np.testing.assert_allclose(views[5].alpha, expected * (128 / 255), atol=1e-7)
+
+
+def test_a_mask_is_undistorted_with_its_image(tmp_path):
+    ramp = np.linspace(0.0, 255.0, 8).astype(np.uint8)
+    write_pair(tmp_path, "images/a.png", (255, 255, 255))
+    write_pair(tmp_path, "images/b.png", (255, 255, 255), alpha=np.broadcast_to(ramp, (6, 8)))
+    (tmp_path / "masks").mkdir()
+    PillowImage.fromarray(np.ascontiguousarray(np.broadcast_to(ramp, (6, 8)))).save(tmp_path / "masks/a.png")
+    records = [record(file_path="images/a.png", camera="a"), record(file_path="images/b.png", camera="b")]
+    write_capture(tmp_path, records, k1=0.1)
+    masked, cut = (row.view() for row in Capture.read(tmp_path).records)
+    np.testing.assert_array_equal(masked.alpha, cut.alpha)
+    np.testing.assert_array_equal(masked.color, cut.color)
+
+
+def test_views_that_cannot_be_read(tmp_path):
+    (tmp_path / "images").mkdir()
+    one = np.ones((6, 8), np.float32)
+    bad = one.copy()
+    bad[2, 3] = np.nan
+    write_exr(tmp_path / "images/nan.exr", {"R": bad, "G": one, "B": one, "A": one})
+    write_exr(tmp_path / "images/alpha.exr", {"R": one, "G": one, "B": one, "A": 2 * one})
+    write_exr(tmp_path / "images/rounded.exr", {"R": one, "G": one, "B": one, "A": one * np.float32(1 + 2**-11)})
+    write_pair(tmp_path, "images/good.png", (9, 9, 9))
+    PillowImage.fromarray(np.zeros((6, 9), np.uint8)).save(tmp_path / "narrow.png")
+    good = record(file_path="images/good.png")
+    write_capture(
+        tmp_path,
+        [
+            record(file_path="images/nan.exr", camera="a"),
+            record(file_path="images/alpha.exr", camera="b"),
+            {**good, "camera": "c", "mask_path": "narrow.png"},
+            {**good, "camera": "d", "mask_path": "nowhere.png"},
+            record(file_path="images/rounded.exr", camera="e"),
+        ],
+    )
+    nan, alpha, narrow, nowhere, rounded = Capture.read(tmp_path).records
+    with pytest.raises(AssetFormatError, match=r"image must be finite, got NaN or infinity in 1 pixels at .*nan\.exr"):
+        nan.view()
+    with pytest.raises(AssetFormatError, match=r"alpha must lie in \[0, 1\], got 2 to 2 at .*alpha\.exr"):
+        alpha.view()
+    with pytest.raises(AssetFormatError, match=r"mask must be 8 x 6 as the capture says, got 9 x 6 at .*narrow\.png"):
+        narrow.view()
+    with pytest.raises(MissingFileError, match=r"nowhere\.png"):
+        nowhere.view()
+    assert rounded.view().alpha.max() == 1.0
+    write_capture(tmp_path, [record(color_space="adobe")])
+    with pytest.raises(
+        AssetFormatError, match=r"color_space must be one of srgb, linear, got 'adobe' at .*frames\[0\]"
+    ):
+        Capture.read(tmp_path)
+
+
+def test_sparse_points(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {n}\n" for n in "xyz")
+    colors = "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
+    write_capture(tmp_path, [record()], ply_file_path="points.ply")
+    capture = Capture.read(tmp_path)
+    with pytest.raises(MissingFileError):
+        capture.points()
+    (tmp_path / "points.ply").write_text(f"{header}{colors}end_header\n1 2 3 255 0 128\n0 0 0.5 1 1 1\n")
+    points = capture.points()
+    np.testing.assert_array_equal(points.positions, [(1, 2, 3), (0, 0, 0.5)])
+    np.testing.assert_allclose(points.colors[0], (1.0, 0.0, 0.2158605), atol=1e-6)
+    (tmp_path / "points.ply").write_text(f"{header}end_header\n1 2 3\n0 0 0.5\n")
+    assert capture.points().colors is None
+    (tmp_path / "points.ply").write_text(f"{header}end_header\n1 2 3\n0 nan 0.5\n")
+    with pytest.raises(AssetFormatError, match="points must be finite"):
+        capture.points()
+    write_capture(tmp_path, [record()])
+    assert Capture.read(tmp_path).points() is None
