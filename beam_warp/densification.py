@@ -24,9 +24,7 @@ def prune(rows: dict[str, NDArray[Any]], unused: NDArray[np.bool_]) -> None:
     rows["radiance"][unused] = 0.0
 
 
-def split(
-    rows: dict[str, NDArray[Any]], sources: NDArray[np.int64], targets: NDArray[np.int64]
-) -> None:
+def split(rows: dict[str, NDArray[Any]], sources: NDArray[np.int64], targets: NDArray[np.int64]) -> None:
     """Replace Gaussians by two halves along their longest axis: one in their own row, one in another; in place.
 
     Args:
@@ -47,9 +45,7 @@ def split(
         rows["log_scales"][places, axis] += np.float32(np.log(SPLIT_SHRINK))
 
 
-def choose_strained(
-    stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int
-) -> NDArray[np.int64]:
+def choose_strained(stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
     """Return the rows of largest stress among those that may be split, at most ``count``; ties by row."""
     candidates = np.flatnonzero(eligible & (stress > 0.0))
     order = np.argsort(-stress[candidates], kind="stable")

@@ -1,4 +1,4 @@
-"""Gaussians as an optimiser moves them: raw arrays on a device, what is drawn of them, and gradients on the way back."""
+"""Gaussians as an optimiser moves them: raw arrays on a device, what is drawn of them, and gradients back to them."""
 
 from __future__ import annotations
 

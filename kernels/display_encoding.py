@@ -51,6 +51,4 @@ def launch_encode(linear: Any, out_encoded: Any, device: Any) -> None:
 def launch_add_linear_gradients(linear: Any, gradients: Any, out_gradients: Any, device: Any) -> None:
     """Add the gradients of a linear image, given those of the encoded one."""
     pixels = linear.shape[0] * linear.shape[1]
-    launch(
-        add_linear_gradients_kernel, pixels, inputs=[linear, gradients], outputs=[out_gradients], device=device
-    )
+    launch(add_linear_gradients_kernel, pixels, inputs=[linear, gradients], outputs=[out_gradients], device=device)
