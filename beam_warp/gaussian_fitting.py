@@ -18,6 +18,7 @@ from beam_warp.densification import choose_strained, prune, split
 from beam_warp.devices import resolve_device
 from beam_warp.gaussian_parameters import GaussianParameters
 from beam_warp.kernels.stress import launch_add_stress
+from beam_warp.raster_records import RasterOptions
 from beam_warp.view_targets import LossWeights, ViewTargets, crop_views
 
 FitProgress = Callable[[int, int], None]
@@ -46,6 +47,7 @@ class FitOptions:
     opacity_rate: float = 3e-2
     color_rate: float = 5e-3
     band_rate: float = 2.5e-4
+    raster: RasterOptions = field(default_factory=lambda: RasterOptions(antialiased=True))
     seed: int = 0
 
 
@@ -84,7 +86,7 @@ class Fitter:
         by_size: dict[tuple[int, int], list[CapturedView]] = {}
         for view in cropped:
             by_size.setdefault((view.camera.width, view.camera.height), []).append(view)
-        self.groups = [ViewTargets(group, len(self.parameters), device) for group in by_size.values()]
+        self.groups = [ViewTargets(group, len(self.parameters), options.raster, device) for group in by_size.values()]
         self.views = [(group, index) for group in self.groups for index in range(len(group))]
         center = np.median(start.positions, axis=0)
         self.extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))

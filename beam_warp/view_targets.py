@@ -16,6 +16,7 @@ from beam_warp.devices import upload
 from beam_warp.image_losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.images import linear_to_srgb
 from beam_warp.kernels.display_encoding import launch_add_linear_gradients, launch_encode
+from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizer import PreparedCameras, Rasterizer
 
 CROP_MARGIN = 8
@@ -84,17 +85,17 @@ class ViewTargets:
         width: Of every view [pixel].
     """
 
-    def __init__(self, views: Sequence[CapturedView], gaussian_count: int, device: Any, **options: Any) -> None:
+    def __init__(self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, device: Any) -> None:
         """Bring views to a device.
 
         Args:
             views: Of one size.
             gaussian_count: Rows that are drawn.
+            options: How splats are drawn.
             device: Warp device.
-            options: Of the rasteriser.
         """
         self.rasterizer = Rasterizer(
-            gaussian_count, [views[0].camera], radiance=True, normals=True, device=device, **options
+            gaussian_count, [views[0].camera], radiance=True, normals=True, options=options, device=device
         )
         self.device = self.rasterizer.device
         self.height, self.width = views[0].camera.height, views[0].camera.width
