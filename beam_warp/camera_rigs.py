@@ -64,6 +64,14 @@ def seen_by(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return (depth > 0.0) & (x >= 0.0) & (x <= camera.width) & (y >= 0.0) & (y <= camera.height)
 
 
+def frustum_corners(camera: Camera, depth: float) -> NDArray[np.float64]:
+    """Return the world positions of an image's corners at a depth [m]: from the top left one, clockwise, ``(4, 3)``."""
+    x = (np.array([0.0, camera.width, camera.width, 0.0]) - camera.center_x) / camera.focal_x
+    y = (np.array([0.0, 0.0, camera.height, camera.height]) - camera.center_y) / camera.focal_y
+    local = depth * np.stack([x, y, np.ones(4)], axis=-1)
+    return local @ camera.camera_to_world[:3, :3].T + camera.position
+
+
 def frustum_volume(
     cameras: Sequence[Camera], *, share: float = 0.75
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -149,7 +149,8 @@ def inspect_capture(
     training = capture.select(split=SPLIT)
     cameras = {record.camera_name: record.camera for record in reversed(capture.records)}
     cameras = {name: cameras[name] for name in sorted(cameras)}
-    rig = {record.camera_name: record.camera for record in reversed(training)}
+    trained = {record.camera_name for record in training}
+    rig = {name: camera for name, camera in cameras.items() if name in trained}
     volume, blind = judge_cameras(rig, SPLIT, findings)
     left_out = {record.name for record in training if record.camera_name in blind}
     left_out |= _judge_files(capture, findings)

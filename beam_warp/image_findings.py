@@ -88,38 +88,66 @@ def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse],
         return set()
     names = {record.name for record in training}
     level = float(np.median([glimpse.brightest for glimpse in glimpses]))
-    black = [glimpse for glimpse in glimpses if not glimpse.brightest > BLACK * level]
-    left_out = _judge_black(training, glimpses, black, findings)
-    shown = [glimpse for glimpse in glimpses if glimpse not in black]
+    empty = [glimpse for glimpse in glimpses if _is_empty(glimpse)]
+    black = [glimpse for glimpse in glimpses if not glimpse.brightest > BLACK * level and glimpse not in empty]
+    left_out = _judge_void(training, glimpses, black, "black-image", "black", "Check the cameras.", findings)
+    left_out |= _judge_void(
+        training,
+        glimpses,
+        empty,
+        "empty-mask",
+        "of nothing, by mask or alpha,",
+        "Right if the subject is out of the image; else make the masks again.",
+        findings,
+    )
+    shown = [glimpse for glimpse in glimpses if glimpse not in black and glimpse not in empty]
     _judge_coverage(shown, findings)
     used = [glimpse for glimpse in shown if glimpse.record.name in names and glimpse.exposure is not None]
     _judge_exposure(used, findings)
     return left_out
 
 
-def _judge_black(
-    training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse], black: Sequence[Glimpse], findings: list[Finding]
+def _is_dim(alpha: NDArray[np.float32]) -> bool:
+    """Tell a mask of 0 and 1 from one of 0 and 255."""
+    return bool(0.0 < alpha.max() <= 2.5 / 255.0)
+
+
+def _is_empty(glimpse: Glimpse) -> bool:
+    return glimpse.alpha is not None and not glimpse.alpha.max() > SOLID and not _is_dim(glimpse.alpha)
+
+
+def _judge_void(
+    training: Sequence[CaptureRecord],
+    glimpses: Sequence[Glimpse],
+    void: Sequence[Glimpse],
+    code: str,
+    what: str,
+    remedy: str,
+    findings: list[Finding],
 ) -> set[str]:
-    """Find black images; a camera whose images were all black is left out as a whole."""
-    if not black:
+    """Say which images show nothing; a camera none of whose images showed more is left out as a whole.
+
+    Those with empty masks too: one of them would carve away all of the subject.
+    """
+    if not void:
         return set()
     looked: dict[str, int] = defaultdict(int)
     for glimpse in glimpses:
         looked[glimpse.record.camera_name] += 1
-    for glimpse in black:
+    for glimpse in void:
         looked[glimpse.record.camera_name] -= 1
     dead = {name for name, left in looked.items() if not left}
     findings.append(
         Finding(
-            "error" if len(black) == len(glimpses) else "warning",
-            "black-image",
-            f"{count_of(len(black), 'image')} {are(black)} black and left out"
+            "error" if len(void) == len(glimpses) else "warning",
+            code,
+            f"{count_of(len(void), 'image')} {are(void)} {what} and left out"
             + (f", with all others of {names_of(sorted(dead))}" if dead else ""),
-            names_of(glimpse.record.name for glimpse in black),
-            "Check the cameras.",
+            names_of(glimpse.record.name for glimpse in void),
+            remedy,
         )
     )
-    return {g.record.name for g in black} | {record.name for record in training if record.camera_name in dead}
+    return {g.record.name for g in void} | {record.name for record in training if record.camera_name in dead}
 
 
 def _judge_coverage(glimpses: Sequence[Glimpse], findings: list[Finding]) -> None:
@@ -149,7 +177,7 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: list[Finding]) -> Non
             )
         )
     known = [(glimpse, glimpse.alpha) for glimpse in glimpses if glimpse.alpha is not None]
-    low = [glimpse for glimpse, alpha in known if 0.0 < alpha.max() <= 2.5 / 255.0]
+    low = [glimpse for glimpse, alpha in known if _is_dim(alpha)]
     if low:
         findings.append(
             Finding(
@@ -158,17 +186,6 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: list[Finding]) -> Non
                 f"{count_of(len(low), 'mask')} {are(low)} never brighter than 2 of 255: written as 0 and 1, it seems",
                 names_of(glimpse.record.name for glimpse in low),
                 "Write masks with white as 255.",
-            )
-        )
-    empty = [glimpse for glimpse, alpha in known if not alpha.max() > SOLID and glimpse not in low]
-    if empty:
-        findings.append(
-            Finding(
-                "error" if len(empty) == len(known) else "warning",
-                "empty-mask",
-                f"mask or alpha of {count_of(len(empty), 'image')} of {len(known)} is empty: nothing is there",
-                names_of(glimpse.record.name for glimpse in empty),
-                "Right if the subject is out of the image; else make the masks again.",
             )
         )
     full = [glimpse for glimpse, alpha in known if float(alpha.min()) > 0.99]

@@ -13,6 +13,7 @@ from beam_warp._version import __version__
 from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
+from beam_warp.cli.inspect import Inspect, inspect
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
@@ -30,6 +31,7 @@ Command = (
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Stability, subcommand("stability", prefix_name=False)]
     | Annotated[Chart, subcommand("chart", prefix_name=False)]
+    | Annotated[Inspect, subcommand("inspect", prefix_name=False)]
 )
 
 
@@ -48,4 +50,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: stability(command))
     if isinstance(command, Chart):
         return run_command(lambda: chart(command))
+    if isinstance(command, Inspect):
+        return run_command(lambda: inspect(command))
     return run_command(lambda: demo(command))

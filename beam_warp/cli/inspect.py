@@ -1,0 +1,65 @@
+"""``beam inspect``: what a capture holds, what is wrong with it, and pictures of its cameras and masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from beam_warp.capture_drawing import headline, verdict, write_picture
+from beam_warp.capture_inspection import MAX_IMAGES, inspect_capture
+from beam_warp.capture_page import write_page
+from beam_warp.captures import Capture
+from beam_warp.chart_image import require_package
+from beam_warp.cli.console import print_json, progress
+from beam_warp.errors import OutputError
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Say what is wrong with a capture before hours are spent on it, and draw its cameras, frustums and masks.
+
+    Reads nerfstudio's transforms.json, COLMAP models (text and binary) and folders of 3 x 4 projection matrices. With
+    --out, writes OUT/capture.png and OUT/capture.html (one file, no network).
+
+    Exit code: 0 ready (warnings allowed), 1 something makes reconstruction impossible, 2 the capture cannot be read.
+
+    Example: beam inspect captures/walker --out report
+    """
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE", help="Folder of the capture.")]
+    out: Annotated[Path | None, arg(metavar="DIR", help="Folder for the pictures; none are drawn without.")] = None
+    max_images: Annotated[
+        int, arg(metavar="N", help="Images to look at, of evenly many frames; poses and file sizes are all checked.")
+    ] = MAX_IMAGES
+    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    quiet: Annotated[bool, arg(help="Print nothing; only the exit code answers.")] = False
+
+
+def inspect(args: Inspect) -> int:
+    """Inspect a capture, draw it, and say what was found."""
+    if args.out is not None:
+        for package in ("matplotlib", "plotly"):
+            require_package(package)
+    with progress(args.quiet or args.json) as advance:
+        report = inspect_capture(Capture.read(args.capture), max_images=args.max_images, progress=advance)
+    files = []
+    if args.out is not None:
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"out must be a folder, got {args.out} ({error.strerror}). Choose another.") from error
+        files = [args.out / "capture.png", args.out / "capture.html"]
+        write_picture(report, files[0])
+        write_page(report, files[1])
+    if args.json and not args.quiet:
+        print_json({**report.as_dict(), "files": [str(path) for path in files]})
+    elif not args.quiet:
+        for finding in report.findings:
+            print(finding)
+        print(f"{args.capture}: {verdict(report)} ({headline(report)})")
+        if files:
+            print(f"look at {files[0]} and {files[1]}")
+    return 0 if report.is_reconstructable else 1
