@@ -55,8 +55,9 @@ class DepthView:
 class DepthImages:
     """Depth, slope and weight of every pixel of all views: 12 bytes a pixel, and 12 more with colour.
 
-    The weight of a pixel is alpha times the cosine between normal and ray; it falls towards edges of the depth, with
-    the square of the share of its eight neighbours that see the same surface, and is 0 at tilts beyond 84 degrees.
+    The weight of a pixel is alpha times the fourth power of the cosine between normal and ray; it falls towards edges
+    of the depth, with the square of the share of its eight neighbours that see the same surface, and is 0 at tilts
+    beyond 84 degrees. Why the fourth power: see ``kernels/depth_pixels.py``.
 
     Attributes:
         cameras: The views' cameras.

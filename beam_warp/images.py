@@ -316,7 +316,7 @@ def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary name beside ``path`` that takes its place on success and vanishes on failure."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp{path.suffix}")
     try:
@@ -363,7 +363,7 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *
     kind = np.float16 if half else np.float32
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     file = OpenEXR.File(header, {name: array.astype(kind) for name, array in arrays.items()})
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         file.write(str(temporary))
 
 
@@ -391,5 +391,5 @@ def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
             f"pixels must be uint8 of shape (H, W), (H, W, 3) or (H, W, 4), got {array.dtype} {array.shape}. "
             "Encode linear values with display_image."
         )
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG")

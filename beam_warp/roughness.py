@@ -13,6 +13,7 @@ from beam_warp.assets import GaussianCloud
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.images import read_image
+from beam_warp.mesh_files import read_mesh
 
 MAX_TEXELS = 1 << 26
 """Largest texture, in texels, that is projected: 8192 x 8192."""
@@ -63,7 +64,7 @@ def textured_roughness(cloud: GaussianCloud, texture: Path, mesh: Path) -> NDArr
     Args:
         cloud: Gaussians, in the same axes and units as the mesh.
         texture: Image whose first channel is perceptual roughness in [0, 1], stored linearly.
-        mesh: Mesh with texture coordinates in any format of trimesh.
+        mesh: Mesh with texture coordinates in any format of trimesh; glTF's axes are turned to the world's.
 
     Returns:
         ``(N,)`` float32.
@@ -87,15 +88,11 @@ def textured_roughness(cloud: GaussianCloud, texture: Path, mesh: Path) -> NDArr
         raise AssetFormatError(
             f"roughness texture must have at most {MAX_TEXELS} texels, got {values.size} in {texture}. Reduce it."
         )
-    try:
-        loaded = trimesh.load(mesh, force="mesh", process=False)
-    except Exception as error:
-        raise AssetFormatError(f"roughness mesh must be readable, got {error} in {mesh}. Export it again.") from error
+    loaded = read_mesh(mesh)
     if getattr(loaded.visual, "uv", None) is None:
         raise AssetFormatError(
             f"roughness mesh must have texture coordinates, got none in {mesh}. Unwrap it before baking."
         )
-    assert isinstance(loaded, trimesh.Trimesh)  # what force='mesh' promises
     positions, indices = texel_positions(loaded, values.shape[0], values.shape[1])
     if len(positions) == 0:
         raise AssetFormatError(f"roughness mesh must cover texels of its texture, got none in {mesh}. Check its UVs.")

@@ -6,6 +6,10 @@ sees: with the ray r = (u, v, 1) through the pixel and the unit normal n towards
 than the surface on that ray is at the distance dz (-n r) in front of it. From depth alone, with q = 1/z and its
 derivatives a, b by u and v, the plane's normal is along (a, b, q - u a - v b), and -n r = q / |(a, b, q - u a - v b)|.
 
+A curved surface leaves that plane: a point at the height e above it is seen at e tan(t) beside its foot, t being the
+angle between normal and ray, where the plane is off by (e tan(t))^2 / 2R. Weights fall with the fourth power of the
+cosine, so that a mean over views is off by a bounded (e^2 / 2R) / 4 and mostly by what is seen from the front.
+
 All zeros are background. Inverse depth without weight is a surface that is not trusted there: grazing, or at an edge.
 """
 
@@ -195,7 +199,8 @@ def write_depth_pixels_kernel(
             slope = -wp.dot(normal, ray) / length
     cosine = slope / wp.length(ray)
     share = float(near - 1) / 8.0
-    weight = wp.min(alpha[pixel], 1.0) * cosine * share * share
+    squared = cosine * cosine
+    weight = wp.min(alpha[pixel], 1.0) * squared * squared * share * share
     if cosine >= LEAST_COSINE and weight > 0.0:
         out_pixels[place] = wp.vec3(q, slope, weight)
     else:

@@ -26,8 +26,8 @@ KEY_OFFSET = 2**20
 NO_KEY = 2**63 - 1
 """Sorts last: a point whose block has no key."""
 
-LEAST_WEIGHT = wp.constant(0.02)
-"""Weight from which a voxel counts as observed: one view at a cosine of 0.1, five times fainter by alpha."""
+LEAST_WEIGHT = wp.constant(1.0e-4)
+"""Weight from which a voxel counts as observed: that of one view at the smallest cosine, 0.1."""
 
 LEAST_DISTANCE = wp.constant(1.0e-3)
 """Smallest distance at a voxel, in voxels: vertices on a grid point would collapse triangles to nothing."""

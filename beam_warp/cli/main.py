@@ -14,6 +14,7 @@ from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
 from beam_warp.cli.inspect import Inspect, inspect
+from beam_warp.cli.mesh import Mesh, mesh
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
@@ -28,6 +29,7 @@ See also beam-convert (formats, axes, units) and beam-validate (is an asset vali
 Command = (
     Annotated[Run, subcommand("run", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
+    | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Stability, subcommand("stability", prefix_name=False)]
     | Annotated[Chart, subcommand("chart", prefix_name=False)]
@@ -46,6 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: run(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
+    if isinstance(command, Mesh):
+        return run_command(lambda: mesh(command))
     if isinstance(command, Stability):
         return run_command(lambda: stability(command))
     if isinstance(command, Chart):

@@ -1,0 +1,252 @@
+"""``beam mesh``: the surface of every frame of a Gaussian sequence, and texture coordinates for one of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from beam_warp import converters
+from beam_warp._version import __version__
+from beam_warp.assets import WORLD_AXES, GaussianCloud
+from beam_warp.axes import change_axes
+from beam_warp.cameras import Camera
+from beam_warp.captures import Capture
+from beam_warp.checks import require_count
+from beam_warp.cli.console import print_json, progress
+from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.images import write_png
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from beam_warp.depth_images import DepthImages
+
+UNWRAP_FACES = 50_000
+"""Triangles of the mesh that is unwrapped, about; cutting charts takes half a minute for so many."""
+
+PREVIEW_SIDE = 512
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Fuse the depth of a Gaussian sequence into one mesh a frame, watertight where it is seen.
+
+    Depth is drawn from the training cameras of a capture, or without one from 32 cameras around the cloud; pixels that
+    no second camera confirms are left out. Writes OUT/mesh_0000.ply, one a frame, and OUT/mesh_0000.json with its
+    counts of boundary edges and holes. Frames whose files are there, made of the same Gaussians and options, are kept.
+
+    PLY and OBJ are in the world's axes, z up; GLB is y up, as glTF demands. Units are metres.
+
+    Example: beam mesh person.usda --capture walker --out meshes --unwrap
+    """
+
+    sequence: Annotated[
+        Positional[Path], arg(metavar="SEQUENCE", help="PLY or USD file, or a folder of numbered PLY files.")
+    ]
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the meshes; made if its parent exists.")]
+    capture: Annotated[
+        Path | None, arg(metavar="DIR", help="Use the cameras of this capture, of the same frame and split.")
+    ] = None
+    split: Annotated[str, arg(help="Which records of the capture.")] = "train"
+    size: Annotated[int, arg(metavar="PX", help="Side of the depth images without --capture.")] = 512
+    format: Annotated[Literal["ply", "obj", "glb"], arg(help="Of the meshes.")] = "ply"
+    voxel: Annotated[
+        float | None, arg(metavar="M", help="Edge of a voxel in metres; the width of a pixel by default.")
+    ] = None
+    frames: Annotated[tuple[int, ...], arg(metavar="N", help="Only these frames, counted from 0; all by default.")] = ()
+    depth: Annotated[Literal["median", "mean"], arg(help="Which depth of a pixel's Gaussians is fused.")] = "median"
+    color: Annotated[
+        Literal["none", "base_color", "radiance"] | None,
+        arg(help="Colour of the vertices; base colour by default, else radiance, if the Gaussians have it."),
+    ] = None
+    confirmations: Annotated[
+        int, arg(metavar="N", help="Leave out pixels that fewer other cameras confirm, or more contradict.")
+    ] = 1
+    unwrap: Annotated[
+        bool, arg(help="Also write canonical.glb and .obj: the first of the frames with texture coordinates.")
+    ] = False
+    preview: Annotated[bool, arg(help="Also draw every mesh, as .png.")] = False
+    antialiased: Annotated[bool, arg(help="For Gaussians trained with the 2D anti-aliasing filter.")] = False
+    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
+    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+
+
+def mesh(args: Mesh) -> int:
+    """Mesh the frames that are not there yet, and say what was found."""
+    started = time.perf_counter()
+    if args.unwrap:
+        from beam_warp.mesh_unwrapping import require_unwrapping
+
+        require_unwrapping()
+    capture = None if args.capture is None else Capture.read(args.capture)
+    sequence = converters.read(args.sequence, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+    frames = _frames(args, len(sequence))
+    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    cameras_of = {frame: _capture_cameras(args, capture, frame) for frame in frames} if capture is not None else {}
+    try:
+        args.out.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
+        ) from error
+    reports = []
+    with progress(args.quiet or args.json) as report:
+        for done, frame in enumerate(frames, start=1):
+            cloud = change_axes(sequence[frame], WORLD_AXES)
+            reports.append(_mesh_frame(args, frame, cloud, cameras_of.get(frame), args.unwrap and done == 1))
+            report("mesh", done, len(frames))
+    seconds = time.perf_counter() - started
+    if args.json:
+        print_json({"frames": reports, "notes": notes, "seconds": round(seconds, 3)})
+    elif not args.quiet:
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
+        for entry in reports:
+            print(_line(entry))
+        print(f"{len(reports)} meshes in {args.out}, {seconds:.1f} s")
+    return 0
+
+
+def _frames(args: Mesh, frame_count: int) -> list[int]:
+    """Return the frames that were asked for."""
+    for frame in args.frames:
+        require_count("frames", frame, 0, frame_count - 1)
+    return sorted(set(args.frames)) or list(range(frame_count))
+
+
+def _capture_cameras(args: Mesh, capture: Capture, frame: int) -> tuple[Camera, ...]:
+    """Return the cameras of a frame."""
+    records = capture.select(split=args.split, frames=(frame,))
+    if not records:
+        raise InvalidOptionError(
+            f"split must name records of frame {frame} of the capture, got {args.split!r} (it has splits "
+            f"{', '.join(capture.splits)} and frames {capture.frames[0]} to {capture.frames[-1]}). "
+            "Choose another split, or --frames."
+        )
+    return tuple(record.camera for record in records)
+
+
+def _mesh_frame(
+    args: Mesh, frame: int, cloud: GaussianCloud, cameras: Sequence[Camera] | None, canonical: bool
+) -> dict[str, Any]:
+    """Write the files of a frame unless they are there, and return its report."""
+    from beam_warp.meshing import surrounding_cameras
+
+    seen_from = surrounding_cameras(cloud, side=args.size) if cameras is None else cameras
+    path = converters.numbered_path(args.out / f"mesh.{args.format}", frame)
+    wanted = [path, *([path.with_suffix(".png")] if args.preview else [])]
+    wanted += [args.out / "canonical.glb", args.out / "canonical.obj"] if canonical else []
+    key = _key(args, cloud, seen_from, canonical)
+    known = _read_report(path.with_suffix(".json"))
+    if known.get("key") == key and all(file.is_file() for file in wanted):
+        return {**known, "kept": True}
+    started = time.perf_counter()
+    report = {"frame": frame, "output": path.name, "key": key, "cameras": len(seen_from)}
+    report |= _write_meshes(args, cloud, seen_from, path, canonical)
+    report["seconds"] = round(time.perf_counter() - started, 3)
+    # Last of all: with it the frame is done.
+    _write_text(path.with_suffix(".json"), json.dumps(report, indent=2, sort_keys=True) + "\n")
+    return {**report, "kept": False}
+
+
+def _write_meshes(
+    args: Mesh, cloud: GaussianCloud, cameras: Sequence[Camera], path: Path, canonical: bool
+) -> dict[str, Any]:
+    """Fuse a frame, write what was asked for, and return what was found."""
+    from beam_warp.depth_consistency import depth_consistency
+    from beam_warp.depth_fusion import fuse_depths
+    from beam_warp.mesh_files import write_mesh
+    from beam_warp.mesh_preview import shaded_image
+    from beam_warp.mesh_topology import mesh_report
+    from beam_warp.meshing import draw_depths
+    from beam_warp.raster_records import RasterOptions
+
+    color = args.color
+    if color is None:
+        color = "base_color" if cloud.base_color is not None else "radiance" if cloud.radiance is not None else "none"
+    options = RasterOptions(antialiased=args.antialiased)
+    images = draw_depths(cloud, cameras, depth=args.depth, color=color, options=options, device=args.device)
+    consistency = depth_consistency(images)
+    if len(cameras) > 1:
+        images.keep(consistency.mask(args.confirmations))
+    surface = fuse_depths(images, voxel=args.voxel)
+    write_mesh(surface, path)
+    if args.preview:
+        camera = Camera.frame_points(surface.vertices, azimuth=25.0, width=PREVIEW_SIDE, height=PREVIEW_SIDE)
+        write_png(path.with_suffix(".png"), shaded_image(surface, camera, args.device))
+    found = mesh_report(surface).as_dict()
+    report = {"voxel": surface.metadata["voxel"], "mesh": found, "consistency": consistency.as_dict()}
+    if canonical:
+        report["canonical"] = _write_canonical(args, images, surface)
+    return report
+
+
+def _write_canonical(args: Mesh, images: DepthImages, surface: trimesh.Trimesh) -> dict[str, Any]:
+    """Unwrap a frame, fused again with a larger voxel if it has too many triangles: that stays manifold."""
+    from beam_warp.depth_fusion import fuse_depths
+    from beam_warp.mesh_files import write_mesh
+    from beam_warp.mesh_unwrapping import unwrapped
+
+    while len(surface.faces) > UNWRAP_FACES:
+        # Triangles are as many as squares of a voxel fit on the surface, and a few less where details vanish.
+        voxel = surface.metadata["voxel"] * 1.01 * float(np.sqrt(len(surface.faces) / UNWRAP_FACES))
+        surface = fuse_depths(images, voxel=voxel)
+    flat = unwrapped(surface)
+    for suffix in ("glb", "obj"):
+        write_mesh(flat, args.out / f"canonical.{suffix}")
+    return {"faces": len(flat.faces), "vertices": len(flat.vertices), "voxel": surface.metadata["voxel"]}
+
+
+def _key(args: Mesh, cloud: GaussianCloud, cameras: Sequence[Camera], canonical: bool) -> str:
+    """Return what a frame's files are made of, as a digest."""
+    digest = hashlib.sha256()
+    options = (args.format, args.voxel, args.depth, args.color, args.confirmations, args.antialiased, canonical)
+    digest.update(repr((__version__, options)).encode())
+    for name, array in cloud.arrays().items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    for camera in cameras:
+        lens = (camera.width, camera.height, camera.focal_x, camera.focal_y, camera.center_x, camera.center_y)
+        digest.update(repr(lens).encode() + camera.camera_to_world.tobytes())
+    return digest.hexdigest()
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    """Return a frame's report; empty if there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a text in one step."""
+    from beam_warp.images import replacing
+
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _line(report: dict[str, Any]) -> str:
+    """Return one line about a frame."""
+    found = report["mesh"]
+    edge = "closed" if found["closed"] else f"{found['holes']} holes, {found['boundary_edges']} boundary edges"
+    agreed = report["consistency"]["confirmed"]
+    made = "kept" if report["kept"] else f"{report['seconds']:.1f} s"
+    return (
+        f"{report['output']}: {found['faces']:,} triangles of voxels of {1e3 * report['voxel']:.2f} mm, {edge}, "
+        f"{100.0 * agreed:.1f} % of the depth confirmed by a second camera, {made}"
+    )

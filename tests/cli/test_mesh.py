@@ -1,0 +1,141 @@
+"""`beam mesh`: what it writes, that it goes on where it stopped, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+
+from beam_warp import converters
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.cameras import Camera
+from beam_warp.cli.main import main
+from beam_warp.mesh_files import read_mesh
+
+FAST = ("--size", "48", "--voxel", "0.05", "--device", "cpu")
+
+
+def ball(center, count=3000):
+    """Opaque flat discs on a ball of radius 0.5 m."""
+    index = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * index / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
+    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
+    return GaussianCloud(
+        positions=0.5 * normals + center,
+        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        scales=np.tile([0.025, 0.025, 1e-4], (count, 1)),
+        opacities=np.full(count, 0.99),
+        radiance=np.zeros((count, 1, 3)),
+        radiance_color_space="lin_rec709_scene",
+    )
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sequence") / "balls.ply"
+    clouds = [ball((0.0, 0.0, 0.3 * frame)) for frame in range(2)]
+    converters.write(GaussianSequence.from_clouds(clouds), path, converters.WriteOptions(profile="beam"))
+    return path.parent
+
+
+def run(*words):
+    return main(["mesh", *map(str, words)])
+
+
+def write_capture(folder, frames):
+    """Cameras around the ball, without images: none are needed."""
+    folder.mkdir()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    records = []
+    for i, split in enumerate(["train"] * 8 + ["test"]):
+        camera = Camera.orbit((0, 0, 0), 3.0, 45.0 * i, 40.0 * (-1) ** i, width=64, height=64, vertical_fov=30.0)
+        records += [
+            {
+                "file_path": f"images/{i}/{frame:04d}.exr", "camera": f"cam{i}", "frame": frame, "split": split,
+                "transform_matrix": (camera.camera_to_world @ flip).tolist(),
+            }
+            for frame in frames
+        ]  # fmt: skip
+    content = {"w": 64, "h": 64, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 32, "cy": 32, "frames": records}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_a_mesh_a_frame(sequence, tmp_path, capsys):
+    assert run(sequence, "--out", tmp_path / "out", *FAST, "--preview") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 3
+    assert "closed" in said[0]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        f"mesh00000{frame}.{suffix}" for frame in range(2) for suffix in ("ply", "json", "png")
+    }
+    for frame in range(2):
+        mesh = read_mesh(tmp_path / "out" / f"mesh00000{frame}.ply")
+        assert np.abs(np.linalg.norm(mesh.vertices - [0, 0, 0.3 * frame], axis=1) - 0.5).max() < 0.05
+        assert mesh.visual.kind == "vertex"
+
+
+def test_finished_frames_are_kept(sequence, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(sequence, "--out", out, *FAST, "--quiet", "--frames", "1") == 0
+    assert capsys.readouterr().out == ""
+    before = (out / "mesh000001.ply").stat().st_mtime_ns
+    content = (out / "mesh000001.ply").read_bytes()
+
+    assert run(sequence, "--out", out, *FAST, "--json") == 0
+    frames = json.loads(capsys.readouterr().out)["frames"]
+    assert [frame["kept"] for frame in frames] == [False, True]
+    assert (out / "mesh000001.ply").stat().st_mtime_ns == before
+
+    # Interrupted before the report was written, damaged, or made with other options: made again, to the same bytes.
+    (out / "mesh000001.json").write_text("{")
+    assert run(sequence, "--out", out, *FAST, "--json", "--frames", "1") == 0
+    assert not json.loads(capsys.readouterr().out)["frames"][0]["kept"]
+    assert (out / "mesh000001.ply").read_bytes() == content
+    assert run(sequence, "--out", out, *FAST, "--json", "--frames", "1", "--color", "none") == 0
+    assert not json.loads(capsys.readouterr().out)["frames"][0]["kept"]
+    assert (out / "mesh000001.ply").read_bytes() != content
+
+
+def test_cameras_of_a_capture(sequence, tmp_path, capsys):
+    write_capture(tmp_path / "capture", [0])
+    words = ("--capture", tmp_path / "capture", "--voxel", "0.05", "--device", "cpu", "--format", "glb")
+    assert run(sequence, "--out", tmp_path / "out", *words, "--frames", "0", "--json") == 0
+    (frame,) = json.loads(capsys.readouterr().out)["frames"]
+    assert frame["cameras"] == 8
+    assert frame["mesh"]["nonmanifold_edges"] == 0
+    mesh = read_mesh(tmp_path / "out" / "mesh000000.glb")
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.5).max() < 0.05
+    assert run(sequence, "--out", tmp_path / "out", *words) == 2
+    assert "split must name records of frame 1 of the capture, got 'train'" in capsys.readouterr().err
+
+
+def test_unwrap(sequence, tmp_path, capsys):
+    pytest.importorskip("xatlas")
+    assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", "--unwrap", "--json") == 0
+    canonical = json.loads(capsys.readouterr().out)["frames"][0]["canonical"]
+    flat = [read_mesh(tmp_path / "out" / f"canonical.{suffix}") for suffix in ("glb", "obj")]
+    for mesh in flat:
+        assert (len(mesh.faces), len(mesh.vertices)) == (canonical["faces"], canonical["vertices"])
+        assert mesh.visual.uv.shape == (len(mesh.vertices), 2)
+    assert np.abs(flat[0].vertices - flat[1].vertices).max() < 1e-7
+
+
+def test_large_canonical_mesh_is_fused_again(sequence, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("xatlas")
+    monkeypatch.setattr("beam_warp.cli.mesh.UNWRAP_FACES", 1500)
+    assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", "--unwrap", "--json") == 0
+    (frame,) = json.loads(capsys.readouterr().out)["frames"]
+    assert frame["mesh"]["faces"] > 1500 >= frame["canonical"]["faces"] > 700
+    assert frame["canonical"]["voxel"] > frame["voxel"]
+
+
+def test_mistakes(sequence, tmp_path, capsys):
+    for words, says in (
+        (("--frames", "7"), "frames must be an integer in [0, 1], got 7"),
+        (("--voxel", "-1"), "voxel must be a number in"),
+        (("--out", tmp_path / "none" / "out"), "out must be a folder that can be made"),
+        (("--confirmations", "99"), "depth must be seen"),
+    ):
+        assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", *words) == 2
+        assert says in capsys.readouterr().err
