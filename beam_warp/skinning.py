@@ -22,13 +22,15 @@ from beam_warp.joint_graph import (
     require_points,
 )
 from beam_warp.kernels.skinning import (
+    MESSAGE,
+    MOST_JOINTS,
     RUN,
     RestSkin,
     Runs,
     launch_add_joint_gradients,
     launch_sum_runs,
     launch_warp_skin,
-    launch_write_blend_gradients,
+    launch_write_messages,
 )
 
 BLENDS = ("linear", "dual")
@@ -116,7 +118,7 @@ class Skin:
         blend: str = "linear",
         device: Any = None,
     ) -> None:
-        """Upload skins and joints at rest; about 16 k + 60 bytes a skin.
+        """Upload skins and joints at rest; about 16 k + 80 bytes a skin.
 
         Args:
             rest_positions: ``(N, 3)``.
@@ -149,9 +151,10 @@ class Skin:
         self._rest.weights = upload(weights.T, float, self.device)
         self._rest.joint_positions = self.joint_rest_positions
         self._rest.dual = int(self.blend == "dual")
-        self._runs, run_count = _runs(slots, weights, len(joints), self.device)
-        self._blend_gradients = wp.empty(len(skins), dtype=wp.vec4, device=self.device)
-        self._swept_gradients = wp.empty(len(skins) if self._rest.dual else 0, dtype=wp.vec4, device=self.device)
+        order = np.argsort(slots[:, 0], kind="stable")
+        self._rest.places = upload(np.argsort(order).astype(np.int32), int, self.device)
+        self._runs, run_count = _runs(slots[order], weights[order], len(joints), self.device)
+        self._messages = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
         self._run_rotations = wp.empty(run_count, dtype=wp.vec4, device=self.device)
         self._run_positions = wp.empty(run_count, dtype=wp.vec3, device=self.device)
 
@@ -215,24 +218,15 @@ class Skin:
             )
         out_rotations = require_vectors("out_rotation_gradients", out_rotation_gradients, joint_count, 4, self.device)
         out_positions = require_vectors("out_position_gradients", out_position_gradients, joint_count, 3, self.device)
-        launch_write_blend_gradients(
-            self._rest,
-            rotations,
-            positions,
-            to_positions,
-            to_orientations,
-            self._blend_gradients,
-            self._swept_gradients,
-            self.device,
+        launch_write_messages(
+            self._rest, rotations, positions, to_positions, to_orientations, self._messages, self.device
         )
         launch_sum_runs(
             self._rest,
             self._runs,
             rotations,
             positions,
-            to_positions,
-            self._blend_gradients,
-            self._swept_gradients,
+            self._messages,
             self._run_rotations,
             self._run_positions,
             self.device,
@@ -258,6 +252,7 @@ class Skin:
 
 def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return what skins are anchored to, checked."""
+    require_count("the number of joints", joint_count, 1, MOST_JOINTS)
     joints = require_array("anchors.joints", anchors.joints, (skin_count, None), np.int32)
     weights = require_array("anchors.weights", anchors.weights, joints.shape)
     if not joints.shape[1]:
@@ -275,14 +270,14 @@ def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray
 
 
 def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> tuple[Runs, int]:
-    """Return what hangs on each joint in runs of at most `RUN` skins, and how many runs there are."""
+    """Return what hangs on each joint in runs of at most `RUN` skins, and how many; skins as their messages lie."""
     pairs, starts = group_by(slots.ravel(), np.flatnonzero(weights.ravel() > 0.0), joint_count)
     runs_of = -(-np.diff(starts) // RUN)
     first_runs = np.concatenate([[0], np.cumsum(runs_of)])
     joints = np.repeat(np.arange(joint_count), runs_of)
     first_pairs = starts[joints] + RUN * (np.arange(len(joints)) - first_runs[joints])
     runs = Runs()
-    runs.skins = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
+    runs.places = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
     runs.weights = upload(weights.ravel()[pairs], float, device)
     runs.first_pairs = upload(np.append(first_pairs, len(pairs)).astype(np.int32), int, device)
     runs.joints = upload(joints.astype(np.int32), int, device)
