@@ -15,6 +15,7 @@ from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.joint_graph import (
     REACH,
+    SMALLEST_COSINE,
     group_by,
     joint_spacing,
     nearest_joints,
@@ -58,6 +59,7 @@ class Anchors:
         neighbor_count: int = 8,
         normals: ArrayLike | None = None,
         joint_normals: ArrayLike | None = None,
+        smallest_cosine: float = SMALLEST_COSINE,
     ) -> Anchors:
         """Anchor skins to their nearest joints, with weights exp(-d^2 / l^2), l = 1.5 joint spacings, that add up to 1.
 
@@ -68,8 +70,9 @@ class Anchors:
             joint_positions: At rest, ``(M, 3)``.
             neighbor_count: Joints for a skin, k; M if there are fewer.
             normals: Which way the surface faces at each skin, outward, ``(N, 3)`` of any length; 0 where unknown.
-            joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin (cosine
-                below -0.2) do not carry it, unless all near ones do; see `JointGraph.build`.
+            joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin do not
+                carry it, unless all near ones do; see `JointGraph.build`.
+            smallest_cosine: Of the normals of a skin and a joint that do not face apart.
 
         Raises:
             InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
@@ -77,8 +80,8 @@ class Anchors:
         """
         skins, joints = require_points("positions", positions), require_points("joint_positions", joint_positions)
         count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints))
-        nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals)
-        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals)
+        nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals, smallest_cosine)
+        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals, smallest_cosine)
         return cls(nearest.astype(np.int32), proximity_weights(squared, reach))
 
 
