@@ -228,7 +228,7 @@ class _Facing:
     def together(self, ends: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which of the joints ``ends``, ``(N, k)``, go with each point; all do where a direction is unknown."""
         cosines = np.einsum("nc,nkc->nk", self.points, self.joints[ends])
-        known = self.points.any(axis=1)[:, None] & self.joints.any(axis=1)[ends]
+        known = (np.abs(self.points).max(axis=1) > 0.0)[:, None] & (np.abs(self.joints).max(axis=1) > 0.0)[ends]
         return (cosines >= self.smallest_cosine) | ~known
 
 
