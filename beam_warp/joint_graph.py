@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from beam_warp.checks import require_array, require_count, require_finite
+from beam_warp.checks import require_array, require_count, require_finite, require_number
 from beam_warp.errors import InvalidArrayError
 
 REACH = 1.5
 """Length l of the weights exp(-d^2 / l^2), in joint spacings: on an evenly covered surface the eighth neighbour of a
 joint then has about a quarter of the weight of the nearest."""
 
-OPPOSED = -0.2
-"""Cosine of two normals, below which what they belong to is not of one surface, however near: over 100 degrees."""
+SMALLEST_COSINE = -0.2
+"""Of two normals, for what they belong to to count as one surface: up to 101 degrees, so that a right angle, such as
+the edge of a box, still does where normals are 10 degrees off."""
 
 CANDIDATES = 3
 """Neighbours looked at for one that is kept, where normals may rule some out: of two sheets in contact half are."""
@@ -49,7 +50,12 @@ class JointGraph:
 
     @classmethod
     def build(
-        cls, joint_positions: ArrayLike, neighbor_count: int = 8, *, normals: ArrayLike | None = None
+        cls,
+        joint_positions: ArrayLike,
+        neighbor_count: int = 8,
+        *,
+        normals: ArrayLike | None = None,
+        smallest_cosine: float = SMALLEST_COSINE,
     ) -> JointGraph:
         """Connect every joint to its nearest ones, with weights exp(-d^2 / l^2), l = 1.5 spacings, that add up to 1.
 
@@ -57,8 +63,9 @@ class JointGraph:
             joint_positions: ``(M, 3)``.
             neighbor_count: Edges that leave a joint, k; M - 1 if there are fewer joints.
             normals: Which way the surface faces at each joint, outward, ``(M, 3)`` of any length; 0 where unknown.
-                Joints that face apart (cosine below -0.2) are then not connected: an arm on a hip is near it in space,
-                far along the surface, and must come off. They are, nearest ones, where no joint near faces otherwise.
+                Joints that face apart are then not connected: an arm on a hip is near it in space, far along the
+                surface, and must come off. They are, nearest ones, where no joint near faces otherwise.
+            smallest_cosine: Of the normals of two joints that do not face apart.
 
         Raises:
             InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
@@ -66,8 +73,9 @@ class JointGraph:
         """
         joints = require_points("joint_positions", joint_positions)
         count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints) - 1)
-        facing = _normals("normals", normals, len(joints))
-        ends, squared = _nearest(joints, joints, count, facing, facing, themselves=True)
+        directions = _directions("normals", normals, len(joints))
+        facing = _facing(directions, directions, smallest_cosine)
+        ends, squared = _nearest(joints, joints, count, facing, themselves=True)
         spacing = _spacing(squared)
         weights = proximity_weights(squared, REACH * spacing)
         there = weights > 0.0
@@ -123,15 +131,17 @@ def stretch(graph: JointGraph, rest_positions: ArrayLike, positions: ArrayLike) 
     return Stretch(ratios, float(found.min()), float(np.median(found)), float(found.max()), float(torn.mean()))
 
 
-def joint_spacing(joints: NDArray[np.float64], normals: ArrayLike | None = None) -> float:
+def joint_spacing(
+    joints: NDArray[np.float64], normals: ArrayLike | None = None, smallest_cosine: float = SMALLEST_COSINE
+) -> float:
     """Return the median distance from a joint to the nearest other one that goes with it; 1 for one joint.
 
     Raises:
         InvalidArrayError: It is 0: at least half of the joints coincide with others.
     """
-    facing = _normals("joint_normals", normals, len(joints))
-    _, squared = _nearest(joints, joints, min(8, len(joints) - 1), facing, facing, themselves=True)
-    return _spacing(squared)
+    directions = _directions("joint_normals", normals, len(joints))
+    facing = _facing(directions, directions, smallest_cosine)
+    return _spacing(_nearest(joints, joints, min(8, len(joints) - 1), facing, themselves=True)[1])
 
 
 def nearest_joints(
@@ -140,17 +150,19 @@ def nearest_joints(
     count: int,
     normals: ArrayLike | None,
     joint_normals: ArrayLike | None,
+    smallest_cosine: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the joints that are nearest to each point and their squared distances, ``(N, count)``, nearest first.
 
     Joints that face apart from a point are left out, unless all near ones do; where fewer are left, the rest has an
     infinite distance. ``count`` is at most the number of joints.
     """
-    facing = _normals("normals", normals, len(points))
-    joints_facing = _normals("joint_normals", joint_normals, len(joints))
-    if facing is None or joints_facing is None:
-        facing = joints_facing = None
-    return _nearest(points, joints, count, facing, joints_facing, themselves=False)
+    facing = _facing(
+        _directions("normals", normals, len(points)),
+        _directions("joint_normals", joint_normals, len(joints)),
+        smallest_cosine,
+    )
+    return _nearest(points, joints, count, facing, themselves=False)
 
 
 def proximity_weights(squared: NDArray[np.float64], length: float) -> NDArray[np.float32]:
@@ -205,22 +217,44 @@ def _spacing(squared: NDArray[np.float64]) -> float:
     return spacing
 
 
-def _normals(name: str, value: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
-    """Return unit normals, 0 where they are 0."""
+@dataclass(frozen=True, eq=False)
+class _Facing:
+    """Which way points and joints face, of unit length or 0, and how far apart those may that go together."""
+
+    points: NDArray[np.float64]
+    joints: NDArray[np.float64]
+    smallest_cosine: float
+
+    def together(self, ends: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of the joints ``ends``, ``(N, k)``, go with each point; all do where a direction is unknown."""
+        cosines = np.einsum("nc,nkc->nk", self.points, self.joints[ends])
+        known = (np.abs(self.points).max(axis=1) > 0.0)[:, None] & (np.abs(self.joints).max(axis=1) > 0.0)[ends]
+        return (cosines >= self.smallest_cosine) | ~known
+
+
+def _facing(
+    points: NDArray[np.float64] | None, joints: NDArray[np.float64] | None, smallest_cosine: float
+) -> _Facing | None:
+    """Return which way both face, or None if either is not told."""
+    cosine = require_number("smallest_cosine", smallest_cosine, -1.0, 1.0)
+    return None if points is None or joints is None else _Facing(points, joints, cosine)
+
+
+def _directions(name: str, value: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+    """Return vectors of unit length, 0 where they are 0."""
     if value is None:
         return None
-    normals = require_array(name, value, (count, 3), np.float64)
-    require_finite(name, normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0.0, length, 1.0)
+    vectors = require_array(name, value, (count, 3), np.float64)
+    require_finite(name, vectors)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def _nearest(
     points: NDArray[np.float64],
     joints: NDArray[np.float64],
     count: int,
-    facing: NDArray[np.float64] | None,
-    joints_facing: NDArray[np.float64] | None,
+    facing: _Facing | None,
     *,
     themselves: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -233,8 +267,8 @@ def _nearest(
     allowed = np.ones(ends.shape, bool)
     if themselves:
         allowed &= ends != np.arange(len(points))[:, None]
-    if facing is not None and joints_facing is not None:
-        agree = allowed & (np.einsum("nc,nkc->nk", facing, joints_facing[ends]) >= OPPOSED)
+    if facing is not None:
+        agree = allowed & facing.together(ends)
         allowed = np.where(agree.any(axis=1, keepdims=True), agree, allowed)
     squared = np.where(allowed, squared, np.inf)
     order = np.argsort(squared, axis=1, kind="stable")[:, :count]

@@ -15,6 +15,7 @@ from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.joint_graph import (
     REACH,
+    SMALLEST_COSINE,
     group_by,
     joint_spacing,
     nearest_joints,
@@ -22,13 +23,15 @@ from beam_warp.joint_graph import (
     require_points,
 )
 from beam_warp.kernels.skinning import (
+    MESSAGE,
+    MOST_JOINTS,
     RUN,
     RestSkin,
     Runs,
     launch_add_joint_gradients,
     launch_sum_runs,
     launch_warp_skin,
-    launch_write_blend_gradients,
+    launch_write_messages,
 )
 
 BLENDS = ("linear", "dual")
@@ -56,6 +59,7 @@ class Anchors:
         neighbor_count: int = 8,
         normals: ArrayLike | None = None,
         joint_normals: ArrayLike | None = None,
+        smallest_cosine: float = SMALLEST_COSINE,
     ) -> Anchors:
         """Anchor skins to their nearest joints, with weights exp(-d^2 / l^2), l = 1.5 joint spacings, that add up to 1.
 
@@ -66,8 +70,9 @@ class Anchors:
             joint_positions: At rest, ``(M, 3)``.
             neighbor_count: Joints for a skin, k; M if there are fewer.
             normals: Which way the surface faces at each skin, outward, ``(N, 3)`` of any length; 0 where unknown.
-            joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin (cosine
-                below -0.2) do not carry it, unless all near ones do; see `JointGraph.build`.
+            joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin do not
+                carry it, unless all near ones do; see `JointGraph.build`.
+            smallest_cosine: Of the normals of a skin and a joint that do not face apart.
 
         Raises:
             InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
@@ -75,8 +80,8 @@ class Anchors:
         """
         skins, joints = require_points("positions", positions), require_points("joint_positions", joint_positions)
         count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints))
-        nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals)
-        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals)
+        nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals, smallest_cosine)
+        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals, smallest_cosine)
         return cls(nearest.astype(np.int32), proximity_weights(squared, reach))
 
 
@@ -116,7 +121,7 @@ class Skin:
         blend: str = "linear",
         device: Any = None,
     ) -> None:
-        """Upload skins and joints at rest; about 16 k + 60 bytes a skin.
+        """Upload skins and joints at rest; about 16 k + 80 bytes a skin.
 
         Args:
             rest_positions: ``(N, 3)``.
@@ -149,9 +154,10 @@ class Skin:
         self._rest.weights = upload(weights.T, float, self.device)
         self._rest.joint_positions = self.joint_rest_positions
         self._rest.dual = int(self.blend == "dual")
-        self._runs, run_count = _runs(slots, weights, len(joints), self.device)
-        self._blend_gradients = wp.empty(len(skins), dtype=wp.vec4, device=self.device)
-        self._swept_gradients = wp.empty(len(skins) if self._rest.dual else 0, dtype=wp.vec4, device=self.device)
+        order = np.argsort(slots[:, 0], kind="stable")
+        self._rest.places = upload(np.argsort(order).astype(np.int32), int, self.device)
+        self._runs, run_count = _runs(slots[order], weights[order], len(joints), self.device)
+        self._messages = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
         self._run_rotations = wp.empty(run_count, dtype=wp.vec4, device=self.device)
         self._run_positions = wp.empty(run_count, dtype=wp.vec3, device=self.device)
 
@@ -215,24 +221,15 @@ class Skin:
             )
         out_rotations = require_vectors("out_rotation_gradients", out_rotation_gradients, joint_count, 4, self.device)
         out_positions = require_vectors("out_position_gradients", out_position_gradients, joint_count, 3, self.device)
-        launch_write_blend_gradients(
-            self._rest,
-            rotations,
-            positions,
-            to_positions,
-            to_orientations,
-            self._blend_gradients,
-            self._swept_gradients,
-            self.device,
+        launch_write_messages(
+            self._rest, rotations, positions, to_positions, to_orientations, self._messages, self.device
         )
         launch_sum_runs(
             self._rest,
             self._runs,
             rotations,
             positions,
-            to_positions,
-            self._blend_gradients,
-            self._swept_gradients,
+            self._messages,
             self._run_rotations,
             self._run_positions,
             self.device,
@@ -258,6 +255,7 @@ class Skin:
 
 def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return what skins are anchored to, checked."""
+    require_count("the number of joints", joint_count, 1, MOST_JOINTS)
     joints = require_array("anchors.joints", anchors.joints, (skin_count, None), np.int32)
     weights = require_array("anchors.weights", anchors.weights, joints.shape)
     if not joints.shape[1]:
@@ -275,14 +273,14 @@ def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray
 
 
 def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> tuple[Runs, int]:
-    """Return what hangs on each joint in runs of at most `RUN` skins, and how many runs there are."""
+    """Return what hangs on each joint in runs of at most `RUN` skins, and how many; skins as their messages lie."""
     pairs, starts = group_by(slots.ravel(), np.flatnonzero(weights.ravel() > 0.0), joint_count)
     runs_of = -(-np.diff(starts) // RUN)
     first_runs = np.concatenate([[0], np.cumsum(runs_of)])
     joints = np.repeat(np.arange(joint_count), runs_of)
     first_pairs = starts[joints] + RUN * (np.arange(len(joints)) - first_runs[joints])
     runs = Runs()
-    runs.skins = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
+    runs.places = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
     runs.weights = upload(weights.ravel()[pairs], float, device)
     runs.first_pairs = upload(np.append(first_pairs, len(pairs)).astype(np.int32), int, device)
     runs.joints = upload(joints.astype(np.int32), int, device)

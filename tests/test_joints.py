@@ -149,6 +149,16 @@ class TestGraph:
         assert (graph.neighbors[:3, 2] == [0, 1, 2]).all()
         assert len(graph.incoming) == 9
 
+    def test_smallest_cosine(self):
+        """The edge of a box: its faces hang together, unless asked otherwise; a joint of unknown direction with all."""
+        joints = np.array([[0.1, 0, 1], [1.0, 0, 1], [1.1, 0, 0.9], [1.1, 0, 0], [0.6, 0, 0.6]])
+        facing = np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0, 0, 0]])
+        box = JointGraph.build(joints, 4, normals=facing)
+        assert (box.weights > 0.0).all()
+        faces = JointGraph.build(joints, 4, normals=facing, smallest_cosine=0.5)
+        ends = [set(row[weights > 0.0]) for row, weights in zip(faces.neighbors, faces.weights, strict=True)]
+        assert ends == [{1, 4}, {0, 4}, {3, 4}, {2, 4}, {0, 1, 2, 3}]
+
     def test_joints_that_coincide(self):
         """A pair of twins among others: each is the other's neighbour, and not its own."""
         joints = np.concatenate([np.eye(3), np.ones((1, 3)), np.ones((1, 3))])
