@@ -54,6 +54,10 @@ LEAST_FACING = 0.2
 """Cosine between normal and view below which a view says nothing about a point's colour."""
 
 
+FALLBACK_ROUNDS = 16
+"""Rounds of random points of which some lie where the most views look."""
+
+
 def initial_gaussians(
     views: Sequence[CapturedView],
     count: int,
@@ -84,7 +88,8 @@ def initial_gaussians(
         ``count`` Gaussians with radiance of degree 0 in scene-linear Rec.709 and ids from 0 on.
 
     Raises:
-        InvalidArrayError: There are no views, their masks share no volume, or ``points`` breaks its contract.
+        InvalidArrayError: There are no views, their masks share no volume, or ``points`` or
+            ``point_colors`` break their contracts.
         InvalidOptionError: ``count`` is out of range.
         DeviceError: The device is not there.
     """
@@ -92,6 +97,8 @@ def initial_gaussians(
     require_count("seed", seed, 0)
     if not len(views):
         raise InvalidArrayError("views must be at least one, got none. Pass the captured views.")
+    if points is None and point_colors is not None:
+        raise InvalidArrayError("point_colors need points, got none. Pass the points too.")
     target = resolve_device(device)
     rng = np.random.default_rng(seed)
     if points is None and len(masked_views(views)[0]) >= 2:
@@ -271,14 +278,23 @@ def _neighbor_distances(points: NDArray[np.float32], views: Sequence[CapturedVie
 
 
 def _common_points(views: Sequence[CapturedView], rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Return random points in the volume that most views see."""
+    """Return random points in the volume that the most views see; fewer than asked for if it is hard to hit."""
     middle, reach = viewing_focus(views)
     reach = max(reach, 1e-3)
-    kept = np.zeros((0, 3))
-    candidates = middle + reach * rng.uniform(-1.0, 1.0, (max(8 * count, 4096), 3))
-    seen = np.zeros(len(candidates), np.int64)
-    for view in views:
-        x, y, _ = view.camera.project(candidates).T
-        seen += (x >= 0.0) & (y >= 0.0) & (x <= view.camera.width) & (y <= view.camera.height)
-    kept = candidates[seen == seen.max()]
+    lower, upper = middle - reach, middle + reach
+    kept, most, batch = np.zeros((0, 3)), 0, max(4 * count, 4096)
+    for _ in range(FALLBACK_ROUNDS):
+        candidates = rng.uniform(lower, upper, (batch, 3))
+        seen = np.zeros(batch, np.int64)
+        for view in views:
+            x, y, _ = view.camera.project(candidates).T
+            seen += (x >= 0.0) & (y >= 0.0) & (x <= view.camera.width) & (y <= view.camera.height)
+        if seen.max() > most:
+            kept, most = np.zeros((0, 3)), int(seen.max())
+        kept = np.concatenate([kept, candidates[seen == most]])
+        if len(kept) >= count:
+            break
+        if len(kept) > 100:  # enough to know where they are, to a few per cent
+            margin = 0.1 * (kept.max(axis=0) - kept.min(axis=0))
+            lower, upper = kept.min(axis=0) - margin, kept.max(axis=0) + margin
     return kept[:count].astype(np.float32)

@@ -6,7 +6,7 @@ from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 
 SUPERSAMPLES = 4
-"""Along each side of a pixel: coverage is a box filter's to a quarter of a row, so that edges are right to 1/8 pixel."""
+"""Along each side of a pixel: coverage is a box filter's to a quarter of a row, so that edges are right to 1/8."""
 
 EDGE_ERROR = 0.25
 """Pixels that the place of half coverage, linear between centres, is off the edge: at 45 degrees, where coverage is
