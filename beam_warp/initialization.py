@@ -50,8 +50,18 @@ PUSHES = 2
 NEIGHBORS = 10
 """Points that a point may have to keep away from, itself included: six surround it where all is even."""
 
+HIDING_OPACITY = 0.9
+"""What Gaussians are drawn with to find what hides what: one is enough to be the median surface."""
+
+DEPTH_SLACK = 3.0
+"""Largest scales that a Gaussian's centre may lie behind the median surface and still be of it."""
+
 LEAST_FACING = 0.2
 """Cosine between normal and view below which a view says nothing about a point's colour."""
+
+
+FALLBACK_ROUNDS = 16
+"""Rounds of random points of which some lie where the most views look."""
 
 
 def initial_gaussians(
@@ -84,7 +94,8 @@ def initial_gaussians(
         ``count`` Gaussians with radiance of degree 0 in scene-linear Rec.709 and ids from 0 on.
 
     Raises:
-        InvalidArrayError: There are no views, their masks share no volume, or ``points`` breaks its contract.
+        InvalidArrayError: There are no views, their masks share no volume, or ``points`` or
+            ``point_colors`` break their contracts.
         InvalidOptionError: ``count`` is out of range.
         DeviceError: The device is not there.
     """
@@ -92,46 +103,64 @@ def initial_gaussians(
     require_count("seed", seed, 0)
     if not len(views):
         raise InvalidArrayError("views must be at least one, got none. Pass the captured views.")
-    target = resolve_device(device)
+    if points is None and point_colors is not None:
+        raise InvalidArrayError("point_colors need points, got none. Pass the points too.")
+    target = str(resolve_device(device))
     rng = np.random.default_rng(seed)
     if points is None and len(masked_views(views)[0]) >= 2:
-        mesh = visual_hull(views, device=str(target)).mesh
-        positions, normals, spacing = even_surface_points(mesh, count, device=str(target), seed=seed)
-        scales = np.broadcast_to(np.float32(spacing) * np.float32([DISC_WIDTH, DISC_WIDTH, DISC_THICKNESS]), (count, 3))
-        orientations = _facing_orientations(normals)
-        opacity, colors = DISC_OPACITY, None
+        shapes = _discs(views, count, target, seed)
     else:
         given = _common_points(views, rng, count) if points is None else require_array("points", points, (None, 3))
         require_finite("points", given)
         if not len(given):
             raise InvalidArrayError("points must be at least one, got none. Leave them out to start from the masks.")
         rows = np.sort(rng.permutation(len(given))[:count]) if count <= len(given) else np.arange(count) % len(given)
-        sizes = _neighbor_distances(given, views)
-        positions, scales = given[rows], np.repeat(sizes[rows, None], 3, axis=1)
-        positions = np.where(
-            (np.arange(count) < len(given))[:, None],
-            positions,
-            positions + rng.normal(0.0, 0.5, (count, 3)).astype(np.float32) * scales,
-        )
-        normals = np.zeros((count, 3), np.float32)
-        orientations = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (count, 1))
-        opacity, colors = BALL_OPACITY, None
-        if point_colors is not None:
-            table = require_array("point_colors", point_colors, (None, 3))
-            require_same_length("point_colors", table, "points", len(given))
-            require_finite("point_colors", table)
-            colors = table[rows]
-    if colors is None:
-        colors = seen_colors(views, positions, normals, orientations, scales, device=str(target))
+        shapes = _balls(views, given, rows, rng)
+    if point_colors is None:
+        colors = seen_colors(views, shapes, device=target)
+    else:
+        table = require_array("point_colors", point_colors, (None, 3))
+        require_same_length("point_colors", table, "points", len(given))
+        require_finite("point_colors", table)
+        colors = table[rows]
+    return shapes.with_arrays(
+        normals=None,
+        radiance=((colors - 0.5) / SH_CONSTANT)[:, None, :],
+        radiance_color_space=LINEAR_REC709,
+    )
+
+
+def _discs(views: Sequence[CapturedView], count: int, device: str, seed: int) -> GaussianCloud:
+    """Return discs on the visual hull, with its normals."""
+    mesh = visual_hull(views, device=device).mesh
+    positions, normals, spacing = even_surface_points(mesh, count, device=device, seed=seed)
     return GaussianCloud(
         positions=positions,
-        orientations=orientations,
-        scales=scales,
-        opacities=np.full(count, opacity, np.float32),
-        radiance=((colors - 0.5) / SH_CONSTANT)[:, None, :],
+        orientations=_facing_orientations(normals),
+        scales=np.tile(
+            np.array([DISC_WIDTH, DISC_WIDTH, DISC_THICKNESS], np.float32) * np.float32(spacing), (count, 1)
+        ),
+        opacities=np.full(count, DISC_OPACITY, np.float32),
+        normals=normals,
         ids=np.arange(count),
         axes=WORLD_AXES,
-        radiance_color_space=LINEAR_REC709,
+    )
+
+
+def _balls(
+    views: Sequence[CapturedView], points: NDArray[np.float32], rows: NDArray[np.int64], rng: np.random.Generator
+) -> GaussianCloud:
+    """Return balls at rows of the points; those past the number of points are copies, half a scale away."""
+    count = len(rows)
+    sizes = _neighbor_distances(points, views)[rows, None]
+    shift = np.where(np.arange(count)[:, None] < len(points), 0.0, 0.5 * sizes * rng.standard_normal((count, 3)))
+    return GaussianCloud(
+        positions=points[rows] + shift,
+        orientations=np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1)),
+        scales=np.repeat(sizes, 3, axis=1),
+        opacities=np.full(count, BALL_OPACITY, np.float32),
+        ids=np.arange(count),
+        axes=WORLD_AXES,
     )
 
 
@@ -188,13 +217,7 @@ def even_surface_points(
 
 
 def seen_colors(
-    views: Sequence[CapturedView],
-    positions: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    orientations: NDArray[np.float32],
-    scales: NDArray[np.float32],
-    *,
-    device: str | None = None,
+    views: Sequence[CapturedView], cloud: GaussianCloud, *, device: str | None = None
 ) -> NDArray[np.float32]:
     """Return the colour of every Gaussian that most of the views that see it agree on.
 
@@ -203,26 +226,24 @@ def seen_colors(
 
     Args:
         views: What the cameras saw.
-        positions: Centres [m], ``(N, 3)``.
-        normals: Unit normals, ``(N, 3)``; 0 for Gaussians that face all ways.
-        orientations: Quaternions xyzw, ``(N, 4)``.
-        scales: Standard deviations [m], ``(N, 3)``.
+        cloud: Gaussians; those of a cloud with normals are seen from their side only.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
         Scene-linear Rec.709, ``(N, 3)`` float32.
     """
     target = resolve_device(device)
-    count = len(positions)
+    count = len(cloud)
     gaussians = GaussianArrays(
-        upload(positions, wp.vec3, target),
-        upload(orientations, wp.quat, target),
-        upload(scales, wp.vec3, target),
-        wp.full(count, 0.9, dtype=float, device=target),
+        upload(cloud.positions, wp.vec3, target),
+        upload(cloud.orientations, wp.quat, target),
+        upload(cloud.scales, wp.vec3, target),
+        wp.full(count, HIDING_OPACITY, dtype=float, device=target),
     )
+    normals = np.zeros((count, 3), np.float32) if cloud.normals is None else cloud.normals
     directions = upload(normals, wp.vec3, target)
     samples = wp.empty((len(views), count), dtype=wp.vec4, device=target)
-    slack = 3.0 * float(np.median(scales.max(axis=1)))
+    slack = DEPTH_SLACK * float(np.median(cloud.scales.max(axis=1)))
     for row, view in enumerate(views):
         pixels = view.camera.width * view.camera.height
         alpha = np.ones(pixels, np.float32) if view.alpha is None else view.alpha.reshape(-1)
@@ -247,7 +268,7 @@ def seen_colors(
     if not known.any():
         return np.full((count, 3), 0.5, np.float32)
     if not known.all():
-        result[~known] = result[known][cKDTree(positions[known]).query(positions[~known], workers=-1)[1]]
+        result[~known] = result[known][cKDTree(cloud.positions[known]).query(cloud.positions[~known], workers=-1)[1]]
     return result
 
 
@@ -271,14 +292,23 @@ def _neighbor_distances(points: NDArray[np.float32], views: Sequence[CapturedVie
 
 
 def _common_points(views: Sequence[CapturedView], rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Return random points in the volume that most views see."""
+    """Return random points in the volume that the most views see; fewer than asked for if it is hard to hit."""
     middle, reach = viewing_focus(views)
     reach = max(reach, 1e-3)
-    kept = np.zeros((0, 3))
-    candidates = middle + reach * rng.uniform(-1.0, 1.0, (max(8 * count, 4096), 3))
-    seen = np.zeros(len(candidates), np.int64)
-    for view in views:
-        x, y, _ = view.camera.project(candidates).T
-        seen += (x >= 0.0) & (y >= 0.0) & (x <= view.camera.width) & (y <= view.camera.height)
-    kept = candidates[seen == seen.max()]
+    lower, upper = middle - reach, middle + reach
+    kept, most, batch = np.zeros((0, 3)), 0, max(4 * count, 4096)
+    for _ in range(FALLBACK_ROUNDS):
+        candidates = rng.uniform(lower, upper, (batch, 3))
+        seen = np.zeros(batch, np.int64)
+        for view in views:
+            x, y, _ = view.camera.project(candidates).T
+            seen += (x >= 0.0) & (y >= 0.0) & (x <= view.camera.width) & (y <= view.camera.height)
+        if seen.max() > most:
+            kept, most = np.zeros((0, 3)), int(seen.max())
+        kept = np.concatenate([kept, candidates[seen == most]])
+        if len(kept) >= count:
+            break
+        if len(kept) > 100:  # enough to know where they are, to a few per cent
+            margin = 0.1 * (kept.max(axis=0) - kept.min(axis=0))
+            lower, upper = kept.min(axis=0) - margin, kept.max(axis=0) + margin
     return kept[:count].astype(np.float32)

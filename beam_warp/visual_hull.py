@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from warp.geometry import sparse_marching_cubes_from_cells
 
 from beam_warp.captured_views import CapturedView
@@ -45,12 +44,8 @@ SEARCH_BLOCKS = 48
 SEARCH_ROUNDS = 8
 """Most times that the box is drawn closer."""
 
-SEARCH_MARGIN = 0.1
-"""What the box is grown by before each round, as a part of its longest side: it follows a piece that reaches out of it.
-A round that moves no side by more was the last one."""
-
-SUPPORT = 0.5
-"""A piece of the hull counts if some of it is seen inside by this part of the most views that see any of it inside."""
+ENOUGH = 0.8
+"""A round that leaves more than this of the longest side was the last one."""
 
 DISTANCE_LIMIT = (24.0, 12)
 """Distances to a silhouette are measured up to so many pixels, or the longer side divided by so many if that is more:
@@ -82,13 +77,16 @@ def visual_hull(
     resolution: int | Literal["auto"] = "auto",
     box: ArrayLike | None = None,
     tolerance: int = 0,
+    quorum: int | None = None,
     device: str | None = None,
 ) -> VisualHull:
     """Carve the visual hull out of the views' masks.
 
     A point is inside if every view that sees it (in its image, before its camera) has it inside its silhouette, where
-    coverage is one half; all but ``tolerance`` of them, if some masks are not to be trusted, but two at least. Parts
-    that a view's image crops away are left to the others. A view whose mask is empty says nothing and is ignored.
+    coverage is one half; all but ``tolerance`` of them, if some masks are not to be trusted. Parts that a view's image
+    crops away are left to the others, of which a ``quorum`` has to agree: beyond what most cameras look at, a few see
+    nothing but each other's side of the room, where their cones share volume that is no subject's. A view whose mask is
+    empty says nothing and is ignored.
 
     Depths in the cones are measured in metres from the silhouettes, to a part of a pixel, and marching cubes runs on
     their minimum: the surface is exact to a part of a voxel but for edges where cones meet, which it cuts by up to one.
@@ -101,6 +99,7 @@ def visual_hull(
         box: Where to carve, lowest and highest corner [m], ``(2, 3)``; the surface is closed where it cuts. None
             searches for the hull in what all cameras look at.
         tolerance: Views that a point may contradict, at most 3.
+        quorum: Views that have to see a point inside, at least 2; None for more than half of those with masks.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
@@ -114,6 +113,8 @@ def visual_hull(
     Source: Laurentini 1994 (the hull); Lorensen and Cline 1987 (marching cubes).
     """
     require_count("tolerance", tolerance, 0, MOST_TOLERATED)
+    if quorum is not None:
+        require_count("quorum", quorum, 2)
     if resolution != "auto":
         require_count("resolution", resolution, MIN_RESOLUTION, MAX_RESOLUTION)
     target = resolve_device(device)
@@ -123,17 +124,13 @@ def visual_hull(
             f"views must have at least two masks that show something, got {len(used)} of {len(views)}"
             f"{_listed(' (no mask, or an empty one: ', ignored)}. Pass views with alpha, or points to start from."
         )
-    cones = _Cones(used, tolerance, target)
+    cones = _Cones(used, tolerance, len(used) // 2 + 1 if quorum is None else quorum, target)
     lower, upper = cones.search() if box is None else _corners(box)
+    side = float((upper - lower).max())
+    count = _auto_resolution(used, 0.5 * (lower + upper), side) if resolution == "auto" else resolution
+    voxel = side / count
     if box is None:
-        side = float((upper - lower).max())
-        count = _auto_resolution(used, 0.5 * (lower + upper), side) if resolution == "auto" else resolution
-        voxel = side / count
         lower, upper = lower - voxel, upper + voxel  # the grid's outermost points count as outside
-    else:
-        side = float((upper - lower).max())
-        count = _auto_resolution(used, 0.5 * (lower + upper), side) if resolution == "auto" else resolution
-        voxel = side / count
     blocks = np.maximum(np.ceil((upper - lower) / (voxel * BLOCK) - 1e-6).astype(int), 1)
     mesh = cones.carve(lower, voxel, blocks)
     if mesh.is_empty:
@@ -224,20 +221,13 @@ def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
     return size, np.maximum(np.ceil(sides / size - 1e-6).astype(int), 1)
 
 
-def _bounds(lower: NDArray[np.float64], size: float, kept: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """Return the corners of the box around some blocks of a grid, ``(2, 3)``; None if there are none."""
-    found = np.argwhere(kept)
-    if not len(found):
-        return None
-    return lower + size * np.stack([found.min(axis=0), found.max(axis=0) + 1])
-
-
 class _Cones:
     """The silhouettes on a device, and what can be asked of them."""
 
-    def __init__(self, views: Sequence[CapturedView], tolerance: int, device: Any) -> None:
+    def __init__(self, views: Sequence[CapturedView], tolerance: int, quorum: int, device: Any) -> None:
         self.captured = list(views)
         self.tolerance = tolerance
+        self.quorum = quorum
         self.device = device
         pixels = sum(view.camera.width * view.camera.height for view in views)
         if pixels > 2**31 - 1:
@@ -254,37 +244,26 @@ class _Cones:
             alpha = upload(np.asarray(view.alpha), float, device)
             launch_measure_silhouette(alpha, limit, column_gaps, row_gaps, record.first_pixel, self.distances, device)
 
-    def search(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of a box that holds the hull, with up to a block of a late round to spare.
-
-        What most views support comes first; the box then follows what hangs together with it, at ever smaller blocks.
-        """
+    def search(self) -> NDArray[np.float64]:
+        """Return the corners of a box that holds the hull, ``(2, 3)``, with up to two small blocks to spare."""
         middle, reach = viewing_focus(self.captured)
         reach = max(reach, 1e-3)
-        root = np.stack([middle - reach, middle + reach])
-        size, count = _blocks(root)
-        states, support = self.judge(root[0], size, count)
-        found = _bounds(root[0], size, (states != OUTSIDE) & (support >= SUPPORT * support.max()))
-        if found is None:
-            raise _no_volume(self.captured, self, root)
+        box = np.stack([middle - reach, middle + reach])
         for _ in range(SEARCH_ROUNDS):
-            margin = SEARCH_MARGIN * (found[1] - found[0]).max()
-            box = np.stack([np.maximum(found[0] - margin, root[0]), np.minimum(found[1] + margin, root[1])])
             size, count = _blocks(box)
-            closer = _bounds(box[0], size, self.subject(box[0], size, count) != OUTSIDE)
-            if closer is None:
+            kept = np.argwhere(self.judge(box[0], size, count) != OUTSIDE)
+            if not len(kept):
                 raise _no_volume(self.captured, self, box)
-            settled = (np.abs(closer - found) <= SEARCH_MARGIN * (closer[1] - closer[0]).max()).all()
-            found = closer
+            closer = box[0] + size * np.stack([kept.min(axis=0), kept.max(axis=0) + 1])
+            settled = (closer[1] - closer[0]).max() > ENOUGH * (box[1] - box[0]).max()
+            box = closer
             if settled:
                 break
-        return found[0], found[1]
+        return box
 
-    def judge(
-        self, lower: NDArray[np.float64], size: float, count: NDArray[Any]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return the states of a grid of blocks, and how many views may see some of each inside; 0 if it is outside."""
-        states, support = (wp.empty(int(np.prod(count)), dtype=int, device=self.device) for _ in range(2))
+    def judge(self, lower: NDArray[np.float64], size: float, count: NDArray[Any]) -> NDArray[np.int32]:
+        """Return the states of a grid of blocks."""
+        states = wp.empty(int(np.prod(count)), dtype=int, device=self.device)
         launch_judge_blocks(
             wp.vec3(*lower),
             size,
@@ -292,26 +271,15 @@ class _Cones:
             self.views,
             self.distances,
             self.tolerance,
+            self.quorum,
             states,
-            support,
             self.device,
         )
-        found = states.numpy().reshape(count)
-        return found, np.where(found == OUTSIDE, 0, support.numpy().reshape(count))
-
-    def subject(self, lower: NDArray[np.float64], size: float, count: NDArray[Any]) -> NDArray[np.int32]:
-        """Return the states of a grid of blocks, `OUTSIDE` for pieces that hardly any view shows.
-
-        Behind most cameras, a few look at each other's background: there cones may share volume that no one shows.
-        """
-        states, support = self.judge(lower, size, count)
-        pieces, piece_count = ndimage.label(states != OUTSIDE, np.ones((3, 3, 3)))
-        strongest = ndimage.maximum(support, pieces, np.arange(piece_count + 1))
-        return np.where((strongest >= SUPPORT * support.max())[pieces], states, OUTSIDE)
+        return states.numpy().reshape(count)
 
     def carve(self, lower: NDArray[np.float64], voxel: float, count: NDArray[Any]) -> trimesh.Trimesh:
         """Return the surface on a grid of blocks of voxels."""
-        states = self.subject(lower, voxel * BLOCK, count)
+        states = self.judge(lower, voxel * BLOCK, count)
         for axis in range(3):  # the grid's outermost points count as outside, so that there is surface next to them
             outermost = np.moveaxis(states, axis, 0)[[0, -1]]
             np.moveaxis(states, axis, 0)[[0, -1]] = np.where(outermost == OUTSIDE, OUTSIDE, SURFACE)
@@ -330,6 +298,7 @@ class _Cones:
             self.views,
             self.distances,
             self.tolerance,
+            self.quorum,
             depths,
             device,
         )
@@ -350,13 +319,17 @@ class _Cones:
 def _no_volume(views: Sequence[CapturedView], cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
     """Say that nothing is left, and which views are to blame where leaving out one is enough."""
     size, count = _blocks(box)
-    blamed = []
+    left = np.zeros(len(views), np.int64)
+    cones.tolerance, cones.quorum = 0, len(views) - 1
     for i in range(len(views) if len(views) > 2 else 0):
         cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=View, device=cones.device)
-        if (cones.judge(box[0], size, count)[0] != OUTSIDE).any():
-            blamed.append(views[i].name)
+        left[i] = np.count_nonzero(cones.judge(box[0], size, count) != OUTSIDE)
+    # Blocks are judged with a margin: those along one cone's side may be left without any view.
+    blamed = [view.name for view, blocks in zip(views, left, strict=True) if blocks > 0.5 * left.max()]
     if blamed:
         found = f"cones that share no volume unless {' or '.join(blamed)} is left out"
     else:
         found = f"cones that share no volume: {', '.join(view.name for view in views)}"
-    return InvalidArrayError(f"masks must show one subject, got {found}. Correct poses or masks, or raise tolerance.")
+    return InvalidArrayError(
+        f"masks must show one subject, got {found}. Correct poses or masks, or raise tolerance or lower quorum."
+    )

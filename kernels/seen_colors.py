@@ -13,8 +13,8 @@ wp.set_module_options({"enable_backward": False})
 LEAST_COVERAGE = wp.constant(0.5)
 """Coverage below which a pixel shows more of the background."""
 
-ROUNDS = wp.constant(5)
-"""Of reweighting: the weights settle within a few."""
+ROUNDS = wp.constant(3)
+"""Of reweighting around the most central sample: by then the weights have settled."""
 
 RELATIVE_SPREAD = wp.constant(0.1)
 LEAST_SPREAD = wp.constant(0.01)
@@ -55,14 +55,37 @@ def sample_colors_kernel(
     out_samples[row, i] = sample
 
 
+@wp.func
+def color_of(sample: wp.vec4) -> wp.vec3:
+    return wp.vec3(sample[0], sample[1], sample[2])
+
+
+@wp.func
+def most_central(samples: wp.array2d[wp.vec4], i: int) -> wp.vec3:
+    """The sample that is nearest to all others, which a minority of outliers cannot move."""
+    best = float(wp.inf)
+    center = wp.vec3(0.0, 0.0, 0.0)
+    for a in range(samples.shape[0]):
+        candidate = samples[a, i]
+        if candidate[3] > 0.0:
+            total = float(0.0)
+            for b in range(samples.shape[0]):
+                other = samples[b, i]
+                total += other[3] * wp.length(color_of(candidate) - color_of(other))
+            if total < best:
+                best = total
+                center = color_of(candidate)
+    return center
+
+
 @wp.kernel
 def agree_colors_kernel(
     first: int, samples: wp.array2d[wp.vec4], out_colors: wp.array[wp.vec3], out_seen: wp.array[int]
 ):
     i = first + wp.tid()
-    mean = wp.vec3(0.0, 0.0, 0.0)
+    mean = most_central(samples, i)
     seen = int(0)
-    for step in range(ROUNDS):
+    for _ in range(ROUNDS):
         total = float(0.0)
         added = wp.vec3(0.0, 0.0, 0.0)
         spread = wp.max(RELATIVE_SPREAD * wp.length(mean), LEAST_SPREAD)
@@ -71,12 +94,10 @@ def agree_colors_kernel(
             sample = samples[row, i]
             if sample[3] > 0.0:
                 seen += 1
-                value = wp.vec3(sample[0], sample[1], sample[2])
-                weight = sample[3]
-                if step > 0:
-                    weight *= spread * spread / (spread * spread + wp.length_sq(value - mean))
+                off = color_of(sample) - mean
+                weight = sample[3] * spread * spread / (spread * spread + wp.length_sq(off))
                 total += weight
-                added += value * weight
+                added += color_of(sample) * weight
         if total > 0.0:
             mean = added / total
     out_colors[i] = mean

@@ -63,11 +63,11 @@ def mean_focal(view: View) -> float:
 
 @wp.func
 def hull_depth(
-    point: wp.vec3, views: wp.array[View], distances: wp.array[float], tolerance: int, unseen: float
+    point: wp.vec3, views: wp.array[View], distances: wp.array[float], tolerance: int, quorum: int, unseen: float
 ) -> float:
-    """Depth [m] in the cones: the least of all views that see the point, ``tolerance`` lesser ones left out.
+    """Depth [m] in the cones: the least of all views that see the point, up to ``tolerance`` lesser ones left out.
 
-    At least two views have to agree, or the point is as far outside as ``unseen`` says.
+    At least ``quorum`` views have to agree; a point that fewer see is as far outside as ``unseen`` says.
     """
     least = wp.vec4(wp.inf, wp.inf, wp.inf, wp.inf)
     seen = int(0)
@@ -84,9 +84,9 @@ def hull_depth(
                         swapped = least[k]
                         least[k] = depth
                         depth = swapped
-    if seen < 2:
+    if seen < quorum:
         return -unseen
-    return least[wp.min(tolerance, seen - 2)]
+    return least[wp.min(tolerance, seen - quorum)]
 
 
 @wp.kernel
@@ -98,8 +98,8 @@ def judge_blocks_kernel(
     views: wp.array[View],
     distances: wp.array[float],
     tolerance: int,
+    quorum: int,
     out_states: wp.array[int],
-    out_support: wp.array[int],
 ):
     block = first + wp.tid()
     k = block % count[2]
@@ -132,12 +132,11 @@ def judge_blocks_kernel(
         elif z > -radius:
             possible += 1
     state = SURFACE
-    if against > tolerance or possible - against < 2:
+    if against > tolerance or possible - against < quorum:
         state = OUTSIDE
-    elif agreeing == possible:
+    elif agreeing == possible:  # a quorum, by the line before
         state = INSIDE
     out_states[block] = state
-    out_support[block] = possible - against
 
 
 @wp.kernel
@@ -150,6 +149,7 @@ def fill_blocks_kernel(
     views: wp.array[View],
     distances: wp.array[float],
     tolerance: int,
+    quorum: int,
     out_depths: wp.array[float],
 ):
     item = first + wp.tid()
@@ -160,7 +160,7 @@ def fill_blocks_kernel(
     j = block[1] * BLOCK + corner / side % side
     k = block[2] * BLOCK + corner % side
     point = origin + voxel * wp.vec3(float(i), float(j), float(k))
-    depth = hull_depth(point, views, distances, tolerance, voxel)
+    depth = hull_depth(point, views, distances, tolerance, quorum, voxel)
     # The grid ends outside, so that the surface is closed where the box cuts it.
     ends = count * BLOCK
     if i == 0 or j == 0 or k == 0 or i == ends[0] or j == ends[1] or k == ends[2]:
@@ -229,19 +229,16 @@ def launch_judge_blocks(
     views: Any,
     distances: Any,
     tolerance: int,
+    quorum: int,
     out_states: Any,
-    out_support: Any,
     device: Any,
 ) -> None:
-    """Write which blocks of a grid are outside, inside, or may hold surface; cubes of ``size`` from ``origin`` on.
-
-    ``out_support`` becomes the number of views that may see some of the block inside their silhouettes.
-    """
+    """Write which blocks of a grid are outside, inside, or may hold surface; cubes of ``size`` from ``origin`` on."""
     launch(
         judge_blocks_kernel,
         len(out_states),
-        inputs=[origin, size, count, views, distances, tolerance],
-        outputs=[out_states, out_support],
+        inputs=[origin, size, count, views, distances, tolerance, quorum],
+        outputs=[out_states],
         device=device,
     )
 
@@ -254,6 +251,7 @@ def launch_fill_blocks(
     views: Any,
     distances: Any,
     tolerance: int,
+    quorum: int,
     out_depths: Any,
     device: Any,
 ) -> None:
@@ -261,7 +259,7 @@ def launch_fill_blocks(
     launch(
         fill_blocks_kernel,
         len(out_depths),
-        inputs=[blocks, origin, voxel, count, views, distances, tolerance],
+        inputs=[blocks, origin, voxel, count, views, distances, tolerance, quorum],
         outputs=[out_depths],
         device=device,
     )
