@@ -25,7 +25,7 @@ from beam_warp.demo_capture import (
     write_capture,
 )
 from beam_warp.demo_environments import studio
-from beam_warp.demo_figure import Figure, dance
+from beam_warp.demo_figure import Figure
 from beam_warp.errors import InvalidArrayError
 from beam_warp.images import Image
 from beam_warp.material_mesh import MaterialMesh
@@ -47,11 +47,11 @@ GREY = 0.35
 """Base colour and roughness of the figure without texture: 0.35 and 0.6."""
 GREY_ROUGHNESS = 0.6
 
-CONTACT_TURN = 21.0
+CONTACT_TURN = 22.5
 """Turn of upper arms and forearms at which the hands touch the dress [degree]."""
 
-APART = 0.5
-"""Part of that turn from which the hands set out, some 11 cm away."""
+APART = 0.7
+"""Part of that turn from which the hands set out, some 9 cm away."""
 
 SPHERE_RADIUS = 0.14
 SPHERE_CENTER = (0.42, -0.30, 0.14)
@@ -442,9 +442,12 @@ def touching(figure: Figure, frame_count: int) -> list[MaterialMesh]:
     meshes = []
     for frame in range(frame_count):
         share = APART + (1.0 - APART) * (frame / max(frame_count - 1, 1))
-        turns = {name: turn for name, turn in dance(0.0).items() if not name.startswith(("left", "right"))}
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            turns |= {f"{side} {bone}": (0.0, sign * CONTACT_TURN * share, 0.0) for bone in ("arm", "forearm")}
+        turn = CONTACT_TURN * share
+        turns = {
+            f"{side} {bone}": (0.0, sign * turn, 0.0)
+            for side, sign in (("left", 1.0), ("right", -1.0))
+            for bone in ("arm", "forearm")
+        }
         meshes.append(figure.posed(turns))
     return meshes
 
