@@ -23,7 +23,7 @@ from beam_warp.stress_captures import (
     TRACKING_LOST,
     CaptureCase,
     CaptureStress,
-    Finding,
+    Detection,
     StressStudio,
     training_cameras,
 )
@@ -39,12 +39,12 @@ class Reconstructed:
 
     Attributes:
         sequence: One cloud for each of the capture's frames, in their order, with persistent ids within a segment.
-        findings: What was noticed.
+        detections: What was noticed.
         key_frames: Indices into the sequence at which a segment starts; the first is 0.
     """
 
     sequence: GaussianSequence
-    findings: Sequence[Finding] = ()
+    detections: Sequence[Detection] = ()
     key_frames: Sequence[int] = (0,)
 
 
@@ -143,10 +143,10 @@ def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: Captu
         return CaptureOutcome(**known, faults=(crash,), seconds=time.perf_counter() - start)
     seconds = time.perf_counter() - start
     first, last = end_scores(capture, result.sequence, device=studio.device)
-    missed = tuple(str(need) for need in stress.required if not any(found.covers(need) for found in result.findings))
+    missed = tuple(str(need) for need in stress.required if not any(found.covers(need) for found in result.detections))
     return CaptureOutcome(
         **known,
-        detected=tuple(str(found) for found in result.findings),
+        detected=tuple(str(found) for found in result.detections),
         missed=missed,
         key_frames=tuple(result.key_frames),
         first=first,
@@ -202,11 +202,11 @@ def _faults(
     if len(result.sequence) != len(stress.capture.frames):
         faults.append(f"{len(stress.capture.frames)} frames must come out, got {len(result.sequence)}")
     wrong = {need.camera for need in stress.required}
-    blamed = sorted({found.camera for found in result.findings if found.camera is not None} - wrong)
+    blamed = sorted({found.camera for found in result.detections if found.camera is not None} - wrong)
     faults += [f"{camera} is blamed" for camera in blamed]
     if stress.is_sound and not blamed:
-        faults += [f"found where nothing is wrong: {found}" for found in result.findings]
-    said = any(found.kind in (TRACKING_LOST, NEW_SURFACE) for found in result.findings)
+        faults += [f"found where nothing is wrong: {found}" for found in result.detections]
+    said = any(found.code in (TRACKING_LOST, NEW_SURFACE) for found in result.detections)
     # Phrased so that NaN fails.
     if first and not first["psnr"] - last["psnr"] <= SILENT_LOSS_DB and not said:
         faults.append(f"lost without a word: {first['psnr']:.1f} dB in the first frame, {last['psnr']:.1f} in the last")

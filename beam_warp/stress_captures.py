@@ -6,14 +6,17 @@ files and change them in memory. Cases that show something else are path traced 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from beam_warp.captured_views import CapturedView
 from beam_warp.captures import Capture, CaptureRecord
 from beam_warp.checks import require_choice
 from beam_warp.demo_capture import (
@@ -30,17 +33,14 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.images import Image
 from beam_warp.material_mesh import MaterialMesh
 
-DARK_VIEW = "dark view"
-MISSING_VIEW = "missing view"
-EXPOSURE = "exposure"
-FEW_VIEWS = "few views"
-TRACKING_LOST = "tracking lost"
-NEW_SURFACE = "new surface"
-
-FINDING_KINDS = (DARK_VIEW, MISSING_VIEW, EXPOSURE, FEW_VIEWS, TRACKING_LOST, NEW_SURFACE)
-
-FEW_CAMERAS = 8
-"""Below this number of cameras a reconstruction must say that it has few."""
+BLACK_IMAGE = "black-image"
+MISSING_IMAGE = "missing-image"
+FRAME_LACKS_CAMERAS = "frame-lacks-cameras"
+CAMERA_EXPOSURE = "camera-exposure"
+FEW_CAMERAS = "few-cameras"
+TRACKING_LOST = "tracking-lost"
+NEW_SURFACE = "new-surface"
+"""Codes of what must be detected: of the inspection of a capture, and of tracking."""
 
 WRONG_EXPOSURE = 2.0
 GREY = 0.35
@@ -61,35 +61,60 @@ SPHERE_COLOR = (0.65, 0.12, 0.08)
 
 
 @dataclass(frozen=True)
-class Finding:
+class Detection:
     """Something that a reconstruction noticed about its input or about itself.
 
     Attributes:
-        kind: Of `FINDING_KINDS`.
+        code: Names the kind.
         camera: Which camera, where it is about one.
         frame: Which frame, where it is about one.
     """
 
-    kind: str
+    code: str
     camera: str | None = None
     frame: int | None = None
 
-    def __post_init__(self) -> None:
-        """Check the kind."""
-        require_choice("kind", self.kind, FINDING_KINDS)
-
-    def covers(self, other: Finding) -> bool:
+    def covers(self, other: Detection) -> bool:
         """Whether this says what the other asks for: its kind, and its camera and frame where it names them."""
         return (
-            self.kind == other.kind
+            self.code == other.code
             and (other.camera is None or self.camera == other.camera)
             and (other.frame is None or self.frame == other.frame)
         )
 
     def __str__(self) -> str:
-        """Return it in words: ``exposure of train_03 in frame 2``."""
+        """Return it in words: ``camera-exposure of train_03 in frame 2``."""
         of = "" if self.camera is None else f" of {self.camera}"
-        return f"{self.kind}{of}" + ("" if self.frame is None else f" in frame {self.frame}")
+        return f"{self.code}{of}" + ("" if self.frame is None else f" in frame {self.frame}")
+
+
+class SaidOfCapture(Protocol):
+    """What the inspection of a capture says: a kind, and where in words."""
+
+    @property
+    def code(self) -> str:
+        """Names the kind."""
+        ...
+
+    @property
+    def what(self) -> str:
+        """What is wrong."""
+        ...
+
+    @property
+    def where(self) -> str:
+        """Cameras, records or frames."""
+        ...
+
+
+def detections_of(said: Iterable[SaidOfCapture], cameras: Sequence[str]) -> tuple[Detection, ...]:
+    """Return what an inspection says as detections: one for each camera that it names, or one without."""
+    found = []
+    for finding in said:
+        text = f"{finding.where} {finding.what}"
+        named = [name for name in cameras if re.search(rf"(?<!\w){re.escape(name)}(?![A-Za-z0-9])", text)]
+        found += [Detection(finding.code, name) for name in named] or [Detection(finding.code)]
+    return tuple(found)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +129,7 @@ class CaptureStress:
     """
 
     capture: Capture
-    required: tuple[Finding, ...] = ()
+    required: tuple[Detection, ...] = ()
     may_refuse: bool = False
     is_sound: bool = False
 
@@ -217,29 +242,33 @@ class AlteredRecord(CaptureRecord):
     """A record whose image is changed as it is read; its truth is not.
 
     Attributes:
-        alter: Returns the changed channels of an image.
+        gain: Of the colour.
+        coverage: Of alpha.
     """
 
-    alter: Callable[[Image], Image]
+    gain: float = 1.0
+    coverage: float = 1.0
 
     @classmethod
-    def of(cls, record: CaptureRecord, alter: Callable[[Image], Image]) -> AlteredRecord:
+    def of(cls, record: CaptureRecord, gain: float, coverage: float) -> AlteredRecord:
         """Return a record that changes its image."""
         known = {entry.name: getattr(record, entry.name) for entry in fields(CaptureRecord)}
-        return cls(**known, alter=alter)
+        return cls(**known, gain=gain, coverage=coverage)
 
     def image(self) -> Image:
         """Read the image and change it."""
-        return self.alter(super().image())
+        image = super().image()
+        factors = {**dict.fromkeys("RGBY", self.gain), "A": self.coverage}
+        return replace(
+            image,
+            channels={name: values * np.float32(factors.get(name, 1.0)) for name, values in image.channels.items()},
+        )
 
-
-def scaled(image: Image, factor: float, *, alpha: bool = False) -> Image:
-    """Return an image whose colour, and if asked for its alpha, is multiplied by a factor."""
-    channels = {
-        name: values * np.float32(factor) if name in "RGBY" or (alpha and name == "A") else values
-        for name, values in image.channels.items()
-    }
-    return replace(image, channels=channels)
+    def view(self) -> CapturedView:
+        """Read the view and change it."""
+        view = super().view()
+        alpha = None if view.alpha is None else view.alpha * np.float32(self.coverage)
+        return replace(view, color=view.color * np.float32(self.gain), alpha=alpha)
 
 
 def training_cameras(capture: Capture) -> tuple[str, ...]:
@@ -267,11 +296,11 @@ def with_every(capture: Capture, step: int) -> Capture:
     return replace(capture, records=capture.select(frames=frames))
 
 
-def with_altered(capture: Capture, camera: str, alter: Callable[[Image], Image]) -> Capture:
+def with_altered(capture: Capture, camera: str, *, gain: float = 1.0, coverage: float = 1.0) -> Capture:
     """Return a capture in which one camera's images are changed as they are read."""
     return replace(
         capture,
-        records=tuple(AlteredRecord.of(r, alter) if r.camera_name == camera else r for r in capture.records),
+        records=tuple(AlteredRecord.of(r, gain, coverage) if r.camera_name == camera else r for r in capture.records),
     )
 
 
@@ -354,8 +383,8 @@ def _black_camera(at: StressStudio) -> CaptureStress:
     base = at.base()
     name = _victim(base)
     return CaptureStress(
-        capture=with_altered(base, name, lambda image: scaled(image, 0.0, alpha=True)),
-        required=(Finding(DARK_VIEW, name),),
+        capture=with_altered(base, name, gain=0.0, coverage=0.0),
+        required=(Detection(BLACK_IMAGE, name),),
     )
 
 
@@ -371,7 +400,9 @@ def _camera_without_files(at: StressStudio) -> CaptureStress:
         replace(r, image_path=r.image_path.with_name(f"absent_{r.image_path.name}")) if r.camera_name == name else r
         for r in base.records
     )
-    return CaptureStress(capture=replace(base, records=gone), required=(Finding(MISSING_VIEW, name),), may_refuse=True)
+    return CaptureStress(
+        capture=replace(base, records=gone), required=(Detection(MISSING_IMAGE, name),), may_refuse=True
+    )
 
 
 @capture_case(
@@ -383,7 +414,7 @@ def _camera_that_stops(at: StressStudio) -> CaptureStress:
     base = at.base()
     name, first = _victim(base), base.frames[0]
     kept = tuple(r for r in base.records if r.camera_name != name or r.frame == first)
-    return CaptureStress(capture=replace(base, records=kept), required=(Finding(MISSING_VIEW, name),))
+    return CaptureStress(capture=replace(base, records=kept), required=(Detection(FRAME_LACKS_CAMERAS, name),))
 
 
 @capture_case(
@@ -395,8 +426,8 @@ def _wrong_exposure(at: StressStudio) -> CaptureStress:
     base = at.base()
     name = _victim(base)
     return CaptureStress(
-        capture=with_altered(base, name, lambda image: scaled(image, WRONG_EXPOSURE)),
-        required=(Finding(EXPOSURE, name),),
+        capture=with_altered(base, name, gain=WRONG_EXPOSURE),
+        required=(Detection(CAMERA_EXPOSURE, name),),
     )
 
 
@@ -407,7 +438,9 @@ def _wrong_exposure(at: StressStudio) -> CaptureStress:
 )
 def _four_cameras(at: StressStudio) -> CaptureStress:
     base = at.base()
-    return CaptureStress(capture=with_cameras(base, evenly(training_cameras(base), 4)), required=(Finding(FEW_VIEWS),))
+    return CaptureStress(
+        capture=with_cameras(base, evenly(training_cameras(base), 4)), required=(Detection(FEW_CAMERAS),)
+    )
 
 
 @capture_case(
@@ -433,7 +466,7 @@ def _object_appears(at: StressStudio) -> CaptureStress:
         return [mesh if frame < first else beside(mesh, ball()) for frame, mesh in enumerate(at.dancing())]
 
     return CaptureStress(
-        capture=at.traced("an object appears", appearing), required=(Finding(NEW_SURFACE, frame=first),)
+        capture=at.traced("an object appears", appearing), required=(Detection(NEW_SURFACE, frame=first),)
     )
 
 

@@ -10,7 +10,7 @@ from beam_warp.assets import LINEAR_REC709, GaussianCloud, GaussianSequence
 from beam_warp.capture_stability import Reconstructed, markdown_table, run_capture_case, run_capture_cases
 from beam_warp.errors import InvalidArrayError
 from beam_warp.reconstruction_scores import read_truth_mesh
-from beam_warp.stress_captures import CAPTURE_CASES, Finding, StressStudio, capture_case_of
+from beam_warp.stress_captures import CAPTURE_CASES, Detection, StressStudio, capture_case_of
 
 COUNT = 3000
 
@@ -42,7 +42,9 @@ def tracked(capture, dim_from=None):
 
 
 def finding(*findings, key_frames=(0,), dim_from=None):
-    return lambda capture: Reconstructed(sequence=tracked(capture, dim_from), findings=findings, key_frames=key_frames)
+    return lambda capture: Reconstructed(
+        sequence=tracked(capture, dim_from), detections=findings, key_frames=key_frames
+    )
 
 
 def run(studio, name, reconstruct):
@@ -60,30 +62,32 @@ class TestJudgement:
         assert outcome.drift["vertices"]["mean_mm"] < 6.0
 
     def test_what_is_found_where_nothing_is_wrong_is_a_fault(self, studio):
-        outcome = run(studio, "as it is", finding(Finding("tracking lost", frame=1)))
-        assert outcome.faults == ("found where nothing is wrong: tracking lost in frame 1",)
+        outcome = run(studio, "as it is", finding(Detection("tracking-lost", frame=1)))
+        assert outcome.faults == ("found where nothing is wrong: tracking-lost in frame 1",)
 
     def test_what_must_be_detected_and_is_not_is_a_fault(self, studio):
         outcome = run(studio, "wrong exposure", finding())
-        assert outcome.missed == ("exposure of train_03",)
-        assert outcome.faults == ("not detected: exposure of train_03",)
+        assert outcome.missed == ("camera-exposure of train_03",)
+        assert outcome.faults == ("not detected: camera-exposure of train_03",)
 
     def test_what_is_detected_passes(self, studio):
-        assert run(studio, "wrong exposure", finding(Finding("exposure", "train_03"))).passed
-        assert run(studio, "black camera", finding(Finding("dark view", "train_03", 0))).passed
-        assert run(studio, "4 cameras", finding(Finding("few views"))).passed
+        assert run(studio, "wrong exposure", finding(Detection("camera-exposure", "train_03"))).passed
+        assert run(studio, "black camera", finding(Detection("black-image", "train_03", 0))).passed
+        assert run(studio, "4 cameras", finding(Detection("few-cameras"))).passed
 
     def test_blaming_a_sound_camera_is_a_fault(self, studio):
         outcome = run(
-            studio, "wrong exposure", finding(Finding("exposure", "train_03"), Finding("exposure", "train_01"))
+            studio,
+            "wrong exposure",
+            finding(Detection("camera-exposure", "train_03"), Detection("camera-exposure", "train_01")),
         )
         assert outcome.faults == ("train_01 is blamed",)
 
     def test_a_loss_must_be_said(self, studio):
-        silent = run(studio, "4 cameras", finding(Finding("few views"), dim_from=1))
+        silent = run(studio, "4 cameras", finding(Detection("few-cameras"), dim_from=1))
         assert len(silent.faults) == 1
         assert silent.faults[0].startswith("lost without a word")
-        said = finding(Finding("few views"), Finding("tracking lost", frame=1), key_frames=(0, 1), dim_from=1)
+        said = finding(Detection("few-cameras"), Detection("tracking-lost", frame=1), key_frames=(0, 1), dim_from=1)
         assert run(studio, "4 cameras", said).passed
 
     def test_frames_that_are_lacking_are_a_fault(self, studio):
@@ -121,4 +125,4 @@ def test_all_cases_of_a_given_capture_run_and_make_a_table(studio):
     table = markdown_table(outcomes).splitlines()
     assert len(table) == 2 + len(cases)
     assert all(line.count("|") == table[0].count("|") for line in table)
-    assert "not detected: dark view of train_03" in table[3]
+    assert "not detected: black-image of train_03" in table[3]

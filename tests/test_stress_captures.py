@@ -1,5 +1,7 @@
 """Stress captures: each changes what it says and nothing else; path-traced ones show what they say."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -9,9 +11,10 @@ from beam_warp.errors import InvalidArrayError, MissingFileError
 from beam_warp.reconstruction_scores import read_truth_mesh
 from beam_warp.stress_captures import (
     CAPTURE_CASES,
-    Finding,
+    Detection,
     StressStudio,
     capture_case_of,
+    detections_of,
     evenly,
     touching,
     training_cameras,
@@ -41,7 +44,7 @@ def records_of(capture, camera):
 class TestChanges:
     def test_black_camera_is_black_and_others_are_as_they_were(self, studio, tiny_capture):
         stress = capture_case_of("black camera").build(studio)
-        assert stress.required == (Finding("dark view", CAMERA),)
+        assert stress.required == (Detection("black-image", CAMERA),)
         for record, original in zip(stress.capture.records, tiny_capture.records, strict=True):
             changed, known = record.image().linear_rgba(), original.image().linear_rgba()
             assert np.array_equal(changed, np.zeros_like(known) if record.camera_name == CAMERA else known)
@@ -107,7 +110,7 @@ class TestTraced:
 
     def test_the_object_is_there_from_its_frame_on(self, tracing_studio):
         stress = capture_case_of("an object appears").build(tracing_studio)
-        assert stress.required == (Finding("new surface", frame=1),)
+        assert stress.required == (Detection("new-surface", frame=1),)
         before, after = (read_truth_mesh(stress.capture, frame) for frame in (0, 1))
         assert len(after.vertices) == len(before.vertices) + 2562
         first, second = (
@@ -123,14 +126,26 @@ class TestRegistry:
         assert names[0] == "as it is"
         assert all(case.fails and case.must for case in CAPTURE_CASES)
 
+    def test_an_inspection_is_read_by_code_and_camera(self):
+        said = [
+            SimpleNamespace(code="camera-exposure", what="1 camera is off", where="train_1 +1.0"),
+            SimpleNamespace(code="black-image", what="2 images are black", where="train_10_0000, train_10_0001"),
+            SimpleNamespace(code="few-cameras", what="4 cameras leave parts unseen", where=""),
+        ]
+        assert detections_of(said, ("train_1", "train_10", "train_2")) == (
+            Detection("camera-exposure", "train_1"),
+            Detection("black-image", "train_10"),
+            Detection("few-cameras"),
+        )
+
     @pytest.mark.parametrize(
         ("need", "found", "covered"),
         [
-            (Finding("exposure", "a"), Finding("exposure", "a", 3), True),
-            (Finding("exposure", "a"), Finding("exposure", "b"), False),
-            (Finding("exposure", "a"), Finding("dark view", "a"), False),
-            (Finding("new surface", frame=2), Finding("new surface", frame=1), False),
-            (Finding("few views"), Finding("few views"), True),
+            (Detection("camera-exposure", "a"), Detection("camera-exposure", "a", 3), True),
+            (Detection("camera-exposure", "a"), Detection("camera-exposure", "b"), False),
+            (Detection("camera-exposure", "a"), Detection("black-image", "a"), False),
+            (Detection("new-surface", frame=2), Detection("new-surface", frame=1), False),
+            (Detection("few-cameras"), Detection("few-cameras"), True),
         ],
     )
     def test_a_finding_covers_what_it_says(self, need, found, covered):
