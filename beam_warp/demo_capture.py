@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.cameras import MAX_SIDE, Camera
-from beam_warp.captures import FILE_NAME, Capture
+from beam_warp.captures import Capture
 from beam_warp.checks import require_count
 from beam_warp.demo_environments import studio
 from beam_warp.demo_figure import Figure, build_figure
@@ -157,7 +157,7 @@ def write_capture(
                 stream = (seed * 1_000_003 + len(records)) % 2**32
                 records.append(_write_view(root, mesh, traced, entry, frame, light, samples, stream))
                 report("path trace capture", len(records), total)
-        write_transforms(root / FILE_NAME, records, FRAMES_PER_SECOND)
+        write_transforms(root / "transforms.json", records, FRAMES_PER_SECOND)
     return Capture.read(folder)
 
 
