@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.cameras import MAX_SIDE, Camera
-from beam_warp.captures import FILE_NAME, Capture
+from beam_warp.captures import Capture
 from beam_warp.checks import require_count
 from beam_warp.demo_environments import studio
-from beam_warp.demo_figure import build_figure
+from beam_warp.demo_figure import Figure, build_figure
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import OutputError
 from beam_warp.images import write_exr
@@ -115,13 +115,18 @@ def write_demo_capture(
     require_count("samples", samples, 1, 2**16)
     require_count("seed", seed, 0, 2**31 - 1)
     require_free(folder)
-    figure = build_figure(float(np.clip(FIGURE_HEIGHT / size, *FIGURE_SPACINGS)))
+    figure = demo_figure_for(size)
     period = FRAMES_PER_SECOND * DANCE_SECONDS
     meshes = [figure.at(frame / period) for frame in range(frame_count)]
     dome = dome_cameras([mesh.vertices for mesh in meshes], camera_count, test_camera_count, size, size)
     return write_capture(
         folder, meshes, dome, studio(), samples=samples, device=device, seed=seed, progress=progress or _quiet
     )
+
+
+def demo_figure_for(size: int) -> Figure:
+    """Mesh the figure as finely as images of a size [pixel] show."""
+    return build_figure(float(np.clip(FIGURE_HEIGHT / size, *FIGURE_SPACINGS)))
 
 
 def write_capture(
@@ -152,7 +157,7 @@ def write_capture(
                 stream = (seed * 1_000_003 + len(records)) % 2**32
                 records.append(_write_view(root, mesh, traced, entry, frame, light, samples, stream))
                 report("path trace capture", len(records), total)
-        write_transforms(root / FILE_NAME, records, FRAMES_PER_SECOND)
+        write_transforms(root / "transforms.json", records, FRAMES_PER_SECOND)
     return Capture.read(folder)
 
 

@@ -5,6 +5,7 @@ Vertex i is the same point of the surface in every pose, so that everything samp
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -121,11 +122,18 @@ class Figure:
     bone_weights: FloatArray
 
     def at(self, phase: float) -> MaterialMesh:
-        """Return the figure at a moment of its dance, standing on z = 0; the dance repeats after 1.
+        """Return the figure at a moment of its dance, standing on z = 0; the dance repeats after 1."""
+        return self.posed(dance(require_number("phase", phase, -1e6, 1e6)))
+
+    def posed(self, turns: Mapping[str, tuple[float, float, float]]) -> MaterialMesh:
+        """Return the figure with its bones turned, standing on z = 0.
 
         Linear blend skinning: bends stay moderate, where it loses little volume.
+
+        Args:
+            turns: By name of a bone of `SKELETON`, its turn about the rest axes x, y, z [degree]; none for the rest.
         """
-        transforms = _bone_transforms(dance(require_number("phase", phase, -1e6, 1e6)))
+        transforms = _bone_transforms(turns)
         blended = np.einsum("vb,bij->vij", self.bone_weights, transforms)
         rest = self.rest.vertices.astype(np.float64)
         posed = np.einsum("vij,vj->vi", blended[:, :, :3], rest) + blended[:, :, 3]
@@ -191,7 +199,7 @@ def _bone_weights(points: FloatArray, faces: NDArray[np.int32], step: float) -> 
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _bone_transforms(turns: dict[str, tuple[float, float, float]]) -> FloatArray:
+def _bone_transforms(turns: Mapping[str, tuple[float, float, float]]) -> FloatArray:
     """Return each bone's transform from rest to pose, ``(bones, 3, 4)``."""
     placed: dict[str, FloatArray] = {}
     for bone in SKELETON:

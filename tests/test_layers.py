@@ -103,6 +103,8 @@ RANKS = {
     "beam_warp.mesh_path_tracing": 6,
     "beam_warp.demo_gaussians": 7,
     "beam_warp.demo_capture": 8,
+    "beam_warp.stress_captures": 9,
+    "beam_warp.capture_stability": 11,
     "beam_warp.surface_distances": 6,
     "beam_warp.tracking_drift": 7,
     "beam_warp.reconstruction_scores": 10,
