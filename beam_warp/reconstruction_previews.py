@@ -63,7 +63,7 @@ def reconstruction_preview(
         row: list[Panel] = [
             (f"{view.name}: photograph", photograph),
             ("render", render),
-            (f"difference × {AMPLIFICATION}", np.minimum(difference, 255).astype(np.uint8)),
+            (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
             ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels[SURFACE_NORMALS] + 0.5, alpha)),
         ]
         if shadings:

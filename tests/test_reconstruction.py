@@ -1,11 +1,13 @@
 """Reconstruction around the optimiser: what is stored, when it is taken again, and that no kill changes a byte."""
 
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +146,29 @@ class TestOutputs:
         assert third - first == {"track_ids"}  # local in the track, unique in the cloud
         cloud = stored_cloud(tmp_path / "out" / "frames" / "frame_000002.h5")
         assert cloud.ids.min() == 2 << ID_BITS
+
+
+class TestMemory:
+    def test_images_of_two_frames_at_most(self, tmp_path, monkeypatch):
+        """The frame that is worked on, and the one that is read ahead."""
+        import beam_warp.reconstruction as module
+
+        capture = Capture.read(write_capture(tmp_path / "capture", range(8)))
+        alive, most = weakref.WeakSet(), []
+        original = module.read_view
+
+        def counted(record):
+            view = original(record)
+            alive.add(view)
+            most.append(len(alive))
+            return view
+
+        monkeypatch.setattr(module, "read_view", counted)
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        assert len(most) == 3 * 8  # each image is read once: the previews take what is there
+        gc.collect()
+        assert max(most) <= 2 * 3
+        assert not alive
 
 
 class Stop(BaseException):
