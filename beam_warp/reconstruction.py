@@ -357,27 +357,24 @@ class _Job:
 
     def reconstruct(self, segments: Sequence[Sequence[int]]) -> None:
         """Bring the frames of some segments into the store, those of each in their order."""
-        total = sum(len(segment) for segment in segments)
-        done = 0
-        self._clear({frame for segment in segments for frame in segment})
+        order = [step for segment in segments for step in zip(segment, (None, *segment), strict=False)]
+        self._clear({frame for frame, _ in order})
+        self._progress("frames", 0, len(order))
+        key = ""
         with self._reading() as (images, pool):
-            self._progress("frames", 0, total)
-            for segment in segments:
-                key = ""
-                for position, frame in enumerate(segment):
-                    key = self._key(frame, key, pool)
-                    if frame_key(self.path(frame)) == key:
-                        self._resumed += 1
-                        views = None
-                    else:
-                        views = images.views(frame)
-                        following = segment[position + 1] if position + 1 < len(segment) else None
-                        if following is not None and frame_key(self.path(following)) is None:
-                            images.expect(following)
-                        self._model(frame, key, views, segment[position - 1] if position else None)
-                    self._complete(frame, key, views)
-                    done += 1
-                    self._progress("frames", done, total, _words(self.header(frame)["report"]))
+            for done, (frame, previous) in enumerate(order):
+                key = self._key(frame, "" if previous is None else key, pool)
+                if frame_key(self.path(frame)) == key:
+                    self._resumed += 1
+                    views = None
+                else:
+                    views = images.views(frame)
+                    following = order[done + 1][0] if done + 1 < len(order) else None
+                    if following is not None and frame_key(self.path(following)) is None:
+                        images.expect(following)
+                    self._model(frame, key, views, previous)
+                self._complete(frame, key, views)
+                self._progress("frames", done + 1, len(order), _words(self.header(frame)["report"]))
 
     def _clear(self, frames: Collection[int]) -> None:
         """Remove what a killed call left half written of these frames, which no other call may be working on."""
@@ -417,7 +414,7 @@ class _Job:
             track, report = self._steps.begin(views, self._within("fit", frame))
             segment = frame
         report = {
-            **{name: _finite(value) for name, value in report.items() if name != "seconds"},
+            **_plain({name: value for name, value in report.items() if name != "seconds"}),
             "frame": frame,
             "kind": "key" if segment == frame else "tracked",
             "segment": segment,
@@ -520,10 +517,14 @@ def _stored_arrays(track: FrameTrack, report: Mapping[str, Any]) -> dict[str, ND
     return {**stored, HEADER: np.frombuffer(text.encode(), np.uint8)}
 
 
-def _finite(value: Any) -> Any:
-    """Return a value that JSON holds: None for a number that is not finite."""
-    if isinstance(value, np.generic):
-        value = value.item()
+def _plain(value: Any) -> Any:
+    """Return a report's value as JSON holds it: None for a number that is not finite."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

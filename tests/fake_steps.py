@@ -84,7 +84,12 @@ class FakeSteps:
             ids=np.arange(self.count),
         )
         progress(1, 1, {"psnr": 30.0, "gaussians": self.count})
-        return FakeTrack(cloud, noise * 1e-3, np.array(0)), {"psnr": 30.0, "iterations": 7, "seconds": 0.5}
+        return FakeTrack(cloud, noise * 1e-3, np.array(0)), {
+            "psnr": 30.0,
+            "iterations": np.int64(7),
+            "loss": np.array([1.0, np.inf]),
+            "seconds": 0.5,
+        }
 
     def advance(self, track, views, progress):
         level = self.level(views)

@@ -121,6 +121,8 @@ class TestOutputs:
         assert report["mean_psnr"] == pytest.approx((30.0 + 29.2) / 2)
         assert report["lowest_psnr"]["psnr"] == pytest.approx(29.2)
         assert report["input"]["cameras"] == 3
+        assert report["frames"][0]["iterations"] == 7
+        assert report["frames"][0]["loss"] == [1.0, None]
         assert all(entry["seconds"] > 0.0 and entry["gaussians"] == 60 for entry in report["frames"])
         for frame in FRAMES:
             assert read_image(out / "previews" / f"frame_{frame:06d}.png").width > 300
@@ -201,21 +203,22 @@ def killed_at(monkeypatch, event, *, after):
 class TestResuming:
     @pytest.mark.parametrize("after", [False, True])
     def test_a_kill_at_any_write_changes_no_byte(self, capture, tmp_path, monkeypatch, after):
+        options = ReconstructOptions(segment_length=2, frames=(0, 1, 2))
         with monkeypatch.context() as patch:
             writes = killed_at(patch, 0, after=after)
-            reconstruct(capture, tmp_path / "whole", FakeSteps(), PAIRS)
+            reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         whole = results(tmp_path / "whole")
-        assert len(writes) == 3 * len(FRAMES) + 1
+        assert len(writes) == 3 * 3 + 1  # Gaussians, preview and note of each frame, and the report
         for event in range(1, len(writes) + 1):
             out = tmp_path / f"killed_{event}"
             with monkeypatch.context() as patch:
                 killed_at(patch, event, after=after)
                 with pytest.raises(Stop):
-                    reconstruct(capture, out, FakeSteps(), PAIRS)
+                    reconstruct(capture, out, FakeSteps(), options)
             steps = FakeSteps()
-            found = reconstruct(capture, out, steps, PAIRS)
-            assert len(steps.calls) == len(FRAMES) - found.report["resumed_frames"]
-            assert found.report["resumed_frames"] == min((event + (1 if after else 0) + 1) // 3, len(FRAMES))
+            found = reconstruct(capture, out, steps, options)
+            assert len(steps.calls) == 3 - found.report["resumed_frames"]
+            assert found.report["resumed_frames"] == min((event + (1 if after else 0) + 1) // 3, 3)
             assert not differing(whole, results(out))
 
     def test_sigkill(self, folder, capture, tmp_path):

@@ -202,6 +202,7 @@ def test_progress_shows_notes_on_a_terminal_only(monkeypatch):
         assert ("frame 1, 12.00 dB" in stream.getvalue()) == shown
 
 
+@pytest.mark.slow
 def test_the_walker(data_dir, asked, tmp_path, capsys):
     """A real capture goes all the way through: two frames, its own light."""
     walker = data_dir / "captures" / "walker"
