@@ -3,7 +3,6 @@
 import gc
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -243,7 +242,7 @@ class TestResuming:
         try:
             assert process.stdout.readline() == b"working\n"
         finally:
-            process.send_signal(signal.SIGKILL)
+            process.kill()
             process.wait()
             process.stdout.close()
         assert not (tmp_path / "out" / "gaussians.usda").exists()

@@ -163,10 +163,10 @@ def _light(args: Run, capture: Capture | None) -> Path:
             "gaussians, target-psnr, preset, segment-length and frames must be left out unless the input is a "
             f"capture, got {args.input}. Drop them."
         )
-    if capture is not None and (args.source_axes is not None or args.drop_invalid):
+    if capture is not None and (args.source_axes is not None or args.drop_invalid or args.persistent):
         raise InvalidOptionError(
-            "source-axes and drop-invalid must be left out for a capture, whose Gaussians are made here, got "
-            f"{args.input}. Drop them."
+            "source-axes, drop-invalid and persistent must be left out for a capture, whose Gaussians are made here, "
+            f"got {args.input}. Drop them."
         )
     light = args.environment or (None if capture is None else capture.environment_path)
     if light is None:

@@ -11,7 +11,7 @@ from fake_steps import FakeSteps, write_capture
 from beam_warp.captures import Capture
 from beam_warp.cli.console import progress, rate_in_words
 from beam_warp.cli.main import main
-from beam_warp.cli.reconstruct import frames_of, part_of
+from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 
@@ -121,7 +121,8 @@ class TestRunOfACapture:
     @pytest.mark.parametrize(
         ("words", "says"),
         [
-            (("--source-axes", "rdf"), "source-axes and drop-invalid must be left out for a capture"),
+            (("--source-axes", "rdf"), "source-axes, drop-invalid and persistent must be left out for a capture"),
+            (("--persistent",), "source-axes, drop-invalid and persistent must be left out for a capture"),
             (("--samples", 0), "sample_count must be"),
             (("--fps", 0), "frames_per_second must be"),
             (("--frames", "9:"), "frames must hold some"),
@@ -158,6 +159,16 @@ class TestDetection:
     def test_an_empty_folder(self, tmp_path):
         with pytest.raises(MissingFileError, match="capture must be a folder with"):
             capture_at(tmp_path)
+
+
+def test_the_words_reach_the_optimiser():
+    """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
+    pytest.importorskip("beam_warp.gaussian_fitting")
+    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), seed=7, device="cpu")
+    asked = json.loads(json.dumps(steps.options()))["fitting"]
+    assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
+    assert steps.device == "cpu"
+    assert steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), seed=7, device="cpu").options()
 
 
 class TestWords:
