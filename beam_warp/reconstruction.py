@@ -16,6 +16,7 @@ import hashlib
 import json
 import math
 import os
+import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -202,6 +203,7 @@ def reconstruct(
     job = _Job(capture, Path(out), steps, options or ReconstructOptions(), progress)
     job.reconstruct(job.segments)
     progress("write asset", 0, 1)
+    _remove_leftovers(Path(out))
     sequence = stored_sequence([job.path(frame) for frame in job.frames], capture.frames_per_second or 30.0)
     asset = Path(out) / ASSET_NAME
     converters.write(sequence, asset)
@@ -500,6 +502,15 @@ def _records_by_frame(capture: Capture, options: ReconstructOptions) -> dict[int
         if record.frame in grouped:
             grouped[record.frame].append(record)
     return {frame: tuple(records) for frame, records in grouped.items()}
+
+
+def _remove_leftovers(out: Path) -> None:
+    """Remove what a killed call left half written of the asset and the report."""
+    for path in [*out.glob(f".{Path(ASSET_NAME).stem}.*"), *out.glob(".report.json.*.tmp")]:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _stored_arrays(track: FrameTrack, report: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

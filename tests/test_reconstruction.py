@@ -246,6 +246,8 @@ class TestResuming:
             process.wait()
             process.stdout.close()
         assert not (tmp_path / "out" / "gaussians.usda").exists()
+        (tmp_path / "out" / ".gaussians.abc").mkdir()  # as a kill within the asset's writer leaves
+        (tmp_path / "out" / ".gaussians.abc" / "half.usdc").write_bytes(b"half")
         found = reconstruct(capture, tmp_path / "out", FakeSteps())
         assert found.report["resumed_frames"] == 1
         reconstruct(capture, tmp_path / "whole", FakeSteps())
