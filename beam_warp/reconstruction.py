@@ -18,11 +18,12 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,8 +64,11 @@ class Progress(Protocol):
         """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
 
 
-StepProgress = Callable[[int, int, Mapping[str, float]], None]
-"""Called with (done, total, facts) inside a frame; of the facts, ``psnr`` and ``gaussians`` are shown."""
+class StepProgress(Protocol):
+    """Hears how far a frame is."""
+
+    def __call__(self, done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+        """Take ``done`` of ``total`` iterations; of the facts, ``psnr`` and ``gaussians`` are shown."""
 
 
 class FrameTrack(Protocol):
@@ -452,9 +456,12 @@ class _Job:
 
     def _within(self, stage: str, frame: int) -> StepProgress:
         """Return a reporter of progress inside a frame."""
-        return lambda done, total, facts: self._progress(
-            stage, done, total, ", ".join(part for part in (f"frame {frame}", _numbers(facts)) if part)
-        )
+
+        def report(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+            words = (f"frame {frame}", _numbers(facts))
+            self._progress(stage, done, total, ", ".join(word for word in words if word))
+
+        return report
 
     def report(self) -> dict[str, Any]:
         """Return what was done, found and spent; JSON-able."""

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.assets import GaussianSequence
-from beam_warp.captures import FILE_NAME, Capture
+from beam_warp.captures import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.console import ProgressCallback, print_json, progress
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
@@ -146,12 +146,12 @@ def run(args: Run) -> int:
 
 def capture_at(path: Path) -> Capture | None:
     """Return the capture at a path; None if there is none, but perhaps Gaussians."""
-    if not (path.is_dir() or path.name == FILE_NAME):
+    if not (path.is_dir() or path.suffix == ".json"):
         return None
     try:
         return Capture.read(path)
     except MissingFileError:
-        if path.is_dir() and not (path / FILE_NAME).exists() and any(path.glob("*.ply")):
+        if any(path.glob("*.ply")) and not (path / "transforms.json").exists():
             return None
         raise
 
