@@ -163,7 +163,7 @@ class TestDetection:
 
 def test_the_words_reach_the_optimiser():
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
-    pytest.importorskip("beam_warp.gaussian_fitting")
+    pytest.importorskip("beam_warp.tracking")
     steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), seed=7, device="cpu")
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
