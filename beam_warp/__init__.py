@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from beam_warp.rasterizing import GBuffer as GBuffer
     from beam_warp.rasterizing import rasterize as rasterize
     from beam_warp.rasterizing import rasterize_backward as rasterize_backward
+    from beam_warp.reconstruction import Reconstruction as Reconstruction
+    from beam_warp.reconstruction import ReconstructOptions as ReconstructOptions
+    from beam_warp.reconstruction import reconstruct as reconstruct
     from beam_warp.scene import Scene as Scene
     from beam_warp.schema.validator import validate as validate
     from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
@@ -69,6 +72,8 @@ _HOMES = {
     "Parameters": "adam",
     "RasterOptions": "raster_records",
     "Rasterizer": "rasterizer",
+    "ReconstructOptions": "reconstruction",
+    "Reconstruction": "reconstruction",
     "RunOptions": "pipeline",
     "RunResult": "pipeline",
     "Scene": "scene",
@@ -84,6 +89,7 @@ _HOMES = {
     "rasterize": "rasterizing",
     "rasterize_backward": "rasterizing",
     "read": "converters",
+    "reconstruct": "reconstruction",
     "run": "pipeline",
     "validate": "schema.validator",
     "visibility": "tracing",

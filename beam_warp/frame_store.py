@@ -21,6 +21,23 @@ from beam_warp.errors import OutputError
 KEY = "beam_key"
 
 
+def make_folders(out: Path, *names: str) -> list[Path]:
+    """Make a folder for results and the named ones in it, as far as they are not there.
+
+    Raises:
+        OutputError: One of them cannot be made, or ``out`` has no parent.
+    """
+    folders = [out / name for name in names]
+    try:
+        for folder in (out, *folders):
+            folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"out must be a folder that can be made, got {out} ({error.strerror}). Choose another place."
+        ) from error
+    return folders
+
+
 def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a frame's arrays under a key.
 
@@ -32,7 +49,7 @@ def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> Non
         with h5py.File(temporary, "w") as file:
             file.attrs[KEY] = key
             for name, array in arrays.items():
-                file.create_dataset(name, data=np.ascontiguousarray(array), track_times=False)  # same bytes again
+                file.create_dataset(name, data=np.asarray(array, order="C"), track_times=False)  # same bytes again
         temporary.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
@@ -47,6 +64,12 @@ def frame_key(path: Path) -> str | None:
             return str(file.attrs[KEY])
     except (OSError, KeyError):
         return None
+
+
+def frame_names(path: Path) -> tuple[str, ...]:
+    """Return the names of a stored frame's arrays."""
+    with h5py.File(path, "r") as file:
+        return tuple(file)
 
 
 def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:

@@ -26,18 +26,17 @@ from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import InvalidArrayError, OutputError
+from beam_warp.errors import InvalidArrayError
 from beam_warp.exposure import estimate_exposure
-from beam_warp.frame_store import frame_key, read_frame, write_frame
+from beam_warp.frame_store import frame_key, make_folders, read_frame, write_frame
 from beam_warp.images import write_png
-from beam_warp.kernels.launching import thread_count
 from beam_warp.materials import (
     ColorEvidence,
     MaterialOptions,
     measure_materials,
     solve_base_color,
 )
-from beam_warp.reporting import Tally, versions, warnings_about, write_report
+from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_report
 from beam_warp.roughness import constant_roughness, textured_roughness
 from beam_warp.scene import Scene
 from beam_warp.surfaces import SurfaceNormals, estimate_normals
@@ -151,7 +150,8 @@ def run(
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
     folder = Path(out)
-    job = _Job(sequence, environment, _make_folders(folder), chosen, progress)
+    (frames,) = make_folders(folder, "frames")
+    job = _Job(sequence, environment, frames, chosen, progress)
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
@@ -424,11 +424,7 @@ class _Job:
         notes = self.sequence.metadata.get("notes", "").splitlines()
         return {
             "input": {"frames": len(self.sequence), "gaussians": len(self.first.cloud), "notes": notes},
-            "device": {
-                "name": self.device.name,
-                "kind": "cuda" if self.device.is_cuda else "cpu",
-                "threads": None if self.device.is_cuda else thread_count(),
-            },
+            "device": device_facts(self.device),
             "versions": versions(),
             "options": options_as_dict(self.options),
             "exposure_stops": self.exposure,
@@ -456,15 +452,3 @@ def _digest(text: str, *arrays: NDArray[Any]) -> str:
         digest.update(str((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _make_folders(out: Path) -> Path:
-    folder = out / "frames"
-    try:
-        out.mkdir(exist_ok=True)
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"out must be a folder that can be made, got {out} ({error.strerror}). Choose another place."
-        ) from error
-    return folder

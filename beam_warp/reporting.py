@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beam_warp._version import __version__
 from beam_warp.assets import GaussianCloud, Observability
 from beam_warp.errors import OutputError
+from beam_warp.kernels.launching import thread_count
 from beam_warp.materials import BaseColor
 
 CLIPPED_WARNING = 0.05
@@ -34,6 +35,15 @@ def versions() -> dict[str, str]:
         "numpy": np.__version__,
         "usd-core": version("usd-core"),
         "python": platform.python_version(),
+    }
+
+
+def device_facts(device: Any) -> dict[str, Any]:
+    """Return what a Warp device is, JSON-able."""
+    return {
+        "name": device.name,
+        "kind": "cuda" if device.is_cuda else "cpu",
+        "threads": None if device.is_cuda else thread_count(),
     }
 
 
@@ -99,10 +109,18 @@ class Tally:
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:
     """Write ``out/report.json`` whole or not at all."""
-    path = out / "report.json"
+    write_json(out / "report.json", report)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written; nothing is left behind.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from beam_warp.errors import BeamError
 
@@ -32,15 +32,29 @@ def print_json(value: Any) -> None:
     print()
 
 
-ProgressCallback = Callable[[str, int, int], None]
-"""Called with (stage, done, total) as work goes on."""
+class ProgressCallback(Protocol):
+    """Hears how far a stage is; a stage that starts over begins at less than it had."""
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
+
+
+SPEED_PERIOD = 600.0
+"""Rates and times left are means over so long a past, in which a step of a minute still counts [s]."""
+
+
+def rate_in_words(steps_per_second: float | None) -> str:
+    """Return a rate as ``12.3/s``, or as ``8.0 s each`` where a step takes longer than a second."""
+    if not steps_per_second:
+        return ""
+    return f"{steps_per_second:,.1f}/s" if steps_per_second >= 1.0 else f"{1.0 / steps_per_second:,.1f} s each"
 
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[ProgressCallback]:
     """Show stages with rate and time left on a terminal; do nothing when quiet or not a terminal."""
     if quiet or not sys.stderr.isatty():
-        yield lambda stage, done, total: None
+        yield lambda stage, done, total, note="": None
         return
     from rich.console import Console
     from rich.progress import (
@@ -59,15 +73,18 @@ def progress(quiet: bool) -> Iterator[ProgressCallback]:
         TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
         tasks: dict[str, Any] = {}
 
-        def update(stage: str, done: int, total: int) -> None:
+        def update(stage: str, done: int, total: int, note: str = "") -> None:
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total, rate="")
+                tasks[stage] = bars.add_task(stage, total=total, rate="", note="")
             task = next(t for t in bars.tasks if t.id == tasks[stage])
-            rate = f"{task.speed:,.1f}/s" if task.speed else ""
-            bars.update(tasks[stage], completed=done, total=total, rate=rate)
+            if done < task.completed:
+                bars.reset(tasks[stage])
+            bars.update(tasks[stage], completed=done, total=total, rate=rate_in_words(task.speed), note=note)
 
         yield update

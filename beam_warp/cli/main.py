@@ -15,11 +15,12 @@ from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
 from beam_warp.cli.inspect import Inspect, inspect
 from beam_warp.cli.mesh import Mesh, mesh
+from beam_warp.cli.reconstruct import Reconstruct, reconstruct
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
 
-_HELP = """Relightable 4D Gaussian assets: decompose, relight, demonstrate.
+_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, demonstrate.
 
 Example: beam run person.ply --environment studio.hdr --out person
 
@@ -28,6 +29,7 @@ See also beam-convert (formats, axes, units) and beam-validate (is an asset vali
 
 Command = (
     Annotated[Run, subcommand("run", prefix_name=False)]
+    | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
     | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
@@ -46,6 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = tyro.cli(Command, prog="beam", description=_HELP, args=words, config=(FlagCreatePairsOff,))  # type: ignore[arg-type]
     if isinstance(command, Run):
         return run_command(lambda: run(command))
+    if isinstance(command, Reconstruct):
+        return run_command(lambda: reconstruct(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
     if isinstance(command, Mesh):

@@ -1,0 +1,160 @@
+"""``beam reconstruct``: from a multi-view capture to a Gaussian sequence, from the command line."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from beam_warp.captures import Capture
+from beam_warp.cli.console import print_json, progress
+from beam_warp.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from beam_warp.reconstruction import FrameSteps, Part, ReconstructOptions
+
+
+@dataclass(frozen=True)
+class Modelling:
+    """How a capture is modelled; the same words in every command that does."""
+
+    gaussians: Annotated[int | None, arg(metavar="N", help="Most Gaussians of a frame; the preset's by default.")] = (
+        None
+    )
+    target_psnr: Annotated[
+        float | None, arg(metavar="DB", help="Stop a fit here, or when more no longer pays, with fewer Gaussians.")
+    ] = None
+    preset: Annotated[
+        Literal["fast", "paper"], arg(help="Schedule of the fits: ours, or the paper's 7,000 + 5,000 iterations.")
+    ] = "fast"
+    segment_length: Annotated[
+        int, arg(metavar="K", help="Frames from one key frame to the next, which parts share out; 0 for one segment.")
+    ] = 0
+    frames: Annotated[
+        str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct a multi-view capture as Gaussians with captured colour, tracked over time.
+
+    Writes OUT/gaussians.usda (+ layers), OUT/report.json, OUT/previews/frame_*.png and, as it goes, OUT/frames. A job
+    that was stopped continues where it was when it is called again. Segments (--segment-length) may be shared out:
+    run --part 1/4 … --part 4/4 anywhere, then the same command without --part.
+
+    Example: beam reconstruct captures/walker --gaussians 20000 --out walker
+    """
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE", help="Folder of a capture: images and cameras.")]
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
+    modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
+    part: Annotated[
+        str | None, arg(metavar="I/N", help="Only every N-th segment from the I-th on, without the asset.")
+    ] = None
+    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+
+
+def reconstruct(args: Reconstruct) -> int:
+    """Reconstruct and say what came out."""
+    part = None if args.part is None else part_of(args.part)
+    capture = Capture.read(args.capture)
+    options = options_of(args.modelling, capture)
+    steps = steps_of(args.modelling, args.seed, args.device)
+
+    from beam_warp.reconstruction import reconstruct as reconstruct_capture
+    from beam_warp.reconstruction import reconstruct_part
+
+    if part is not None:
+        with progress(args.quiet or args.json) as report:
+            frames = reconstruct_part(capture, args.out, steps, part, options, progress=report)
+        if args.json:
+            print_json({"part": args.part, "frames": list(frames)})
+        elif not args.quiet:
+            print(f"part {args.part}: {len(frames)} frame{'' if len(frames) == 1 else 's'} ready in {args.out}")
+        return 0
+    with progress(args.quiet or args.json) as report:
+        result = reconstruct_capture(capture, args.out, steps, options, progress=report)
+    if args.json:
+        print_json(result.report)
+    elif not args.quiet:
+        for warning in result.report["warnings"]:
+            print(f"warning: {warning}", file=sys.stderr)
+        print(f"wrote {result.asset}: {summary(result.report)}\nlook at {args.out / 'previews'}")
+    return 0
+
+
+def summary(report: dict[str, Any]) -> str:
+    """Return what a reconstruction's report says, in a line."""
+    frames = report["frames"]
+    counts = sorted({entry["gaussians"] for entry in frames})
+    words = [
+        f"{len(frames)} frame{'' if len(frames) == 1 else 's'}",
+        f"{len(report['segments'])} segment{'' if len(report['segments']) == 1 else 's'}",
+        f"{counts[0]:,} Gaussians" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,} Gaussians",
+    ]
+    if report["mean_psnr"] is not None:
+        lowest = report["lowest_psnr"]
+        words.append(f"{report['mean_psnr']:.2f} dB, lowest {lowest['psnr']:.2f} dB at frame {lowest['frame']}")
+    return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"])
+
+
+def steps_of(modelling: Modelling, seed: int, device: str | None) -> FrameSteps:
+    """Return the steps that the words ask for."""
+    from beam_warp.gaussian_fitting import FitOptions
+    from beam_warp.reconstruction_steps import FitAndTrack
+
+    asked: dict[str, Any] = {"preset": modelling.preset, "target_psnr": modelling.target_psnr, "seed": seed}
+    if modelling.gaussians is not None:
+        asked["gaussian_count"] = modelling.gaussians
+    return FitAndTrack(fitting=FitOptions(**asked), device=device)
+
+
+def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
+    """Return which frames are reconstructed, and in which segments."""
+    from beam_warp.reconstruction import ReconstructOptions
+
+    frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
+    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames)
+
+
+def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the frames that ``A:B`` or ``A:B:S`` asks for; A, B and S may be left out.
+
+    Raises:
+        InvalidOptionError: It is no range, or no frame is in it.
+    """
+    try:
+        low, high, step = [int(word) if word else None for word in words.split(":")] + [None] * (2 - words.count(":"))
+    except ValueError:
+        low, high, step = None, None, 0
+    if ":" not in words or (step is not None and step < 1):
+        raise InvalidOptionError(f"frames must be A:B or A:B:S, got {words}. Write 0:10 for the first ten.")
+    first, end = there[0] if low is None else low, there[-1] + 1 if high is None else high
+    found = [frame for frame in there if first <= frame < end][::step]
+    if not found:
+        raise InvalidOptionError(
+            f"frames must hold some of the capture's {len(there)} from {there[0]} to {there[-1]}, got {words}. Widen "
+            "the range."
+        )
+    return tuple(found)
+
+
+def part_of(words: str) -> Part:
+    """Return the part that ``I/N`` asks for.
+
+    Raises:
+        InvalidOptionError: It is none.
+    """
+    from beam_warp.reconstruction import Part
+
+    number, slash, count = words.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal()):
+        raise InvalidOptionError(f"part must be I/N with 1 <= I <= N, got {words}. Write 2/4 for the second of four.")
+    return Part(int(number), int(count))

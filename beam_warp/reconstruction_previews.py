@@ -1,0 +1,92 @@
+"""One picture of a reconstructed frame: photograph, render, what differs, and normals, from two sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.assets import GaussianCloud
+from beam_warp.cameras import Camera
+from beam_warp.captured_views import CapturedView
+from beam_warp.contact_sheet import Panel, lay_out, over_background
+from beam_warp.images import display_image
+from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, rasterize
+
+AMPLIFICATION = 8
+"""By how much differences are brightened: 1/8 of the display's range comes to white."""
+
+MOST_ROWS = 540
+"""Panels are reduced to at most so many rows of pixels."""
+
+FEWEST_ROWS = 240
+"""Panels of fewer rows are enlarged, so that their titles fit."""
+
+
+def opposite_cameras(cameras: Sequence[Camera]) -> list[int]:
+    """Return which two cameras look from sides furthest apart, the first of all being one; fewer if there are fewer."""
+    if len(cameras) < 2:
+        return list(range(len(cameras)))
+    forward = np.stack([camera.forward for camera in cameras])
+    return [0, 1 + int(np.argmin(forward[1:] @ forward[0]))]
+
+
+def reconstruction_preview(
+    cloud: GaussianCloud,
+    views: Sequence[CapturedView],
+    *,
+    shadings: Sequence[NDArray[np.uint8]] = (),
+    device: str | None = None,
+) -> NDArray[np.uint8]:
+    """Draw a frame beside its photographs, a row for each view.
+
+    Args:
+        cloud: Gaussians with scene-linear radiance, axes "rfu".
+        views: What to compare with; images of one size.
+        shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
+            column out.
+        device: Warp device.
+
+    Returns:
+        8-bit sRGB, ``(H, W, 3)``.
+    """
+    buffers = rasterize(cloud, [view.camera for view in views], channels=(RADIANCE, SURFACE_NORMALS), device=device)
+    panels: list[Panel] = []
+    for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
+        alpha = buffer.alpha[..., None]
+        photograph = _shown(view)
+        render = over_background(display_image(buffer.channels[RADIANCE]) / 255.0, alpha)
+        difference = np.abs(photograph.astype(np.int16) - render) * AMPLIFICATION
+        if view.alpha is None:  # nothing is known of what lies around the subject
+            difference = np.rint(difference * alpha)
+        row: list[Panel] = [
+            (f"{view.name}: photograph", photograph),
+            ("render", render),
+            (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
+            ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels[SURFACE_NORMALS] + 0.5, alpha)),
+        ]
+        if shadings:
+            row.append(("mesh", shadings[index]))
+        panels += [(title, _fitted(pixels)) for title, pixels in row]
+    return lay_out(panels, len(panels) // len(views))
+
+
+def _shown(view: CapturedView) -> NDArray[np.uint8]:
+    """Return a photograph for a display, over the background where its coverage is known."""
+    alpha = np.ones(view.color.shape[:2], np.float32) if view.alpha is None else view.alpha
+    covered = alpha[..., None]
+    straight = np.divide(view.color, covered, out=np.zeros_like(view.color), where=covered > 0.0)
+    return over_background(display_image(straight) / 255.0, covered)
+
+
+def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Reduce or enlarge a panel by a whole factor."""
+    rows, columns = pixels.shape[:2]
+    factor = -(-rows // MOST_ROWS)
+    if factor > 1:
+        kept = pixels[: rows // factor * factor, : columns // factor * factor]
+        blocks = kept.reshape(rows // factor, factor, columns // factor, factor, -1)
+        return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+    factor = max(-(-FEWEST_ROWS // rows), 1)
+    return np.repeat(np.repeat(pixels, factor, axis=0), factor, axis=1)

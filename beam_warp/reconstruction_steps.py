@@ -1,0 +1,52 @@
+"""How the Gaussians of a frame are found: the first one from a visual hull, by fitting; the next ones by tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.captured_views import CapturedView
+from beam_warp.gaussian_fitting import FitOptions, fit_gaussians
+from beam_warp.initialization import initial_gaussians
+from beam_warp.reconstruction import StepProgress
+from beam_warp.tracking import Track, TrackOptions, advance_track, begin_track
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitAndTrack:
+    """The steps that `beam_warp.reconstruction.reconstruct` takes; see `beam_warp.reconstruction.FrameSteps`.
+
+    Attributes:
+        fitting: How key frames are fitted.
+        tracking: How other frames follow from the one before.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+    """
+
+    fitting: FitOptions = field(default_factory=FitOptions)
+    tracking: TrackOptions = field(default_factory=TrackOptions)
+    device: str | None = None
+
+    def options(self) -> Mapping[str, Any]:
+        """Return all that results depend on, but for the device; JSON-able."""
+        return {"fitting": asdict(self.fitting), "tracking": asdict(self.tracking)}
+
+    def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
+        """Fit a key frame from its images alone."""
+        chosen = self.fitting
+        start = initial_gaussians(views, chosen.gaussian_count, device=self.device, seed=chosen.seed)
+        fit = fit_gaussians(views, start, chosen, device=self.device, progress=progress)
+        return begin_track(fit.cloud, views, self.tracking, device=self.device), dict(fit.report)
+
+    def advance(
+        self, track: Track, views: Sequence[CapturedView], progress: StepProgress
+    ) -> tuple[Track, dict[str, Any]]:
+        """Track the frame after."""
+        return advance_track(track, views, self.tracking, device=self.device, progress=progress)
+
+    def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
+        """Return the track whose arrays these are."""
+        return Track.from_arrays(arrays)

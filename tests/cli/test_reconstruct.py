@@ -1,0 +1,225 @@
+"""`beam reconstruct`, and `beam run` of a capture: what they write and say, and one clear line for each mistake."""
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from fake_steps import FakeSteps, write_capture
+
+from beam_warp.captures import Capture
+from beam_warp.cli.console import progress, rate_in_words
+from beam_warp.cli.main import main
+from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
+from beam_warp.cli.run import capture_at
+from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_capture(tmp_path_factory.mktemp("captures") / "ball", range(4), levels={2: 0.95})
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What was asked of the steps; the fake does them."""
+    found = []
+
+    def steps_of(modelling, seed, device):
+        found.append((modelling, seed, device))
+        return FakeSteps(count=modelling.gaussians or 60, seed=seed)
+
+    monkeypatch.setattr("beam_warp.cli.reconstruct.steps_of", steps_of)
+    monkeypatch.setattr("beam_warp.cli.run.steps_of", steps_of)
+    return found
+
+
+def beam(*words):
+    return main([str(word) for word in words])
+
+
+class TestReconstruct:
+    def test_all_is_written_and_said(self, folder, asked, tmp_path, capsys):
+        out = tmp_path / "out"
+        assert beam("reconstruct", folder, "--out", out, "--gaussians", 40, "--target-psnr", 35, "--seed", 3) == 0
+        said = capsys.readouterr()
+        assert "gaussians.usda: 4 frames, 2 segments, 40 Gaussians, " in said.out
+        assert "dB, lowest 29.20 dB at frame 1" in said.out
+        assert "warning: tracking was lost at frame 2 (too bright)" in said.err
+        modelling, seed, _ = asked[0]
+        assert (modelling.gaussians, modelling.target_psnr, modelling.preset, seed) == (40, 35.0, "fast", 3)
+        for name in ("gaussians.usda", "report.json", "previews/frame_000003.png", "frames/frame_000003.h5"):
+            assert (out / name).is_file()
+
+    def test_json(self, folder, asked, tmp_path, capsys):
+        assert beam("reconstruct", folder, "--out", tmp_path / "out", "--frames", "1:3", "--json") == 0
+        report = json.loads(capsys.readouterr().out)
+        assert [entry["frame"] for entry in report["frames"]] == [1, 2]
+
+    def test_parts_then_the_whole(self, folder, asked, tmp_path, capsys):
+        words = ("reconstruct", folder, "--out", tmp_path / "out", "--segment-length", 2)
+        assert beam(*words, "--part", "2/2") == 0
+        assert "part 2/2: 2 frames ready" in capsys.readouterr().out
+        assert beam(*words, "--part", "1/2", "--json") == 0
+        assert json.loads(capsys.readouterr().out) == {"part": "1/2", "frames": [0, 1]}
+        assert beam(*words, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["resumed_frames"] == 4
+
+    @pytest.mark.parametrize(
+        ("words", "says"),
+        [
+            (("--part", "3/2", "--segment-length", 2), "part must be I/N with 1 <= I <= N, got 3/2"),
+            (("--part", "one"), "part must be I/N with 1 <= I <= N, got one"),
+            (("--part", "1/2"), "segment_length must be at least 1 to work in parts"),
+            (("--frames", "7:9"), "frames must hold some of the capture's 4 from 0 to 3, got 7:9"),
+            (("--frames", "3"), "frames must be A:B or A:B:S, got 3"),
+            (("--segment-length", -2), "segment_length must be"),
+        ],
+    )
+    def test_mistakes(self, folder, asked, tmp_path, capsys, words, says):
+        assert beam("reconstruct", folder, "--out", tmp_path / "out", *words) == 2
+        said = capsys.readouterr()
+        (line,) = said.err.strip().splitlines()
+        assert line.startswith("error: ")
+        assert says in line
+        assert not (tmp_path / "out").exists()
+
+    def test_help_has_an_example(self, capsys):
+        with pytest.raises(SystemExit):
+            main(["reconstruct", "--help"])
+        assert "Example: beam reconstruct" in capsys.readouterr().out
+
+
+class TestRunOfACapture:
+    def test_from_images_to_an_asset_and_again(self, folder, asked, tmp_path, capsys):
+        words = ("run", folder, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", ":2")
+        assert beam(*words) == 0
+        said = capsys.readouterr()
+        assert "2 frames, 1 segment, 60 Gaussians" in said.out
+        assert "asset.usda: 2 frames" in said.out
+        assert "exposure of the light +0.00 stops" in said.out
+        assert (tmp_path / "out" / "reconstruction" / "gaussians.usda").is_file()
+        assert (tmp_path / "out" / "asset.usda").is_file()
+        assert beam(*words, "--json") == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report["resumed_frames"] == report["reconstruction"]["resumed_frames"] == 2
+        assert report["persistent"]
+
+    def test_another_light_may_be_named(self, folder, asked, tmp_path, capsys):
+        words = ("run", folder, "--out", tmp_path / "out", "--environment", tmp_path / "none.exr")
+        assert beam(*words) == 2
+        assert "none.exr" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+    def test_a_capture_without_light(self, asked, tmp_path, capsys):
+        dark = write_capture(tmp_path / "dark", (0,), environment=False)
+        assert beam("run", dark, "--out", tmp_path / "out") == 2
+        assert "environment must be given, got none for" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("words", "says"),
+        [
+            (("--source-axes", "rdf"), "source-axes, drop-invalid and persistent must be left out for a capture"),
+            (("--persistent",), "source-axes, drop-invalid and persistent must be left out for a capture"),
+            (("--samples", 0), "sample_count must be"),
+            (("--fps", 0), "frames_per_second must be"),
+            (("--frames", "9:"), "frames must hold some"),
+        ],
+    )
+    def test_mistakes_cost_no_reconstruction(self, folder, asked, tmp_path, capsys, words, says):
+        assert beam("run", folder, "--out", tmp_path / "out", *words) == 2
+        assert says in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+    def test_gaussians_need_a_light_and_no_modelling(self, tmp_path, capsys):
+        assert beam("run", tmp_path / "some.ply", "--out", tmp_path / "out") == 2
+        assert "Gaussians come without their light" in capsys.readouterr().err
+        assert beam("run", tmp_path / "some.ply", "--out", tmp_path / "out", "--gaussians", 9) == 2
+        assert "must be left out unless the input is a capture" in capsys.readouterr().err
+
+
+class TestDetection:
+    def test_a_folder_or_its_file(self, folder):
+        assert capture_at(folder).frames == (0, 1, 2, 3)
+        assert capture_at(folder / "transforms.json").frames == (0, 1, 2, 3)
+
+    def test_numbered_gaussians_are_no_capture(self, tmp_path):
+        (tmp_path / "frame_0.ply").touch()
+        assert capture_at(tmp_path) is None
+        assert capture_at(tmp_path / "frame_0.ply") is None
+
+    def test_a_broken_capture_is_a_capture(self, tmp_path):
+        (tmp_path / "frame_0.ply").touch()
+        (tmp_path / "transforms.json").write_text("{")
+        with pytest.raises(AssetFormatError, match="capture must be JSON"):
+            capture_at(tmp_path)
+
+    def test_an_empty_folder(self, tmp_path):
+        with pytest.raises(MissingFileError, match="capture must be a folder with"):
+            capture_at(tmp_path)
+
+
+def test_the_words_reach_the_optimiser():
+    """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
+    pytest.importorskip("beam_warp.tracking")
+    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), seed=7, device="cpu")
+    asked = json.loads(json.dumps(steps.options()))["fitting"]
+    assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
+    assert steps.device == "cpu"
+    assert steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), seed=7, device="cpu").options()
+
+
+class TestWords:
+    def test_frames(self):
+        there = (0, 2, 4, 6, 8)
+        assert frames_of("2:6", there) == (2, 4)
+        assert frames_of(":3", there) == (0, 2)
+        assert frames_of("3:", there) == (4, 6, 8)
+        assert frames_of("::2", there) == (0, 4, 8)
+        assert frames_of(":", there) == there
+
+    @pytest.mark.parametrize("words", ["", "3", "a:b", "1:2:0", "1:2:-1", "1:2:3:4", "1:2:x"])
+    def test_no_frames(self, words):
+        with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
+            frames_of(words, (0, 1, 2))
+
+    @pytest.mark.parametrize("words", ["", "/", "1", "1/", "0/1", "2/1", "-1/2", "a/b"])
+    def test_no_part(self, words):
+        with pytest.raises(InvalidOptionError, match="part must be I/N"):
+            part_of(words)
+
+    def test_rates(self):
+        assert rate_in_words(None) == rate_in_words(0.0) == ""
+        assert rate_in_words(12.34) == "12.3/s"
+        assert rate_in_words(0.125) == "8.0 s each"
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_shows_notes_on_a_terminal_only(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    for stream, quiet, shown in ((Terminal(), False, True), (Terminal(), True, False), (io.StringIO(), False, False)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with progress(quiet) as report:
+            report("fit", 50, 100, "frame 0, 31.25 dB")
+            report("fit", 1, 100, "frame 1, 12.00 dB")
+            report("write asset", 1, 1)
+        assert ("frame 1, 12.00 dB" in stream.getvalue()) == shown
+
+
+@pytest.mark.slow
+def test_the_walker(data_dir, asked, tmp_path, capsys):
+    """A real capture goes all the way through: two frames, its own light."""
+    walker = data_dir / "captures" / "walker"
+    words = ("run", walker, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", "0:2", "--json")
+    assert beam(*words) == 0
+    report = json.loads(capsys.readouterr().out)["reconstruction"]
+    assert report["input"]["cameras"] == 24
+    assert np.isfinite(report["mean_psnr"])
+    assert len(Capture.read(walker).select(split="train", frames=[0])) == report["input"]["cameras"]
