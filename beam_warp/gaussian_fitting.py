@@ -35,6 +35,8 @@ class FitOptions:
     sh_degree: int = 2
     normal_weight: float = 0.03
     alpha_weight: float = 0.5
+    attraction: float = 0.1
+    samples: int = 1
     ssim_weight: float = 0.2
     refine_every: int = 250
     refine_until: float = 0.6
@@ -86,7 +88,10 @@ class Fitter:
         by_size: dict[tuple[int, int], list[CapturedView]] = {}
         for view in cropped:
             by_size.setdefault((view.camera.width, view.camera.height), []).append(view)
-        self.groups = [ViewTargets(group, len(self.parameters), options.raster, device) for group in by_size.values()]
+        self.groups = [
+            ViewTargets(group, len(self.parameters), options.raster, options.samples, device)
+            for group in by_size.values()
+        ]
         self.views = [(group, index) for group in self.groups for index in range(len(group))]
         center = np.median(start.positions, axis=0)
         self.extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
@@ -175,6 +180,8 @@ class Fitter:
         launch_add_stress(drawn.positions, self.stress, self.seen, self.device)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
+        if self.options.attraction > 0.0:
+            group.attract(index, parameters.drawn, self.options.attraction, parameters.gradient("positions"))
         self.adam.step()
 
     def refine(self) -> None:

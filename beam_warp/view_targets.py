@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.depth_normals import DepthNormals
 from beam_warp.device_arrays import pixel_channels
 from beam_warp.devices import upload
 from beam_warp.image_losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.images import linear_to_srgb
-from beam_warp.kernels.display_encoding import launch_add_linear_gradients, launch_encode
-from beam_warp.raster_records import RasterOptions
+from beam_warp.kernels.display_encoding import (
+    launch_add_sample_gradients,
+    launch_average,
+    launch_encode,
+    launch_spread,
+)
+from beam_warp.kernels.surface_attraction import Attraction, launch_attract
+from beam_warp.raster_records import GaussianArrays, RasterOptions
 from beam_warp.rasterizer import PreparedCameras, Rasterizer
 
 CROP_MARGIN = 8
 """Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
+
+TOLERANCE = 0.5
 
 CROP_STEP = 16
 """Crops are multiples of it: a tile of the rasteriser."""
@@ -76,6 +85,19 @@ def _box(view: CapturedView) -> tuple[tuple[int, int], tuple[int, int]]:
     return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
 
 
+def scaled_camera(camera: Camera, factor: int) -> Camera:
+    """Return a camera that takes ``factor`` x ``factor`` samples where the given one has a pixel."""
+    return replace(
+        camera,
+        width=camera.width * factor,
+        height=camera.height * factor,
+        focal_x=camera.focal_x * factor,
+        focal_y=camera.focal_y * factor,
+        center_x=camera.center_x * factor,
+        center_y=camera.center_y * factor,
+    )
+
+
 class ViewTargets:
     """The photographs of views of one size, and how renders of Gaussians differ from them.
 
@@ -85,42 +107,48 @@ class ViewTargets:
         width: Of every view [pixel].
     """
 
-    def __init__(self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, device: Any) -> None:
+    def __init__(
+        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+    ) -> None:
         """Bring views to a device.
 
         Args:
             views: Of one size.
             gaussian_count: Rows that are drawn.
             options: How splats are drawn.
+            samples: Side of the square of samples that a pixel is the mean of.
             device: Warp device.
         """
+        cameras = [scaled_camera(view.camera, samples) for view in views]
         self.rasterizer = Rasterizer(
-            gaussian_count, [views[0].camera], radiance=True, normals=True, options=options, device=device
+            gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
         )
         self.device = self.rasterizer.device
         self.height, self.width = views[0].camera.height, views[0].camera.width
-        self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([view.camera]) for view in views]
+        self._samples = samples
+        self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
         self._colors = [upload(linear_to_srgb(view.color), float, self.device) for view in views]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
-        self._depth_normals = [DepthNormals(view.camera, device=self.device) for view in views]
-        size = (self.height, self.width)
+        self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
+        size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
         colors, normals = self.rasterizer.color_channels.start, self.rasterizer.normal_channels.start
         self._color, self._to_color = (
-            pixel_channels(part.channels[0], *size, colors, 3) for part in (images, adjoints)
+            pixel_channels(part.channels[0], *fine, colors, 3) for part in (images, adjoints)
         )
         self._normal, self._to_normal = (
-            pixel_channels(part.channels[0], *size, normals, 3) for part in (images, adjoints)
+            pixel_channels(part.channels[0], *fine, normals, 3) for part in (images, adjoints)
         )
-        self._alpha, self._to_alpha = (part.alpha.reshape((*size, 1)) for part in (images, adjoints))
-        self._depth, self._to_depth = (part.depth.reshape(size) for part in (images, adjoints))
-        self._encoded, self._to_encoded, self._surface, self._to_surface = (
-            wp.zeros((*size, 3), dtype=float, device=self.device) for _ in range(4)
-        )
+        self._alpha, self._to_alpha = (part.alpha.reshape((*fine, 1)) for part in (images, adjoints))
+        self._depth, self._to_depth = (part.depth.reshape(fine) for part in (images, adjoints))
+        self._coverage, self._median = images.alpha.reshape(fine), images.median_depth.reshape(fine)
+        self._encoded, self._to_encoded = (wp.zeros((*size, 3), dtype=float, device=self.device) for _ in range(2))
+        self._covered, self._to_covered = (wp.zeros((*size, 1), dtype=float, device=self.device) for _ in range(2))
+        self._surface, self._to_surface = (wp.zeros((*fine, 3), dtype=float, device=self.device) for _ in range(2))
         self._l1, self._ssim = L1Loss(*size, device=self.device), SsimLoss(*size, device=self.device)
-        self._coverage, self._agreement = L1Loss(*size, 1, device=self.device), NormalLoss(*size, device=self.device)
+        self._l1_alpha, self._agreement = L1Loss(*size, 1, device=self.device), NormalLoss(*fine, device=self.device)
         self._adjoints = adjoints
 
     def __len__(self) -> int:
@@ -139,37 +167,56 @@ class ViewTargets:
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
-        launch_encode(self._color, self._encoded, self.device)
+        launch_encode(self._color, self._samples, self._encoded, self.device)
         target = self._colors[index]
         terms = [
             self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded),
         ]
         if weights.ssim > 0.0:
             terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
-        launch_add_linear_gradients(self._color, self._to_encoded, self._to_color, self.device)
+        launch_add_sample_gradients(self._color, self._samples, self._to_encoded, self._to_color, self.device)
         alpha = self._alphas[index]
         if alpha is not None and weights.alpha > 0.0:
-            terms.append(self._coverage(self._alpha, alpha, weight=weights.alpha, gradient=self._to_alpha))
+            self._to_covered.zero_()
+            launch_average(self._alpha, self._samples, self._covered, self.device)
+            terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
+            launch_spread(self._to_covered, self._samples, self._to_alpha, self.device)
         if weights.normal > 0.0:
             self._to_surface.zero_()
             geometry = self._depth_normals[index]
-            coverage = self._alpha.reshape((self.height, self.width))
-            geometry.write(self._depth, coverage, self._surface)
+            geometry.write(self._depth, self._coverage, self._surface)
             terms.append(
                 self._agreement(
                     self._normal,
                     self._surface,
                     weight=weights.normal,
-                    mask=coverage,
+                    mask=self._coverage,
                     rendered_gradient=self._to_normal,
                     expected_gradient=self._to_surface,
                 )
             )
-            geometry.add_gradients(self._depth, coverage, self._to_surface, self._to_depth)
+            geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
+
+    def attract(self, index: int, gaussians: GaussianArrays, strength: float, gradients: wp.array) -> None:
+        """Add to the positions' gradients a pull towards the surface that the view drew last."""
+        attraction = Attraction()
+        attraction.tolerance = TOLERANCE * self._samples
+        attraction.strength = strength / (self.height * self.width)
+        attraction.reach, attraction.least_cosine, attraction.least_alpha = 0.02, 0.2, 0.5
+        launch_attract(
+            gaussians.positions,
+            gaussians.orientations,
+            self._cameras[index].views,
+            self._median,
+            self._coverage,
+            attraction,
+            gradients,
+            self.device,
+        )
 
     def square_error(self, index: int) -> float:
         """Return the mean squared difference of what was drawn last and a view, encoded and clipped to [0, 1]."""
-        launch_encode(self._color, self._encoded, self.device)
+        launch_encode(self._color, self._samples, self._encoded, self.device)
         drawn = np.clip(self._encoded.numpy(), 0.0, 1.0)
         return float(np.mean((drawn - np.clip(self._colors[index].numpy(), 0.0, 1.0)) ** 2))

@@ -1,6 +1,7 @@
-"""Linear images as a viewer sees them: the sRGB curve, continued above 1, and its slope for the way back.
+"""Linear images as a viewer sees them: pixels as means of samples, the sRGB curve, continued above 1, and the way back.
 
-Errors in the dark are seen more than those in the light; a loss on encoded colours weighs them so.
+Errors in the dark are seen more than those in the light; a loss on encoded colours weighs them so. A photograph's pixel
+is the mean over its area, in linear light: with several samples for each, so is ours.
 """
 
 from typing import Any
@@ -14,13 +15,22 @@ wp.set_module_options({"enable_backward": False})
 KNEE = wp.constant(0.0031308)
 
 
+@wp.func
+def mean_sample(samples: wp.array3d[float], y: int, x: int, channel: int, factor: int) -> float:
+    total = float(0.0)
+    for j in range(factor):
+        for i in range(factor):
+            total += samples[y * factor + j, x * factor + i, channel]
+    return total / float(factor * factor)
+
+
 @wp.kernel
-def encode_kernel(first: int, linear: wp.array3d[float], out_encoded: wp.array3d[float]):
+def encode_kernel(first: int, samples: wp.array3d[float], factor: int, out_encoded: wp.array3d[float]):
     item = first + wp.tid()
-    y = item / linear.shape[1]
-    x = item % linear.shape[1]
-    for channel in range(linear.shape[2]):
-        value = linear[y, x, channel]
+    y = item / out_encoded.shape[1]
+    x = item % out_encoded.shape[1]
+    for channel in range(out_encoded.shape[2]):
+        value = mean_sample(samples, y, x, channel, factor)
         encoded = 12.92 * value
         if value > KNEE:
             encoded = 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
@@ -28,27 +38,64 @@ def encode_kernel(first: int, linear: wp.array3d[float], out_encoded: wp.array3d
 
 
 @wp.kernel
-def add_linear_gradients_kernel(
-    first: int, linear: wp.array3d[float], gradients: wp.array3d[float], out_gradients: wp.array3d[float]
+def add_sample_gradients_kernel(
+    first: int, samples: wp.array3d[float], factor: int, gradients: wp.array3d[float], out_gradients: wp.array3d[float]
 ):
     item = first + wp.tid()
-    y = item / linear.shape[1]
-    x = item % linear.shape[1]
-    for channel in range(linear.shape[2]):
-        value = linear[y, x, channel]
+    y = item / gradients.shape[1]
+    x = item % gradients.shape[1]
+    for channel in range(gradients.shape[2]):
+        value = mean_sample(samples, y, x, channel, factor)
         slope = float(12.92)
         if value > KNEE:
             slope = (1.055 / 2.4) * wp.pow(value, 1.0 / 2.4 - 1.0)
-        out_gradients[y, x, channel] += slope * gradients[y, x, channel]
+        share = slope * gradients[y, x, channel] / float(factor * factor)
+        for j in range(factor):
+            for i in range(factor):
+                out_gradients[y * factor + j, x * factor + i, channel] += share
 
 
-def launch_encode(linear: Any, out_encoded: Any, device: Any) -> None:
-    """Encode every channel of an image ``(H, W, C)``; arrays may be strided."""
-    pixels = linear.shape[0] * linear.shape[1]
-    launch(encode_kernel, pixels, inputs=[linear], outputs=[out_encoded], device=device)
+@wp.kernel
+def average_kernel(first: int, samples: wp.array3d[float], factor: int, out_means: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / out_means.shape[1]
+    x = item % out_means.shape[1]
+    for channel in range(out_means.shape[2]):
+        out_means[y, x, channel] = mean_sample(samples, y, x, channel, factor)
 
 
-def launch_add_linear_gradients(linear: Any, gradients: Any, out_gradients: Any, device: Any) -> None:
-    """Add the gradients of a linear image, given those of the encoded one."""
-    pixels = linear.shape[0] * linear.shape[1]
-    launch(add_linear_gradients_kernel, pixels, inputs=[linear, gradients], outputs=[out_gradients], device=device)
+@wp.kernel
+def spread_kernel(first: int, gradients: wp.array3d[float], factor: int, out_gradients: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / gradients.shape[1]
+    x = item % gradients.shape[1]
+    for channel in range(gradients.shape[2]):
+        share = gradients[y, x, channel] / float(factor * factor)
+        for j in range(factor):
+            for i in range(factor):
+                out_gradients[y * factor + j, x * factor + i, channel] += share
+
+
+def launch_encode(samples: Any, factor: int, out_encoded: Any, device: Any) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode; arrays may be strided."""
+    pixels = out_encoded.shape[0] * out_encoded.shape[1]
+    launch(encode_kernel, pixels, inputs=[samples, factor], outputs=[out_encoded], device=device)
+
+
+def launch_add_sample_gradients(samples: Any, factor: int, gradients: Any, out_gradients: Any, device: Any) -> None:
+    """Add the gradients of linear samples, given those of the encoded image."""
+    pixels = gradients.shape[0] * gradients.shape[1]
+    inputs = [samples, factor, gradients]
+    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
+
+
+def launch_average(samples: Any, factor: int, out_means: Any, device: Any) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel."""
+    pixels = out_means.shape[0] * out_means.shape[1]
+    launch(average_kernel, pixels, inputs=[samples, factor], outputs=[out_means], device=device)
+
+
+def launch_spread(gradients: Any, factor: int, out_gradients: Any, device: Any) -> None:
+    """Add the gradients of samples, given those of their averages."""
+    pixels = gradients.shape[0] * gradients.shape[1]
+    launch(spread_kernel, pixels, inputs=[gradients, factor], outputs=[out_gradients], device=device)
