@@ -30,7 +30,7 @@ def test_the_example_of_the_tracking_page():
     scope = {}
     exec(compile(blocks("tracking.md")[0], "docs/tracking.md", "exec"), scope)
     length = (scope["moved"].numpy() ** 2).sum(axis=1) ** 0.5
-    # x' = x + 0.1 sum w x_a: the mean of joints within 2 spacings of 0.16 lies 0.06 below a sphere of radius 0.8 at most
+    # x' = x + 0.1 sum w x_a: the mean of joints within 2 spacings of 0.16 lies at most 0.06 below the sphere of 0.8
     assert abs(length / 0.88 - 1.0).max() < 0.1 * 0.06 / 0.88
     assert scope["energy"].numpy()[0] > 0.0
     assert abs(scope["to_positions"].numpy().sum(axis=0) - 5000.0).max() < 0.1
