@@ -206,16 +206,9 @@ def _central_ray(view: CapturedView) -> NDArray[np.float64]:
 
 def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]) -> float:
     """Return how many pixels a metre at a point covers in the median view."""
-    return float(
-        np.median(
-            [
-                0.5
-                * (view.camera.focal_x + view.camera.focal_y)
-                / max(np.linalg.norm(view.camera.position - middle), 1e-9)
-                for view in views
-            ]
-        )
-    )
+    focal = np.array([0.5 * (view.camera.focal_x + view.camera.focal_y) for view in views])
+    distances = np.array([np.linalg.norm(view.camera.position - middle) for view in views])
+    return float(np.median(focal / np.maximum(distances, 1e-9)))
 
 
 def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
