@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from warp.geometry import sparse_marching_cubes_from_cells
 
+from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.checks import require_array, require_count, require_finite
 from beam_warp.devices import resolve_device, upload
@@ -47,9 +48,15 @@ SEARCH_ROUNDS = 8
 ENOUGH = 0.8
 """A round that leaves more than this of the longest side was the last one."""
 
-DISTANCE_LIMIT = (24.0, 12)
-"""Distances to a silhouette are measured up to so many pixels, or the longer side divided by so many if that is more:
-a block of the search covers a few per cent of the image."""
+SEARCH_SIDE = 320
+"""Longest side of the masks [pixel] while the box is searched for: larger ones are reduced by whole factors."""
+
+VOXEL_PIXELS = 2
+"""Masks are reduced while a voxel covers more pixels than this: finer ones would tell it nothing, at a higher price."""
+
+DISTANCE_LIMIT = 32.0
+"""Distances to a silhouette are measured up to so many pixels: a block of the search, and of the grid, has a radius
+of fewer where masks are reduced as above."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +131,25 @@ def visual_hull(
             f"views must have at least two masks that show something, got {len(used)} of {len(views)}"
             f"{_listed(' (no mask, or an empty one: ', ignored)}. Pass views with alpha, or points to start from."
         )
-    cones = _Cones(used, tolerance, len(used) // 2 + 1 if quorum is None else quorum, target)
-    lower, upper = cones.search() if box is None else _corners(box)
+    agreeing = len(used) // 2 + 1 if quorum is None else quorum
+    if box is None:
+        longest = max(max(view.camera.width, view.camera.height) for view in used)
+        lower, upper = _Cones(used, max(longest // SEARCH_SIDE, 1), tolerance, agreeing, target).search()
+    else:
+        lower, upper = _corners(box)
     side = float((upper - lower).max())
-    count = _auto_resolution(used, 0.5 * (lower + upper), side) if resolution == "auto" else resolution
+    pixels = _pixels_per_metre(used, 0.5 * (lower + upper))
+    count = int(np.clip(round(side * pixels), *AUTO_RESOLUTION)) if resolution == "auto" else resolution
     voxel = side / count
     if box is None:
         lower, upper = lower - voxel, upper + voxel  # the grid's outermost points count as outside
     blocks = np.maximum(np.ceil((upper - lower) / (voxel * BLOCK) - 1e-6).astype(int), 1)
+    smallest = min(min(view.camera.width, view.camera.height) for view in used)
+    factor = int(np.clip(voxel * pixels / VOXEL_PIXELS, 1, smallest))
+    cones = _Cones(used, factor, tolerance, agreeing, target)
     mesh = cones.carve(lower, voxel, blocks)
     if mesh.is_empty:
-        raise _no_volume(used, cones, np.stack([lower, upper]))
+        raise _no_volume(cones, np.stack([lower, upper]))
     return VisualHull(
         mesh,
         voxel,
@@ -189,15 +204,30 @@ def _central_ray(view: CapturedView) -> NDArray[np.float64]:
     return camera.camera_to_world[:3, :3] @ (local / np.linalg.norm(local))
 
 
-def _auto_resolution(views: Sequence[CapturedView], middle: NDArray[np.float64], side: float) -> int:
-    """Return how many pixels the side covers in the median view."""
-    pixels = [
-        0.5
-        * (view.camera.focal_x + view.camera.focal_y)
-        / max(float(np.linalg.norm(view.camera.position - middle)), 1e-9)
-        for view in views
-    ]
-    return int(np.clip(round(side * float(np.median(pixels))), *AUTO_RESOLUTION))
+def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]) -> float:
+    """Return how many pixels a metre at a point covers in the median view."""
+    focal = np.array([0.5 * (view.camera.focal_x + view.camera.focal_y) for view in views])
+    distances = np.array([np.linalg.norm(view.camera.position - middle) for view in views])
+    return float(np.median(focal / np.maximum(distances, 1e-9)))
+
+
+def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
+    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced` but no colour."""
+    camera, alpha = view.camera, np.asarray(view.alpha)
+    if factor == 1:
+        return camera, alpha
+    width, height = camera.width // factor, camera.height // factor
+    blocks = alpha[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    smaller = replace(
+        camera,
+        width=width,
+        height=height,
+        focal_x=camera.focal_x / factor,
+        focal_y=camera.focal_y / factor,
+        center_x=camera.center_x / factor,
+        center_y=camera.center_y / factor,
+    )
+    return smaller, blocks.mean(axis=(1, 3), dtype=np.float32)
 
 
 def _corners(box: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -224,25 +254,26 @@ def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
 class _Cones:
     """The silhouettes on a device, and what can be asked of them."""
 
-    def __init__(self, views: Sequence[CapturedView], tolerance: int, quorum: int, device: Any) -> None:
+    def __init__(self, views: Sequence[CapturedView], factor: int, tolerance: int, quorum: int, device: Any) -> None:
         self.captured = list(views)
         self.tolerance = tolerance
         self.quorum = quorum
         self.device = device
-        pixels = sum(view.camera.width * view.camera.height for view in views)
+        cameras, masks = zip(*(_reduced(view, factor) for view in views), strict=True)
+        pixels = sum(mask.size for mask in masks)
         if pixels > 2**31 - 1:
             raise InvalidArrayError(
                 f"masks must have at most {2**31 - 1} pixels in all, got {pixels}. Reduce the views."
             )
-        self.records = ViewLayout.of([view.camera for view in views]).views
+        self.records = ViewLayout.of(cameras).views
         self.views = wp.array(self.records, dtype=View, device=device)
         self.distances = wp.empty(pixels, dtype=float, device=device)
-        for view, record in zip(views, self.records, strict=True):
-            shape = (view.camera.height, view.camera.width)
-            column_gaps, row_gaps = (wp.empty(shape, dtype=float, device=device) for _ in range(2))
-            limit = max(DISTANCE_LIMIT[0], max(shape) / DISTANCE_LIMIT[1])
-            alpha = upload(np.asarray(view.alpha), float, device)
-            launch_measure_silhouette(alpha, limit, column_gaps, row_gaps, record.first_pixel, self.distances, device)
+        for mask, record in zip(masks, self.records, strict=True):
+            column_gaps, row_gaps = (wp.empty(mask.shape, dtype=float, device=device) for _ in range(2))
+            alpha = upload(mask, float, device)
+            launch_measure_silhouette(
+                alpha, DISTANCE_LIMIT, column_gaps, row_gaps, record.first_pixel, self.distances, device
+            )
 
     def search(self) -> NDArray[np.float64]:
         """Return the corners of a box that holds the hull, ``(2, 3)``, with up to two small blocks to spare."""
@@ -253,7 +284,7 @@ class _Cones:
             size, count = _blocks(box)
             kept = np.argwhere(self.judge(box[0], size, count) != OUTSIDE)
             if not len(kept):
-                raise _no_volume(self.captured, self, box)
+                raise _no_volume(self, box)
             closer = box[0] + size * np.stack([kept.min(axis=0), kept.max(axis=0) + 1])
             settled = (closer[1] - closer[0]).max() > ENOUGH * (box[1] - box[0]).max()
             box = closer
@@ -316,9 +347,10 @@ class _Cones:
         return trimesh.Trimesh(vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1], process=False)
 
 
-def _no_volume(views: Sequence[CapturedView], cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
+def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
     """Say that nothing is left, and which views are to blame where leaving out one is enough."""
     size, count = _blocks(box)
+    views = cones.captured
     left = np.zeros(len(views), np.int64)
     cones.tolerance, cones.quorum = 0, len(views) - 1
     for i in range(len(views) if len(views) > 2 else 0):

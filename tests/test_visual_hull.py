@@ -129,7 +129,16 @@ class TestBall:
         lowest = np.quantile(np.linalg.norm(points, axis=1), 0.05)
         assert abs(lowest - RADIUS) <= slack(hull, views) + 0.1 * hull.voxel
 
-    def test_off_center_in_metres_and_kilometres(self, device):
+    def test_large_masks_are_reduced_to_what_voxels_tell(self, device):
+        views = ball_views(9, size=200)  # a voxel of 1 / 16 of the ball is 6 pixels
+        hull = visual_hull(views, resolution=16, quorum=9, device=device)
+        radii = np.linalg.norm(hull.mesh.vertices, axis=1)
+        coarse = [view.reduced(3) for view in views]
+        assert radii.min() >= RADIUS - 0.5 * hull.voxel - slack(hull, coarse)
+        reach = widest(views, hull.mesh.vertices / radii[:, None])
+        assert (radii <= RADIUS * reach + slack(hull, coarse) * reach).all()
+
+    def test_off_center(self, device):
         center = np.array([40.0, -30.0, 7.0])
         cameras = cameras_around(8, center=center)
         views = [ball_view(f"v{i}", camera, center=center) for i, camera in enumerate(cameras)]
