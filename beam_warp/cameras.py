@@ -5,7 +5,7 @@ Camera axes are OpenCV's: x right, y down, z forward. Pixel (0, 0) is the top le
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +94,23 @@ class Camera:
     def forward(self) -> NDArray[np.float64]:
         """Unit world direction of the optical axis, ``(3,)`` float64."""
         return self.camera_to_world[:3, 2]
+
+    def supersampled(self, factor: int) -> Camera:
+        """Return the camera that takes ``factor`` x ``factor`` samples where this one has a pixel.
+
+        Raises:
+            InvalidOptionError: ``factor`` is below 1, or the images would be too large.
+        """
+        require_count("factor", factor, 1, MAX_SIDE)
+        return replace(
+            self,
+            width=self.width * factor,
+            height=self.height * factor,
+            focal_x=self.focal_x * factor,
+            focal_y=self.focal_y * factor,
+            center_x=self.center_x * factor,
+            center_y=self.center_y * factor,
+        )
 
     def directions(self) -> NDArray[np.float64]:
         """Return unit world directions from the camera through every pixel centre, ``(height, width, 3)`` float64."""

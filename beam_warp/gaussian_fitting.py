@@ -1,11 +1,18 @@
-"""The first frame: Gaussians that look like the photographs of a moment, with the geometry that these imply."""
+"""The first frame: Gaussians that look like the photographs of a moment, with the geometry that these imply.
+
+Steps look at one view each. The discs of a visual hull are moved until renders agree with the photographs in colour,
+structure and coverage, and the Gaussians' normals with those of the depth that they draw. Every so many steps those
+that nobody sees are dropped, and those that the images pull at most are split into their places: their number stays
+within a budget.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import warp as wp
@@ -14,51 +21,183 @@ from numpy.typing import NDArray
 from beam_warp.adam import Adam
 from beam_warp.assets import GaussianCloud
 from beam_warp.captured_views import CapturedView
+from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.densification import choose_strained, prune, split
+from beam_warp.device_arrays import float_rows
 from beam_warp.devices import resolve_device
+from beam_warp.errors import InvalidArrayError
 from beam_warp.gaussian_parameters import GaussianParameters
 from beam_warp.kernels.stress import launch_add_stress
-from beam_warp.raster_records import RasterOptions
-from beam_warp.view_targets import LossWeights, ViewTargets, crop_views
+from beam_warp.motion_losses import TemporalLoss
+from beam_warp.raster_records import GaussianGradients, RasterOptions
+from beam_warp.regularizers import AnisotropyLoss, OpacityLoss
+from beam_warp.sampling_limits import SamplingLimits
+from beam_warp.step_graphs import StepGraphs
+from beam_warp.view_targets import LossWeights, TargetSet, sample_side
 
-FitProgress = Callable[[int, int], None]
-"""Called with (iterations done, iterations in all)."""
+PRESETS = ("fast", "paper", "rade")
+
+FIT_RASTER = RasterOptions(antialiased=True, low_pass=0.1)
+"""How splats are drawn while they are fitted, and should be afterwards: the pixel filter's variance is about that of
+a pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
+
+DISC_SPACING = 0.7
+"""Deviation of an initial disc over the distance to its neighbours (`beam_warp.initialization`)."""
+
+PROGRESS_EVERY = 50
+"""Steps from one report of progress, and change of the positions' learning rate, to the next."""
+
+LEAST_GAIN = 0.15
+"""Gain of twice as many Gaussians below which more of them do not pay [dB]."""
+
+FEWEST_GAUSSIANS = 2_000
+"""Where a search for a number of Gaussians begins, at least."""
+
+
+class FitProgress(Protocol):
+    """Hears how far a fit is."""
+
+    def __call__(self, done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+        """Take ``done`` of ``total`` steps; facts: ``psnr`` [dB], ``gaussians``."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Sizes of steps, each in the units of what is moved.
+
+    Attributes:
+        positions: At the start, in distances of the cameras from the subject.
+        final_positions: At the end; in between it falls by the same factor every step.
+        orientations: Of quaternions.
+        scales: Of logarithms.
+        opacities: Of logits.
+        color: Of the spherical harmonics' band 0.
+        bands: Of all other bands.
+    """
+
+    positions: float = 5e-4
+    final_positions: float = 5e-6
+    orientations: float = 2e-3
+    scales: float = 1e-2
+    opacities: float = 3e-2
+    color: float = 1e-2
+    bands: float = 5e-4
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """How Gaussians are fitted to the photographs of one moment."""
+    """How Gaussians are fitted to the photographs of one moment.
+
+    Attributes:
+        gaussian_count: Most Gaussians there may be.
+        target_psnr: Begin with few Gaussians and double them until the views are met so well [dB], or doubling gains
+            less than `LEAST_GAIN`, or there are as many as allowed; None for all of them at once.
+        color_iterations: Steps without the term of normals.
+        normal_iterations: Steps with it.
+        weights: What the terms count.
+        rates: Sizes of steps.
+        sh_degree: Of the captured radiance.
+        samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
+        raster: How splats are drawn.
+        sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
+        anisotropy: Weight of needles (`AnisotropyLoss`).
+        opacity: Weight of opacity (`OpacityLoss`).
+        temporal: Weight of changes against the start, for the frames after the first (E_temp).
+        refine_every: Steps from one refinement to the next; 0 for none.
+        refine_until: Part of all steps after which there is none.
+        split_fraction: Most of the Gaussians that one refinement splits.
+        dead_opacity: Gaussians below it are dropped.
+        seed: Same seed, same device, same result.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
 
     gaussian_count: int = 60_000
+    target_psnr: float | None = None
     color_iterations: int = 1_000
     normal_iterations: int = 2_000
+    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=0.3))
+    rates: LearningRates = field(default_factory=LearningRates)
     sh_degree: int = 2
-    normal_weight: float = 0.03
-    alpha_weight: float = 0.5
-    attraction: float = 0.1
-    samples: int = 1
-    ssim_weight: float = 0.2
+    samples: int | Literal["auto"] = "auto"
+    raster: RasterOptions = FIT_RASTER
+    sampling_filter: bool = True
+    anisotropy: float = 0.0
+    opacity: float = 0.0
+    temporal: float = 0.0
     refine_every: int = 250
     refine_until: float = 0.6
     split_fraction: float = 0.1
     dead_opacity: float = 0.02
-    position_rate: float = 1.6e-4
-    final_position_rate: float = 1.6e-6
-    orientation_rate: float = 2e-3
-    scale_rate: float = 5e-3
-    opacity_rate: float = 3e-2
-    color_rate: float = 5e-3
-    band_rate: float = 2.5e-4
-    raster: RasterOptions = field(default_factory=lambda: RasterOptions(antialiased=True))
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_count("gaussian_count", self.gaussian_count, 1, 2**24)
+        if self.target_psnr is not None:
+            require_number("target_psnr", self.target_psnr, 1.0, 120.0)
+        for name in ("color_iterations", "normal_iterations", "refine_every", "seed"):
+            require_count(name, getattr(self, name), 0)
+        require_count("sh_degree", self.sh_degree, 0, 4)
+        if self.samples != "auto":
+            require_count("samples", self.samples, 1, 8)
+        for name in ("refine_until", "split_fraction", "dead_opacity"):
+            require_number(name, getattr(self, name), 0.0, 1.0)
+        for name in ("anisotropy", "opacity", "temporal"):
+            require_number(name, getattr(self, name), 0.0)
+
+    @classmethod
+    def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
+        """Return the options of a preset, some of them changed.
+
+        ``fast`` is ours. ``paper`` is BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of
+        0.03, the rates of 3DGS, no term of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass
+        on the image but the 3D filter, normals at 0.05 for the second half; both draw one sample a pixel.
+
+        Raises:
+            InvalidOptionError: There is no such preset, or an option is out of range.
+        """
+        require_choice("preset", preset, PRESETS)
+        rates = LearningRates(1.6e-4, 1.6e-6, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4)
+        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
+        options: dict[str, dict[str, Any]] = {
+            "fast": {},
+            "paper": {
+                **common,
+                "color_iterations": 7_000,
+                "normal_iterations": 5_000,
+                "weights": LossWeights(alpha=0.0, normal=0.03),
+                "raster": RasterOptions(),
+                "sampling_filter": False,
+            },
+            "rade": {
+                **common,
+                "color_iterations": 6_000,
+                "normal_iterations": 6_000,
+                "weights": LossWeights(alpha=0.0, normal=0.05),
+                "raster": RasterOptions(low_pass=1e-4),
+            },
+        }
+        return cls(**{**options[preset], **changes})
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What came out."""
+    """What came out of a fit.
+
+    Attributes:
+        cloud: Gaussians with scene-linear radiance and ids.
+        report: What was done and how well it went, JSON-able: ``psnr`` of the training views' crops [dB], lowest
+            ``view_psnr``, ``gaussians``, ``iterations``, ``samples``, ``seconds``; ``growth`` with a target.
+    """
 
     cloud: GaussianCloud
     report: dict[str, Any] = field(default_factory=dict)
+
+
+def no_fit_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+    """Report to nobody."""
 
 
 def fit_gaussians(
@@ -67,160 +206,270 @@ def fit_gaussians(
     options: FitOptions | None = None,
     *,
     device: str | None = None,
-    progress: FitProgress | None = None,
+    progress: FitProgress = no_fit_progress,
 ) -> Fit:
-    """Fit."""
-    fitter = Fitter(views, start, options or FitOptions(), resolve_device(device))
-    fitter.run(progress)
-    return Fit(fitter.parameters.cloud(), fitter.report())
+    """Fit Gaussians to the photographs of one moment.
+
+    Args:
+        views: The photographs, at least one.
+        start: Where steps begin, with scene-linear radiance, such as `initial_gaussians` gives; some of them, evenly
+            chosen, where there are more than may be.
+        options: See `FitOptions`.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+        progress: Called with (done, total, facts).
+
+    Raises:
+        InvalidArrayError: There is no view or no Gaussian, or the start has no radiance in scene-linear Rec.709.
+        DeviceError: There is no such device.
+
+    Source: Kerbl et al. 2023, 3DGS; BEAM §3.1 for the normals; what differs is in `docs/reconstruction.md`.
+    """
+    chosen = options or FitOptions()
+    if not len(views) or not len(start):
+        raise InvalidArrayError(
+            f"views and start must hold something, got {len(views)} views and {len(start)} Gaussians. Pass some."
+        )
+    if len(start) > chosen.gaussian_count:
+        start = start.select(np.linspace(0, len(start) - 1, chosen.gaussian_count).astype(int))
+    target = resolve_device(device)
+    began = time.perf_counter()
+    if chosen.target_psnr is None:
+        fitter = Fitter(views, start, chosen, target)
+        fitter.run(progress)
+        report = fitter.report()
+    else:
+        fitter, report = _grow(views, start, chosen, target, progress)
+    report["seconds"] = time.perf_counter() - began
+    return Fit(fitter.parameters.cloud(), report)
+
+
+def _grow(
+    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: FitProgress
+) -> tuple[Fitter, dict[str, Any]]:
+    """Fit few Gaussians, and twice as many from there, until more do not pay."""
+    assert options.target_psnr is not None
+    count = min(max(FEWEST_GAUSSIANS, options.gaussian_count // 16), len(start))
+    cloud = start.select(np.linspace(0, len(start) - 1, count).astype(int))
+    cloud = cloud.with_arrays(scales=cloud.scales * np.sqrt(len(start) / count))
+    growth: list[dict[str, float]] = []
+    iterations = 0
+    while True:
+        fitter = Fitter(views, cloud, replace(options, gaussian_count=count), device)
+        fitter.run(progress)
+        report = fitter.report()
+        iterations += report["iterations"]
+        growth.append({"gaussians": report["gaussians"], "psnr": report["psnr"]})
+        gain = growth[-1]["psnr"] - growth[-2]["psnr"] if len(growth) > 1 else np.inf
+        if growth[-1]["psnr"] >= options.target_psnr or gain < LEAST_GAIN or count >= options.gaussian_count:
+            return fitter, {**report, "iterations": iterations, "growth": growth}
+        count = min(2 * count, options.gaussian_count)
+        cloud = fitter.doubled(count)
+        # What is there is good already: half the steps do for its halves.
+        options = replace(
+            options,
+            color_iterations=0,
+            normal_iterations=max(1, (options.color_iterations + options.normal_iterations) // 2)
+            if len(growth) == 1
+            else options.normal_iterations,
+        )
 
 
 class Fitter:
-    """Steps of the fit of one moment."""
+    """The steps of one fit, on a device.
+
+    Attributes:
+        parameters: The Gaussians.
+        samples: Side of the square of samples of a pixel.
+    """
 
     def __init__(self, views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any) -> None:
+        """Bring everything to the device; see `fit_gaussians`."""
         self.options = options
         self.device = device
-        self.parameters = GaussianParameters(
-            start, device, row_count=max(options.gaussian_count, len(start)), sh_degree=options.sh_degree
-        )
-        cropped = crop_views(views)
-        by_size: dict[tuple[int, int], list[CapturedView]] = {}
-        for view in cropped:
-            by_size.setdefault((view.camera.width, view.camera.height), []).append(view)
-        self.groups = [
-            ViewTargets(group, len(self.parameters), options.raster, options.samples, device)
-            for group in by_size.values()
-        ]
-        self.views = [(group, index) for group in self.groups for index in range(len(group))]
+        count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
+        self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         center = np.median(start.positions, axis=0)
-        self.extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
-        chosen = options
-        self.adam: Adam = self.parameters.optimizer(
+        spacing = float(np.median(np.sort(start.scales, axis=1)[:, 1])) / DISC_SPACING
+        self.samples = sample_side(views, center, spacing) if options.samples == "auto" else int(options.samples)
+        self._targets = TargetSet(views, count, options.raster, self.samples, device)
+        self._extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
+        self._limits = SamplingLimits([view.camera for view in views], device=device)
+        rates = options.rates
+        self._adam: Adam = self.parameters.optimizer(
             {
-                "positions": chosen.position_rate * self.extent,
-                "orientations": chosen.orientation_rate,
-                "log_scales": chosen.scale_rate,
-                "logits": chosen.opacity_rate,
-                "color": chosen.color_rate,
-                "bands": chosen.band_rate,
+                "positions": rates.positions * self._extent,
+                "orientations": rates.orientations,
+                "log_scales": rates.scales,
+                "logits": rates.opacities,
+                "color": rates.color,
+                "bands": rates.bands,
             }
         )
-        self.weights = LossWeights(
-            l1=1.0 - chosen.ssim_weight, ssim=chosen.ssim_weight, alpha=chosen.alpha_weight, normal=0.0
-        )
-        count = len(self.parameters)
-        self.stress = wp.zeros(count, dtype=float, device=device)
-        self.seen = wp.zeros(count, dtype=float, device=device)
-        self._graphs: dict[int, Any] = {}
-        self._capacities: list[int] = []
-        self.seconds = 0.0
+        self._stress = wp.zeros(count, dtype=float, device=device)
+        self._seen = wp.zeros(count, dtype=float, device=device)
+        self._anisotropy = AnisotropyLoss(count, device=device)
+        self._opacity = OpacityLoss(count, device=device)
+        self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._graphs = StepGraphs(device)
+        self._weights = options.weights
+        self._taken = 0
 
-    def run(self, progress: FitProgress | None = None) -> None:
+    def run(self, progress: FitProgress = no_fit_progress) -> None:
         """Take all steps."""
-        began = time.perf_counter()
         chosen = self.options
         total = chosen.color_iterations + chosen.normal_iterations
         order = self._order(total)
-        self.make_room()
+        facts: dict[str, float] = {"gaussians": float(self.parameters.alive().sum())}
+        self._weights = replace(chosen.weights, normal=0.0)
+        self._renew()
         for iteration in range(total):
             if iteration == chosen.color_iterations:
-                self.weights = replace(self.weights, normal=chosen.normal_weight)
+                self._weights = chosen.weights
                 self._graphs.clear()
-            if iteration % 50 == 0:
-                part = iteration / max(total - 1, 1)
-                rate = chosen.position_rate * (chosen.final_position_rate / chosen.position_rate) ** part
-                self.adam.set_learning_rate("positions", rate * self.extent)
-                if progress is not None:
-                    progress(iteration, total)
-            self.step(int(order[iteration]))
-            done = iteration + 1
-            if done % chosen.refine_every == 0 and done <= chosen.refine_until * total:
-                self.refine()
-                self.make_room()
-        wp.synchronize_device(self.device)
-        self.seconds = time.perf_counter() - began
+            if iteration % PROGRESS_EVERY == 0:
+                self._set_position_rate(iteration / max(total - 1, 1))
+                progress(iteration, total, facts)
+            view = int(order[iteration])
+            self._graphs.run(view, lambda view=view: self._step(view))
+            self._taken += 1
+            if chosen.refine_every and self._taken % chosen.refine_every == 0:
+                if self._taken <= chosen.refine_until * total:
+                    self._refine()
+                facts = {"gaussians": float(self.parameters.alive().sum()), "psnr": self._renew()}
+        facts["psnr"] = self._renew()
+        progress(total, total, facts)
+
+    def report(self) -> dict[str, Any]:
+        """Return what was done and how well it went, JSON-able."""
+        psnr, _ = self.measure()
+        return {
+            "psnr": float(psnr.mean()),
+            "view_psnr": float(psnr.min()),
+            "gaussians": int(self.parameters.alive().sum()),
+            "iterations": self._taken,
+            "samples": self.samples,
+        }
+
+    def measure(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return PSNR and largest uncovered part of every view; see `TargetSet.measure`."""
+        self.parameters.activate()
+        return self._targets.measure(self.parameters.drawn)
+
+    def doubled(self, count: int) -> GaussianCloud:
+        """Return what was fitted with the most strained Gaussians split, ``count`` in all."""
+        rows = self.parameters.rows()
+        alive = self.parameters.alive()
+        rows = {name: array[alive] for name, array in rows.items()}
+        present = int(alive.sum())
+        stress = (self._stress.numpy() / np.maximum(self._seen.numpy(), 1.0))[alive]
+        strained = choose_strained(stress + 1e-30, np.ones(present, bool), max(count - present, 0))
+        grown = {name: np.concatenate([array, array[strained]]) for name, array in rows.items()}
+        split(grown, strained, present + np.arange(len(strained)))
+        orientations = grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True)
+        return GaussianCloud(
+            positions=grown["positions"],
+            orientations=orientations,
+            scales=np.exp(grown["log_scales"]),
+            opacities=1.0 / (1.0 + np.exp(-grown["logits"])),
+            radiance=grown["radiance"],
+            radiance_color_space=self.parameters.cloud().radiance_color_space,
+            ids=np.arange(len(grown["positions"])),
+        )
 
     def _order(self, total: int) -> NDArray[np.int64]:
         """Return which view each step looks at: all of them, shuffled, again and again."""
         rng = np.random.default_rng(self.options.seed)
-        rounds = -(-total // len(self.views))
-        return np.concatenate([rng.permutation(len(self.views)) for _ in range(rounds)])
+        rounds = -(-total // len(self._targets))
+        return np.concatenate([rng.permutation(len(self._targets)) for _ in range(max(rounds, 1))])
 
-    def make_room(self) -> None:
-        """Draw every view once, with as much room as it takes."""
+    def _set_position_rate(self, part: float) -> None:
+        """Let steps of positions shrink."""
+        rates = self.options.rates
+        if rates.positions > 0.0:
+            rate = rates.positions * (rates.final_positions / rates.positions) ** part
+            self._adam.set_learning_rate("positions", rate * self._extent)
+
+    def _renew(self) -> float:
+        """Bring the sampling filter and the room for pairs up to date; return the mean PSNR of the views [dB]."""
+        if self.options.sampling_filter:
+            self._limits.write(self.parameters.positions, self.parameters.filters)
         self.parameters.activate()
-        for group, index in self.views:
-            group.select(index)
-            group.rasterizer.draw(self.parameters.drawn)
-        capacities = [group.rasterizer.pair_capacity for group in self.groups]
-        if capacities != self._capacities:
+        if self._targets.make_room(self.parameters.drawn):
             self._graphs.clear()
-            self._capacities = capacities
+        return float(self._targets.measure(self.parameters.drawn)[0].mean())
 
-    def step(self, view: int) -> None:
-        """Take one step, as a graph where the device has them."""
-        if not self.device.is_cuda:
-            self._launch_step(view)
-            return
-        if view not in self._graphs:
-            with wp.ScopedCapture(self.device) as capture:
-                self._launch_step(view)
-            self._graphs[view] = capture.graph
-        wp.capture_launch(self._graphs[view])
-
-    def _launch_step(self, view: int) -> None:
-        group, index = self.views[view]
-        parameters = self.parameters
+    def _step(self, view: int) -> None:
+        """Draw a view, compare, and move the Gaussians."""
+        group, index = self._targets[view]
+        parameters, chosen = self.parameters, self.options
         parameters.activate()
         group.select(index)
         group.rasterizer.redraw()
-        group.add_losses(index, self.weights)
+        group.add_losses(index, self._weights)
         drawn = group.rasterizer.backward()
-        launch_add_stress(drawn.positions, self.stress, self.seen, self.device)
+        launch_add_stress(drawn.positions, self._stress, self._seen, self.device)
+        self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
-        if self.options.attraction > 0.0:
-            group.attract(index, parameters.drawn, self.options.attraction, parameters.gradient("positions"))
-        self.adam.step()
+        if self._weights.surface > 0.0:
+            group.add_attraction(index, parameters.drawn, self._weights.surface, parameters.gradient("positions"))
+        if self._temporal is not None:
+            self._temporal.add_gradients(chosen.temporal)
+        self._adam.step()
 
-    def refine(self) -> None:
+    def _add_regularizers(self, drawn: GaussianGradients) -> None:
+        """Add the gradients of terms on what is drawn."""
+        chosen, gaussians = self.options, self.parameters.drawn
+        if chosen.anisotropy > 0.0:
+            self._anisotropy(gaussians.scales, weight=chosen.anisotropy, gradient=drawn.scales)
+        if chosen.opacity > 0.0:
+            self._opacity(gaussians.opacities, weight=chosen.opacity, gradient=drawn.opacities)
+
+    def _refine(self) -> None:
         """Drop Gaussians that are not seen, and split strained ones into their rows."""
         chosen = self.options
         rows = self.parameters.rows()
-        stress, seen = self.stress.numpy(), self.seen.numpy()
+        stress, seen = self._stress.numpy(), self._seen.numpy()
         alive = self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
-        dead = alive & ((opacity < chosen.dead_opacity) | (seen == 0))
+        dead = alive & ~((opacity >= chosen.dead_opacity) & (seen > 0))
+        if dead.sum() == alive.sum():  # all of them: nothing to go on from
+            dead[:] = False
         prune(rows, dead)
         alive &= ~dead
         free = np.flatnonzero(~alive)
-        strained = choose_strained(
-            stress / np.maximum(seen, 1.0), alive, min(len(free), int(chosen.split_fraction * alive.sum()))
-        )
-        split(rows, strained, free[: len(strained)])
+        most = min(len(free), int(np.ceil(chosen.split_fraction * alive.sum())))
+        strained = choose_strained(stress / np.maximum(seen, 1.0), alive, most)
+        taken = free[: len(strained)]
+        split(rows, strained, taken)
         self.parameters.set_rows(rows)
         changed = dead.copy()
-        changed[strained] = True
-        changed[free[: len(strained)]] = True
-        self.adam.restart(changed)
-        self.stress.zero_()
-        self.seen.zero_()
+        changed[strained] = changed[taken] = True
+        self._adam.restart(changed)
+        self._stress.zero_()
+        self._seen.zero_()
 
-    def psnr(self) -> float:
-        """Return the mean PSNR over the views of crops, encoded and clipped [dB]."""
-        self.parameters.activate()
-        values = []
-        for group, index in self.views:
-            group.select(index)
-            group.rasterizer.draw(self.parameters.drawn)
-            values.append(-10.0 * np.log10(max(group.square_error(index), 1e-12)))
-        return float(np.mean(values))
 
-    def report(self) -> dict[str, Any]:
-        """Return what was done, JSON-able."""
-        return {
-            "psnr": self.psnr(),
-            "gaussians": int(self.parameters.alive().sum()),
-            "seconds": self.seconds,
-        }
+class _Anchored:
+    """Terms that hold Gaussians to what they were in the frame before (E_temp)."""
+
+    UNITS: Mapping[str, float] = MappingProxyType({"radiance": 0.1, "log_scales": 0.1, "logits": 0.5})
+
+    def __init__(self, parameters: GaussianParameters, spacing: float) -> None:
+        self._parameters = parameters
+        self._units = {**self.UNITS, "positions": 0.1 * spacing}
+        self._terms = {}
+        for name in self._units:
+            rows = float_rows(getattr(parameters, name))
+            self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
+
+    def add_gradients(self, weight: float) -> None:
+        for name, (term, reference) in self._terms.items():
+            values, gradients = getattr(self._parameters, name), self._parameters.gradient(name)
+            term(
+                float_rows(values),
+                reference,
+                weight=weight,
+                unit=self._units[name],
+                gradient=float_rows(gradients),
+            )

@@ -107,6 +107,7 @@ def score_frame(
     truth_mesh: trimesh.Trimesh | None = None,
     seeing: Sequence[Camera] = (),
     options: RasterOptions | None = None,
+    samples: int = 1,
     sample_count: int = SAMPLE_COUNT,
     device: str | None = None,
 ) -> FrameScores:
@@ -124,6 +125,7 @@ def score_frame(
         seeing: Cameras that took the training images: only what they see of the truth counts. Those of ``records``
             without.
         options: How splats are drawn: as in training.
+        samples: Side of the square of samples of a pixel's colour and alpha: as in training.
         sample_count: Points on each surface.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
@@ -136,9 +138,13 @@ def score_frame(
         raise InvalidArrayError("records must hold at least one view, got none. Choose the capture's test split.")
     cameras = [record.camera for record in records]
     buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
+    fine = [camera.supersampled(samples) for camera in cameras]
+    colors = rasterize(cloud, fine, channels=(RADIANCE,), options=options, device=device) if samples > 1 else buffers
     views = tuple(
-        _score_view(buffer, seen_radiance(buffer, cloud), record)
-        for buffer, record in zip(buffers, records, strict=True)
+        _score_view(
+            buffer, block_means(seen_radiance(color, cloud), samples), block_means(color.alpha, samples), record
+        )
+        for buffer, color, record in zip(buffers, colors, records, strict=True)
     )
     surface = None
     if mesh is not None and truth_mesh is not None:
@@ -150,6 +156,12 @@ def seen_radiance(buffer: GBuffer, cloud: GaussianCloud) -> NDArray[np.float64]:
     """Return what a camera sees as scene-linear colour over black, ``(H, W, 3)``: not below 0, not cut above."""
     over_black = np.maximum(buffer.channels[RADIANCE].astype(np.float64) * buffer.alpha[..., None], 0.0)
     return srgb_to_linear(over_black) if cloud.radiance_color_space == DISPLAY_SRGB else over_black
+
+
+def block_means(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """Return the means of squares of ``side`` x ``side`` samples, ``(H, W, ...)`` of ``(H side, W side, ...)``."""
+    height, width = image.shape[0] // side, image.shape[1] // side
+    return image.reshape(height, side, width, side, *image.shape[2:]).mean(axis=(1, 3)) if side > 1 else image
 
 
 def read_truth_mesh(capture: Capture, frame: int) -> trimesh.Trimesh:
@@ -182,7 +194,9 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         ) from error
 
 
-def _score_view(buffer: GBuffer, radiance: NDArray[np.float64], record: CaptureRecord) -> ViewScores:
+def _score_view(
+    buffer: GBuffer, radiance: NDArray[np.floating], alpha: NDArray[np.floating], record: CaptureRecord
+) -> ViewScores:
     """Score one view."""
     image = record.image().linear_rgba()
     truth = record.truth() if record.truth_path is not None else None
@@ -191,11 +205,11 @@ def _score_view(buffer: GBuffer, radiance: NDArray[np.float64], record: CaptureR
     colors: dict[str, Any] = {
         "name": record.name,
         "novel_view": compare(
-            radiance, image[..., :3], alpha=buffer.alpha, truth_alpha=truth_alpha, is_color=True, premultiplied=True
+            radiance, image[..., :3], alpha=alpha, truth_alpha=truth_alpha, is_color=True, premultiplied=True
         ),
         "whole_psnr": psnr(ours, theirs),
         "whole_ssim": ssim(ours, theirs),
-        "alpha_error": float(np.abs(buffer.alpha.astype(np.float64) - truth_alpha).mean()),
+        "alpha_error": float(np.abs(alpha.astype(np.float64) - truth_alpha).mean()),
     }
     if truth is None:
         return ViewScores(**colors)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
+from scipy import ndimage
 
-from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.depth_normals import DepthNormals
 from beam_warp.device_arrays import pixel_channels
@@ -29,10 +30,21 @@ from beam_warp.rasterizer import PreparedCameras, Rasterizer
 CROP_MARGIN = 8
 """Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
 
-TOLERANCE = 0.5
-
 CROP_STEP = 16
 """Crops are multiples of it: a tile of the rasteriser."""
+
+
+SURFACE_REACH = 0.02
+"""Gaussians within this part of the depth from the drawn surface belong to it; at 3 m, 6 cm: less than a limb."""
+
+SURFACE_TOLERANCE = 0.5
+"""Half the thickness that a surface may have [pixel]."""
+
+SURFACE_COSINE = 0.2
+"""Of a Gaussian's normal and the direction to the camera: below, it belongs to another side."""
+
+MOST_SAMPLES = 4
+"""Side of the square of samples of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +56,15 @@ class LossWeights:
         ssim: One minus the structural similarity of encoded colours.
         alpha: Mean absolute difference of coverage, where it is known.
         normal: Disagreement of the Gaussians' normals with those of the drawn depth (BEAM Eq. 2).
+        surface: Distance of Gaussians from the drawn surface [pixel], beyond half a pixel; as many times as there are
+            pixels, so that it stands to the images' terms as a Gaussian does to a pixel.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     alpha: float = 0.5
     normal: float = 0.0
+    surface: float = 0.0
 
 
 def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
@@ -85,19 +100,6 @@ def _box(view: CapturedView) -> tuple[tuple[int, int], tuple[int, int]]:
     return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
 
 
-def scaled_camera(camera: Camera, factor: int) -> Camera:
-    """Return a camera that takes ``factor`` x ``factor`` samples where the given one has a pixel."""
-    return replace(
-        camera,
-        width=camera.width * factor,
-        height=camera.height * factor,
-        focal_x=camera.focal_x * factor,
-        focal_y=camera.focal_y * factor,
-        center_x=camera.center_x * factor,
-        center_y=camera.center_y * factor,
-    )
-
-
 class ViewTargets:
     """The photographs of views of one size, and how renders of Gaussians differ from them.
 
@@ -119,7 +121,7 @@ class ViewTargets:
             samples: Side of the square of samples that a pixel is the mean of.
             device: Warp device.
         """
-        cameras = [scaled_camera(view.camera, samples) for view in views]
+        cameras = [view.camera.supersampled(samples) for view in views]
         self.rasterizer = Rasterizer(
             gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
         )
@@ -198,12 +200,12 @@ class ViewTargets:
             geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
 
-    def attract(self, index: int, gaussians: GaussianArrays, strength: float, gradients: wp.array) -> None:
+    def add_attraction(self, index: int, gaussians: GaussianArrays, weight: float, gradients: wp.array) -> None:
         """Add to the positions' gradients a pull towards the surface that the view drew last."""
         attraction = Attraction()
-        attraction.tolerance = TOLERANCE * self._samples
-        attraction.strength = strength / (self.height * self.width)
-        attraction.reach, attraction.least_cosine, attraction.least_alpha = 0.02, 0.2, 0.5
+        attraction.tolerance = SURFACE_TOLERANCE * self._samples
+        attraction.strength = weight / (self.height * self.width)
+        attraction.reach, attraction.least_cosine, attraction.least_alpha = SURFACE_REACH, SURFACE_COSINE, 0.5
         launch_attract(
             gaussians.positions,
             gaussians.orientations,
@@ -220,3 +222,94 @@ class ViewTargets:
         launch_encode(self._color, self._samples, self._encoded, self.device)
         drawn = np.clip(self._encoded.numpy(), 0.0, 1.0)
         return float(np.mean((drawn - np.clip(self._colors[index].numpy(), 0.0, 1.0)) ** 2))
+
+    def draw(self, index: int, gaussians: GaussianArrays) -> None:
+        """Draw Gaussians for a view, with as much room as they take."""
+        self.select(index)
+        self.rasterizer.draw(gaussians)
+
+    def subject_pixels(self, index: int) -> int:
+        """Return how many pixels of a view the subject covers; all without alpha."""
+        alpha = self._alphas[index]
+        return self.height * self.width if alpha is None else int((alpha.numpy() > 0.5).sum())
+
+    def missed(self, index: int) -> NDArray[np.bool_]:
+        """Return which pixels of the subject what was drawn last does not cover, ``(H, W)``; none without alpha."""
+        alpha = self._alphas[index]
+        if alpha is None:
+            return np.zeros((self.height, self.width), bool)
+        launch_average(self._alpha, self._samples, self._covered, self.device)
+        return ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+
+
+class TargetSet:
+    """Views of any sizes, each at hand by its number.
+
+    Attributes:
+        device: Where they are.
+    """
+
+    def __init__(
+        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+    ) -> None:
+        """Crop views to the subject and bring them to a device; see `ViewTargets`."""
+        by_size: dict[tuple[int, int], list[int]] = {}
+        cropped = crop_views(views)
+        for number, view in enumerate(cropped):
+            by_size.setdefault((view.camera.width, view.camera.height), []).append(number)
+        self.device = device
+        self._places: list[tuple[ViewTargets, int]] = [None] * len(cropped)  # type: ignore[list-item]
+        self._groups = []
+        for numbers in by_size.values():
+            group = ViewTargets([cropped[number] for number in numbers], gaussian_count, options, samples, device)
+            self._groups.append(group)
+            for index, number in enumerate(numbers):
+                self._places[number] = (group, index)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self._places)
+
+    def __getitem__(self, number: int) -> tuple[ViewTargets, int]:
+        """Return where a view is: among which, and at which place."""
+        return self._places[number]
+
+    def make_room(self, gaussians: GaussianArrays) -> bool:
+        """Draw every view, with as much room as it takes; return whether some had to be made."""
+        before = [group.rasterizer.pair_capacity for group in self._groups]
+        for group, index in self._places:
+            group.draw(index, gaussians)
+        return before != [group.rasterizer.pair_capacity for group in self._groups]
+
+    def measure(self, gaussians: GaussianArrays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Draw every view and compare.
+
+        Returns:
+            PSNR of each crop, encoded and clipped to [0, 1] [dB], and the largest connected part of the subject that
+            is not drawn, as a fraction of it: ``(V,)`` each.
+        """
+        psnr, missed = [], []
+        for group, index in self._places:
+            group.draw(index, gaussians)
+            psnr.append(-10.0 * np.log10(max(group.square_error(index), 1e-12)))
+            parts, count = ndimage.label(group.missed(index))
+            largest = np.bincount(parts.ravel())[1:].max() if count else 0
+            missed.append(largest / max(group.subject_pixels(index), 1))
+        return np.array(psnr), np.array(missed)
+
+
+def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:
+    """Return how many samples a pixel's side needs, so that two fall on the distance of neighbouring Gaussians.
+
+    At silhouettes many layers lie behind each other, so that their blurred edges are opaque further out than half of
+    the blur, and what is fitted shrinks to make up for it, by half a pixel. Samples finer than the Gaussians keep that
+    below their own size.
+
+    Args:
+        views: What is fitted.
+        center: Of the subject [m], ``(3,)``.
+        spacing: Distance of neighbouring Gaussians [m].
+    """
+    footprints = [float((center - view.camera.position) @ view.camera.forward) / view.camera.focal_x for view in views]
+    footprint = float(np.median(footprints))
+    return int(np.clip(np.ceil(2.0 * footprint / spacing), 1, MOST_SAMPLES)) if footprint > 0.0 else 1

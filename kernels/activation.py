@@ -2,8 +2,8 @@
 
 Scales are moved as logarithms and opacities as logits, so that no step leaves their range. The sampling filter widens a
 Gaussian to what its training images can show, and takes the opacity that this adds away again: with f the filter's
-deviation, s_i' = sqrt(s_i^2 + f^2) and o' = o prod s_i / s_i' (Yu et al. 2024, Mip-Splatting, Eq. 8). The product is
-over the two larger axes: a disc without thickness would vanish by the third, although it fills as many pixels.
+deviation, s_i' = sqrt(s_i^2 + f^2) and o' = o prod s_i / s_i' (Yu et al. 2024, Mip-Splatting, Eq. 8). Here only for the
+two larger axes: the thickness of a disc is no detail that an image shows, and would fade it out.
 """
 
 from typing import Any
@@ -48,10 +48,10 @@ def activate_kernel(first: int, shapes: Shapes, out_scales: wp.array[wp.vec3], o
     thin = smallest_axis(scales)
     opacity = sigmoid(shapes.logits[item])
     for axis in range(3):
-        wide = wp.sqrt(scales[axis] * scales[axis] + filter * filter)
         if axis != thin:
+            wide = wp.sqrt(scales[axis] * scales[axis] + filter * filter)
             opacity *= scales[axis] / wide
-        scales[axis] = wide
+            scales[axis] = wide
     out_scales[item] = scales
     out_opacities[item] = opacity
 
@@ -80,11 +80,12 @@ def add_shape_gradients_kernel(
     found = out_log_scales[item]
     for axis in range(3):
         square = scales[axis] * scales[axis]
-        variance = square + filter * filter
+        excess = filter * filter
+        if axis == thin:
+            excess = 0.0
         # ds'/dlog s = s^2 / s'; dlog(s / s')/dlog s = 1 - s^2 / s'^2
-        found[axis] += gradient[axis] * square / wp.sqrt(variance)
-        if axis != thin:
-            found[axis] += opacity_gradient * peak * kept * (filter * filter / variance)
+        found[axis] += gradient[axis] * square / wp.sqrt(square + excess)
+        found[axis] += opacity_gradient * peak * kept * (excess / (square + excess))
     out_log_scales[item] = found
     out_logits[item] += opacity_gradient * kept * peak * (1.0 - peak)
 

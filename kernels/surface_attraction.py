@@ -1,4 +1,4 @@
-"""Gaussians drawn to the surface that is seen of them: those that sank behind it, or float before it, move along the ray.
+"""Gaussians drawn to the surface that is seen of them: those behind it, or before it, move along the ray.
 
 Photographs alone do not keep Gaussians on a surface: at every silhouette the soft edges of what is drawn are pushed
 inwards, and what is pushed behind others is not pulled back, since nobody sees it. A Gaussian that faces the camera and

@@ -1,0 +1,188 @@
+"""Coarse motion: where joints must be for the Gaussians that they carry to look like the next photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.adam import Adam, Parameters
+from beam_warp.assets import GaussianCloud
+from beam_warp.captured_views import CapturedView
+from beam_warp.devices import upload
+from beam_warp.joint_graph import JointGraph
+from beam_warp.motion_losses import RigidityLoss
+from beam_warp.raster_records import GaussianArrays, RasterOptions
+from beam_warp.skinning import Anchors, Skin
+from beam_warp.step_graphs import StepGraphs
+from beam_warp.view_targets import LossWeights, TargetSet
+
+
+@dataclass(frozen=True)
+class JointPose:
+    """Poses of all joints.
+
+    Attributes:
+        rotations: Against the frame before, quaternions xyzw, ``(M, 4)`` float32.
+        positions: ``(M, 3)`` float32 [m].
+    """
+
+    rotations: NDArray[np.float32]
+    positions: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions:
+    """How joints are moved.
+
+    Attributes:
+        levels: Reductions of the images, coarse to fine: the coarser, the further a motion is found.
+        iterations: Steps at each of them.
+        weights: What the images' terms count.
+        rigidity: What motion that is not rigid around each joint counts (E_smooth).
+        rotation_rate: Size of steps of quaternions.
+        position_rate: Size of steps, in distances between joints.
+        final_rate: Part of both that is left at the end.
+        blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
+    """
+
+    levels: tuple[int, ...] = (4, 2, 1)
+    iterations: tuple[int, ...] = (100, 100, 200)
+    weights: LossWeights = field(default_factory=lambda: LossWeights(alpha=1.0))
+    rigidity: float = 0.05
+    rotation_rate: float = 1e-2
+    position_rate: float = 5e-2
+    final_rate: float = 0.1
+    blend: str = "linear"
+
+
+class JointTracker:
+    """Joints, the Gaussians that they carry from the frame before, and the photographs of this one."""
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        anchors: Anchors,
+        graph: JointGraph,
+        joints: NDArray[np.float32],
+        options: JointOptions,
+        raster: RasterOptions,
+        device: Any,
+    ) -> None:
+        """Bring the frame before to a device.
+
+        Args:
+            cloud: Its Gaussians.
+            anchors: Of the Gaussians to the joints.
+            graph: Of the joints.
+            joints: Where they were, ``(M, 3)``.
+            options: See `JointOptions`.
+            raster: How splats are drawn.
+            device: Warp device.
+        """
+        self.device = device
+        self._options = options
+        self._raster = raster
+        count = len(joints)
+        self._count = len(cloud)
+        self._spacing = graph.spacing
+        self._skin = Skin(cloud.positions, cloud.orientations, anchors, joints, blend=options.blend, device=device)
+        self._rigidity = RigidityLoss(graph, device=device)
+        at_rest = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (count, 1))
+        self._rest_rotations = upload(at_rest, wp.quat, device)
+        self._rest_positions = upload(joints.astype(np.float32), wp.vec3, device)
+        self._rotations = wp.clone(self._rest_rotations)
+        self._positions = wp.clone(self._rest_positions)
+        self._rotation_gradients = wp.zeros(count, dtype=wp.quat, device=device)
+        self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
+        self._drawn = GaussianArrays(
+            wp.clone(self._skin.rest_positions),
+            wp.clone(self._skin.rest_orientations),
+            upload(cloud.scales, wp.vec3, device),
+            upload(cloud.opacities, float, device),
+            None,
+            upload(cloud.radiance, wp.vec3, device),  # type: ignore[arg-type]
+        )
+
+    def find(self, views: Sequence[CapturedView], start: JointPose, samples: int, seed: int) -> JointPose:
+        """Move the joints until what they carry looks like the views.
+
+        Args:
+            views: The photographs.
+            start: Poses to begin with.
+            samples: Side of the square of samples of a pixel at full resolution.
+            seed: Of the order of views.
+        """
+        chosen = self._options
+        wp.copy(self._rotations, upload(start.rotations, wp.quat, self.device))
+        wp.copy(self._positions, upload(start.positions, wp.vec3, self.device))
+        total = sum(chosen.iterations)
+        rng = np.random.default_rng(seed)
+        rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
+        done = 0
+        for level, iterations in zip(chosen.levels, chosen.iterations, strict=True):
+            reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
+            targets = TargetSet(reduced, self._count, self._raster, samples if level == 1 else 1, self.device)
+            adam = Adam(
+                {
+                    "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),
+                    "positions": Parameters(self._positions, self._position_gradients, rates["positions"]),
+                }
+            )
+            graphs = StepGraphs(self.device)
+            self._carry()
+            targets.make_room(self._drawn)
+            rounds = -(-iterations // len(targets))
+            order = np.concatenate([rng.permutation(len(targets)) for _ in range(max(rounds, 1))])
+            for iteration in range(iterations):
+                for name, rate in rates.items():
+                    adam.set_learning_rate(name, rate * chosen.final_rate ** ((done + iteration) / total))
+                view = int(order[iteration])
+                graphs.run(view, lambda view=view, targets=targets, adam=adam: self._step(targets, view, adam))
+            done += iterations
+        rotations = self._rotations.numpy().astype(np.float64)
+        rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
+        return JointPose(rotations.astype(np.float32), self._positions.numpy())
+
+    def carried(self, cloud: GaussianCloud) -> GaussianCloud:
+        """Return a cloud where the joints carry it now."""
+        self._carry()
+        orientations = self._drawn.orientations.numpy().astype(np.float64)
+        orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
+        return cloud.with_arrays(positions=self._drawn.positions.numpy(), orientations=orientations.astype(np.float32))
+
+    def _carry(self) -> None:
+        self._skin.warp(self._rotations, self._positions, self._drawn.positions, self._drawn.orientations)
+
+    def _step(self, targets: TargetSet, view: int, adam: Adam) -> None:
+        """Draw a view, compare, and move the joints."""
+        group, index = targets[view]
+        self._carry()
+        group.select(index)
+        group.rasterizer.redraw()
+        group.add_losses(index, self._options.weights)
+        drawn = group.rasterizer.backward()
+        self._rotation_gradients.zero_()
+        self._position_gradients.zero_()
+        self._skin.add_gradients(
+            self._rotations,
+            self._positions,
+            drawn.positions,
+            drawn.orientations,
+            self._rotation_gradients,
+            self._position_gradients,
+        )
+        self._rigidity(
+            self._rotations,
+            self._positions,
+            self._rest_rotations,
+            self._rest_positions,
+            weight=self._options.rigidity,
+            rotation_gradients=self._rotation_gradients,
+            position_gradients=self._position_gradients,
+        )
+        adam.step()

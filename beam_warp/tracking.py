@@ -1,0 +1,267 @@
+"""From one frame to the next: joints find the coarse motion, the Gaussians that they carry the rest.
+
+A track keeps identities: row i is the same Gaussian in all of its frames. Where the photographs can no longer be met so
+- too much worse than in the key frame, a part of the subject that nothing covers, joints torn apart - it says that it
+is lost, and why: then a new key frame begins a new track.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, GaussianCloud
+from beam_warp.captured_views import CapturedView
+from beam_warp.devices import resolve_device
+from beam_warp.gaussian_fitting import FIT_RASTER, FitOptions, FitProgress, Fitter, LearningRates, no_fit_progress
+from beam_warp.joint_graph import JointGraph, stretch
+from beam_warp.joint_selection import select_joints
+from beam_warp.joint_tracking import JointOptions, JointPose, JointTracker
+from beam_warp.raster_records import RasterOptions
+from beam_warp.rasterizing import upload_gaussians
+from beam_warp.skinning import Anchors
+from beam_warp.view_targets import TargetSet, sample_side
+
+GAUSSIANS_PER_JOINT = 25
+"""A joint for so many Gaussians, within the limits below."""
+
+JOINT_LIMITS = (60, 4_000)
+
+SMALLEST_COSINE = 0.2
+"""Of the normals of neighbours on a body: two limbs in contact are not one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """How a frame follows from the one before.
+
+    Attributes:
+        joint_count: Joints; None for one for every `GAUSSIANS_PER_JOINT` Gaussians.
+        joints: How they are moved.
+        refinement: How the Gaussians that they carried are fitted; counts and refinements are not used.
+        largest_drop: PSNR may be so much below the key frame's [dB].
+        largest_gap: Connected part of the subject that may stay uncovered in a view, beyond the key frame's.
+        largest_tear: Part of the joints that may be torn from a neighbour.
+    """
+
+    joint_count: int | None = None
+    joints: JointOptions = field(default_factory=JointOptions)
+    refinement: FitOptions = field(
+        default_factory=lambda: FitOptions(
+            color_iterations=0,
+            normal_iterations=400,
+            rates=LearningRates(1e-4, 1e-5, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4),
+            temporal=1e-3,
+        )
+    )
+    raster: RasterOptions = FIT_RASTER
+    largest_drop: float = 6.0
+    largest_gap: float = 0.03
+    largest_tear: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What the next frame needs of this one.
+
+    Attributes:
+        cloud: This frame's Gaussians; row i is the same one in every frame of the track.
+        anchors: Of the Gaussians to the joints, from the key frame.
+        graph: Of the joints, from the key frame.
+        key_joints: Where the joints were in the key frame, ``(M, 3)`` float32 [m].
+        joints: Where they are, ``(M, 3)``.
+        previous_joints: Where they were a frame before; where they are in a key frame.
+        turns: How they turned since then, quaternions xyzw, ``(M, 4)``.
+        baseline: PSNR [dB] and largest gap in the key frame, ``(2,)`` float64.
+    """
+
+    cloud: GaussianCloud
+    anchors: Anchors
+    graph: JointGraph
+    key_joints: NDArray[np.float32]
+    joints: NDArray[np.float32]
+    previous_joints: NDArray[np.float32]
+    turns: NDArray[np.float32]
+    baseline: NDArray[np.float64]
+
+    OWN = ("key_joints", "joints", "previous_joints", "turns", "baseline")
+    ANCHORS = ("joints", "weights")
+    GRAPH = ("neighbors", "weights", "incoming", "incoming_starts")
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything as arrays by name, from which `from_arrays` makes the same track."""
+        return {
+            **self.cloud.arrays(),
+            **{f"track_{name}": getattr(self, name) for name in self.OWN},
+            **{f"anchor_{name}": getattr(self.anchors, name) for name in self.ANCHORS},
+            **{f"graph_{name}": getattr(self.graph, name) for name in self.GRAPH},
+            "graph_spacing": np.array(self.graph.spacing),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Track:
+        """Return the track of which these are `arrays`."""
+        return cls(
+            GaussianCloud(
+                **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
+                radiance_color_space=LINEAR_REC709,
+            ),
+            Anchors(*(arrays[f"anchor_{name}"] for name in cls.ANCHORS)),
+            JointGraph(*(arrays[f"graph_{name}"] for name in cls.GRAPH), float(arrays["graph_spacing"])),
+            *(arrays[f"track_{name}"] for name in cls.OWN),
+        )
+
+
+def begin_track(
+    cloud: GaussianCloud, views: Sequence[CapturedView], options: TrackOptions, *, device: str | None = None
+) -> Track:
+    """Choose joints in a key frame, and anchor its Gaussians to them.
+
+    Args:
+        cloud: What was fitted to the key frame, with scene-linear radiance and ids.
+        views: Its photographs.
+        options: See `TrackOptions`.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+
+    Source: Jiang et al. 2024, DualGS; `docs/tracking.md` lists what differs.
+    """
+    count = options.joint_count or int(np.clip(len(cloud) // GAUSSIANS_PER_JOINT, *JOINT_LIMITS))
+    rows = select_joints(cloud.positions, min(count, len(cloud)), opacities=cloud.opacities)
+    normals = outward_normals(cloud, views)
+    joints = cloud.positions[rows]
+    graph = JointGraph.build(joints, normals=normals[rows], smallest_cosine=SMALLEST_COSINE)
+    anchors = Anchors.fit(
+        cloud.positions,
+        joints,
+        normals=normals,
+        joint_normals=normals[rows],
+        smallest_cosine=SMALLEST_COSINE,
+    )
+    psnr, gaps = _measure(cloud, views, options, device)
+    still = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (len(joints), 1))
+    return Track(cloud, anchors, graph, joints, joints, joints, still, np.array([psnr.mean(), gaps.max()]))
+
+
+def advance_track(
+    track: Track,
+    views: Sequence[CapturedView],
+    options: TrackOptions,
+    *,
+    device: str | None = None,
+    progress: FitProgress = no_fit_progress,
+) -> tuple[Track, dict[str, Any]]:
+    """Find the Gaussians of the next frame.
+
+    Args:
+        track: Of the frame before.
+        views: The photographs of the frame.
+        options: As the track began.
+        device: As the track began.
+        progress: Called with (done, total, facts).
+
+    Returns:
+        The track of the frame, and a report, JSON-able: ``psnr`` of the training views' crops [dB], ``gap``,
+        ``torn``, ``gaussians``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
+    """
+    began = time.perf_counter()
+    target = resolve_device(device)
+    chosen = options.refinement
+    samples = chosen.samples if chosen.samples != "auto" else _samples(track.cloud, views)
+    tracker = JointTracker(
+        track.cloud, track.anchors, track.graph, track.joints, options.joints, options.raster, target
+    )
+    pose = tracker.find(views, _expected(track), samples, chosen.seed)
+    carried = tracker.carried(track.cloud)
+    refinement = replace(
+        chosen,
+        gaussian_count=len(carried),
+        refine_every=0,
+        samples=samples,
+        raster=options.raster,
+        sampling_filter=False,  # it is in the scales already
+    )
+    fitter = Fitter(views, carried, refinement, target)
+    fitter.run(progress)
+    cloud = fitter.parameters.cloud().with_arrays(ids=track.cloud.ids)
+    psnr, gaps = fitter.measure()
+    torn = stretch(track.graph, track.key_joints, pose.positions).torn
+    following = replace(track, cloud=cloud, joints=pose.positions, previous_joints=track.joints, turns=pose.rotations)
+    report = {
+        "psnr": float(psnr.mean()),
+        "view_psnr": float(psnr.min()),
+        "gap": float(gaps.max()),
+        "torn": float(torn),
+        "gaussians": len(cloud),
+        "lost": _why_lost(track, float(psnr.mean()), gaps, torn, views, options),
+        "seconds": time.perf_counter() - began,
+    }
+    return following, report
+
+
+def outward_normals(cloud: GaussianCloud, views: Sequence[CapturedView]) -> NDArray[np.float32]:
+    """Return the thin axes of Gaussians, turned towards the cameras that can see them, ``(N, 3)``; 0 for balls.
+
+    A camera sees a Gaussian from the front if the photograph's subject is there; of all cameras, the mean direction to
+    them weighted by how squarely they face the disc decides the sign, unless the fit's own orientation is clear: local
+    z points outward where a hull began it, and steps turn it little.
+    """
+    axes = Rotation.from_quat(cloud.orientations).as_matrix()
+    thin = cloud.scales.argmin(axis=1)
+    picked = np.arange(len(cloud))
+    normals = axes[picked, :, thin]
+    outward = axes[:, :, 2]
+    along = (normals * outward).sum(axis=1)
+    normals *= np.where(along < 0.0, -1.0, 1.0)[:, None]
+    flat = np.sort(cloud.scales, axis=1)
+    normals[flat[:, 0] > 0.5 * flat[:, 1]] = 0.0
+    normals[thin != 2] = 0.0  # which side is out is not known
+    return normals.astype(np.float32)
+
+
+def _expected(track: Track) -> JointPose:
+    """Return where joints will be if they go on as they went: turned once more by their last turn."""
+    return JointPose(track.turns, 2.0 * track.joints - track.previous_joints)
+
+
+def _samples(cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
+    """Return the samples that a fit of these Gaussians takes."""
+    spacing = float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / 0.7
+    return sample_side(views, np.median(cloud.positions, axis=0), spacing)
+
+
+def _measure(
+    cloud: GaussianCloud, views: Sequence[CapturedView], options: TrackOptions, device: str | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return PSNR and gaps of a cloud in views."""
+    target = resolve_device(device)
+    chosen = options.refinement.samples
+    samples = chosen if chosen != "auto" else _samples(cloud, views)
+    targets = TargetSet(views, len(cloud), options.raster, samples, target)
+    return targets.measure(upload_gaussians(cloud, target, radiance=cloud.radiance))
+
+
+def _why_lost(
+    track: Track,
+    psnr: float,
+    gaps: NDArray[np.float64],
+    torn: float,
+    views: Sequence[CapturedView],
+    options: TrackOptions,
+) -> str:
+    """Return why a frame is not the same subject moved on, or nothing."""
+    before, gap = track.baseline
+    reasons = []
+    if not psnr >= before - options.largest_drop:
+        reasons.append(f"PSNR fell from {before:.1f} dB in the key frame to {psnr:.1f} dB")
+    if not gaps.max() <= gap + options.largest_gap:
+        name = views[int(gaps.argmax())].name
+        reasons.append(f"{100.0 * gaps.max():.0f} % of the subject are not covered in {name}")
+    if not torn <= options.largest_tear:
+        reasons.append(f"{100.0 * torn:.0f} % of the joints are torn from a neighbour")
+    return "; ".join(reasons)
