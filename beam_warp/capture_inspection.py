@@ -6,8 +6,10 @@ each at a fraction of its resolution: how many is in the report.
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +32,13 @@ SPLIT = "train"
 
 MAX_IMAGES = 96
 """Images read by default."""
+
+QUICK_IMAGES = 48
+"""Images read by default where reconstruction waits for it."""
+
+MAX_READERS = 8
+PIXELS_AT_A_TIME = 2**24
+"""Images of so many pixels in all are read at a time, a thread each: a pixel takes up to 100 bytes meanwhile."""
 
 MAX_HEADERS = 8192
 """Files whose presence and size are looked at; of more, evenly many are."""
@@ -103,7 +112,7 @@ class Readiness:
     fallbacks: tuple[Finding, ...]
 
 
-def require_reconstructable(capture: Capture, *, max_images: int = MAX_IMAGES) -> Readiness:
+def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES) -> Readiness:
     """Refuse a capture from which nothing can be reconstructed, and say what is done without in one that can be.
 
     Args:
@@ -156,22 +165,21 @@ def inspect_capture(
     left_out |= _judge_files(capture, findings)
     chosen = [record for record in _sample(capture, max_images) if record.name not in left_out]
     glimpses, damaged = [], []
-    for index, record in enumerate(chosen):
-        progress("images", index, len(chosen))
-        try:
-            glimpses.append(glimpse_of(record))
-        except BeamError as error:
-            damaged.append((record, error))
-    progress("images", len(chosen), len(chosen))
+    with ThreadPoolExecutor(_reader_count(chosen)) as readers:
+        for index, found in enumerate(readers.map(_glimpse_or_error, chosen)):
+            progress("images", index + 1, len(chosen))
+            if isinstance(found, Glimpse):
+                glimpses.append(found)
+            else:
+                damaged.append((chosen[index], found))
     if damaged:
         left_out |= {record.name for record, _ in damaged}
         findings.append(
             Finding(
                 "warning",
                 "damaged-image",
-                f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: {damaged[0][1]}".rstrip(
-                    "."
-                ),
+                f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: "
+                f"{str(damaged[0][1]).removesuffix('.')}",
                 names_of(record.name for record, _ in damaged),
             )
         )
@@ -187,6 +195,19 @@ def inspect_capture(
         up=up_direction(list(rig.values() or cameras.values())),
         left_out=frozenset(left_out & {record.name for record in training}),
     )
+
+
+def _reader_count(records: Sequence[CaptureRecord]) -> int:
+    """Return how many images to read at a time: as there are processors, while they fit into memory."""
+    largest = max((record.camera.width * record.camera.height for record in records), default=1)
+    return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_A_TIME // largest))
+
+
+def _glimpse_or_error(record: CaptureRecord) -> Glimpse | BeamError:
+    try:
+        return glimpse_of(record)
+    except BeamError as error:
+        return error
 
 
 def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
