@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from beam_warp.camera_rigs import frustum_volume, likely_mistake, seen_by, up_direction
 from beam_warp.cameras import Camera
-from beam_warp.capture_findings import Finding, count_of, names_of
+from beam_warp.capture_findings import Finding, are, count_of, names_of
 from beam_warp.errors import InvalidOptionError
 
 MIN_CAMERAS = 2
@@ -116,7 +116,8 @@ def judge_cameras(
             Finding(
                 "warning",
                 "sees-nothing",
-                f"{count_of(len(blind), 'camera')} of {len(rig)} see nothing of what most see, and are left out",
+                f"{count_of(len(blind), 'camera')} of {len(rig)} {'sees' if len(blind) == 1 else 'see'} nothing of "
+                f"what most see, and {are(blind)} left out",
                 names_of(sorted(blind)),
                 "Correct their poses, or take them out.",
             )

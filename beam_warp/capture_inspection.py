@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -210,6 +211,11 @@ def _glimpse_or_error(record: CaptureRecord) -> Glimpse | BeamError:
         return error
 
 
+def _below(folder: Path, path: Path | None) -> str:
+    """Show a path as the capture names it."""
+    return str(path.relative_to(folder) if path is not None and path.is_relative_to(folder) else path)
+
+
 def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
     """Find files that are missing or of another size; return the names of records that cannot be read."""
     step = -(-len(capture.records) // MAX_HEADERS)
@@ -241,7 +247,7 @@ def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
                 "error" if len(missing) * step >= len(capture.records) else "warning",
                 "missing-image",
                 f"{count_of(len(missing), 'image')} of {len(capture.records)} {are(missing)} missing and left out: "
-                f"{missing[0].image_path}",
+                f"{_below(capture.folder, missing[0].image_path)}",
                 names_of(record.name for record in missing),
                 "Copy them there, or take the records out.",
             )
@@ -251,7 +257,8 @@ def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
             Finding(
                 "warning",
                 "missing-mask",
-                f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: {masks[0].mask_path}",
+                f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: "
+                f"{_below(capture.folder, masks[0].mask_path)}",
                 names_of(record.name for record in masks),
                 "Copy them there.",
             )
