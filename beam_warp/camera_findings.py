@@ -97,13 +97,13 @@ def judge_cameras(
     _judge_up(cameras, findings)
     try:
         volume = frustum_volume(cameras)
-    except InvalidOptionError as error:
+    except InvalidOptionError:
         findings.append(
             Finding(
                 "error",
                 "no-overlap",
                 "the cameras have no volume in common",
-                remedy=f"{error}".split("see. ")[-1],
+                remedy="Check the poses: their axes, their units, and that they are camera-to-world.",
             )
         )
         return None, set()

@@ -10,7 +10,7 @@ import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -133,9 +133,7 @@ def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES)
         kind = MissingFileError if first.code in ("missing-image", "frame-without-images") else AssetFormatError
         raise kind(f"capture must be fit for reconstruction, got {first.what}{place}. {first.remedy}{more}")
     kept = tuple(record for record in capture.records if record.name not in report.left_out)
-    return Readiness(
-        Capture(**{**vars(capture), "records": kept}), report.volume, (*report.of("warning"), *report.of("note"))
-    )
+    return Readiness(replace(capture, records=kept), report.volume, (*report.of("warning"), *report.of("note")))
 
 
 def inspect_capture(
@@ -324,17 +322,18 @@ def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], finding
                 "They are reconstructed from the cameras that there are.",
             )
         )
-    if numbers := sorted(by_frame):
-        gaps = (
-            sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers[-1] - numbers[0] < 10**6 else []
-        )
+    numbers = np.array(sorted(by_frame))
+    if len(numbers) > 2:
+        step = int(np.diff(numbers).min())  # every second frame of a take is whole in itself
+        count = int(((np.diff(numbers) - 1) // step).sum())
+        gaps = [int(number) for number in numbers[:-1][np.diff(numbers) > step]]
         if gaps:
             findings.append(
                 Finding(
                     "warning",
                     "missing-frames",
-                    f"{count_of(len(gaps), 'frame')} between {numbers[0]} and {numbers[-1]} {are(gaps)} not there",
-                    f"frames {names_of(gaps)}",
+                    f"{count_of(count, 'frame')} between {numbers[0]} and {numbers[-1]} {are(range(count))} not there",
+                    f"after {names_of(gaps)}",
                     "Motion is tracked over the gap.",
                 )
             )

@@ -251,15 +251,23 @@ def test_the_same_pose_twice(tmp_path):
     assert found(tmp_path, "duplicate-pose").where == "c02 = c07"
 
 
-def test_frames_that_lack_cameras_and_gaps(tmp_path):
+def test_frames_that_lack_cameras(tmp_path):
     content = write_sound(tmp_path)
     content["frames"] = [r for r in content["frames"] if (r["camera"], r["frame"]) != ("c04", 1)]
     save(tmp_path, content)
     assert codes(tmp_path) == {"frame-lacks-cameras"}
     assert "frame 1 without c04" in found(tmp_path, "frame-lacks-cameras").what
-    content["frames"] = [r for r in content["frames"] if r["frame"] != 1]
-    save(tmp_path, content)
-    assert codes(tmp_path) == {"missing-frames"}
+
+
+def test_gaps_in_the_frames(tmp_path):
+    content = write_sound(tmp_path, rig(8), frames=5)
+    for numbers, missing in (((0, 2, 4), None), ((0, 1, 4), "2 frames"), ((0, 2, 3), "1 frame "), ((1, 3), None)):
+        save(tmp_path, {**content, "frames": [r for r in content["frames"] if r["frame"] in numbers]})
+        if missing is None:
+            assert codes(tmp_path) == set()
+        else:
+            assert codes(tmp_path) == {"missing-frames"}
+            assert found(tmp_path, "missing-frames").what.startswith(missing)
 
 
 @pytest.mark.parametrize(("count", "code"), [(1, "too-few-cameras"), (4, "few-cameras")])
