@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from beam_warp.camera_rigs import frustum_volume, likely_mistake, seen_by, up_direction
+from beam_warp.camera_rigs import frustum_volume, likely_mistakes, seen_by, up_direction
 from beam_warp.cameras import Camera
 from beam_warp.capture_findings import Finding, are, count_of, names_of
 from beam_warp.errors import InvalidOptionError
@@ -84,14 +84,14 @@ def judge_cameras(
         return None, set()
     cameras = list(rig.values())
     _judge_duplicates(rig, findings)
-    mistake = likely_mistake(cameras)
-    if mistake is not None:
+    mistakes = likely_mistakes(cameras)
+    if mistakes:
         findings.append(
             Finding(
                 "error",
                 "swapped-axes",
                 "the cameras do not look at a common place, and would with their axes changed",
-                remedy=f"Probably {mistake}.",
+                remedy=f"Probably {'; or '.join(mistakes)}.",
             )
         )
     _judge_up(cameras, findings)
@@ -107,7 +107,7 @@ def judge_cameras(
             )
         )
         return None, set()
-    if mistake is not None:
+    if mistakes:
         return volume, set()
     grid = np.stack(np.meshgrid(*np.linspace(*volume, 9).T, indexing="ij"), axis=-1).reshape(-1, 3)
     blind = {name for name, camera in rig.items() if not seen_by(camera, grid).any()}
