@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from beam_warp.camera_rigs import frustum_volume, likely_mistake, seen_by, up_direction
+from beam_warp.camera_rigs import frustum_volume, likely_mistakes, seen_by, up_direction
 from beam_warp.cameras import Camera
-from beam_warp.capture_findings import Finding, count_of, names_of
+from beam_warp.capture_findings import Finding, are, count_of, names_of
 from beam_warp.errors import InvalidOptionError
 
 MIN_CAMERAS = 2
@@ -84,30 +84,30 @@ def judge_cameras(
         return None, set()
     cameras = list(rig.values())
     _judge_duplicates(rig, findings)
-    mistake = likely_mistake(cameras)
-    if mistake is not None:
+    mistakes = likely_mistakes(cameras)
+    if mistakes:
         findings.append(
             Finding(
                 "error",
                 "swapped-axes",
                 "the cameras do not look at a common place, and would with their axes changed",
-                remedy=f"Probably {mistake}.",
+                remedy=f"Probably {'; or '.join(mistakes)}.",
             )
         )
     _judge_up(cameras, findings)
     try:
         volume = frustum_volume(cameras)
-    except InvalidOptionError as error:
+    except InvalidOptionError:
         findings.append(
             Finding(
                 "error",
                 "no-overlap",
                 "the cameras have no volume in common",
-                remedy=f"{error}".split("see. ")[-1],
+                remedy="Check the poses: their axes, their units, and that they are camera-to-world.",
             )
         )
         return None, set()
-    if mistake is not None:
+    if mistakes:
         return volume, set()
     grid = np.stack(np.meshgrid(*np.linspace(*volume, 9).T, indexing="ij"), axis=-1).reshape(-1, 3)
     blind = {name for name, camera in rig.items() if not seen_by(camera, grid).any()}
@@ -116,7 +116,8 @@ def judge_cameras(
             Finding(
                 "warning",
                 "sees-nothing",
-                f"{count_of(len(blind), 'camera')} of {len(rig)} see nothing of what most see, and are left out",
+                f"{count_of(len(blind), 'camera')} of {len(rig)} {'sees' if len(blind) == 1 else 'see'} nothing of "
+                f"what most see, and {are(blind)} left out",
                 names_of(sorted(blind)),
                 "Correct their poses, or take them out.",
             )

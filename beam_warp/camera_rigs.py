@@ -164,6 +164,12 @@ def facing_share(cameras: Sequence[Camera], poses: NDArray[np.float64] | None = 
     return facing / len(cameras)
 
 
+NO_UP, ONE_UP = 0.3, 0.7
+"""Length of the mean upward direction below which cameras have no up in common, and above which they do."""
+
+UP_MARGIN = 0.2
+"""Mistakes whose cameras agree on up, and on z as up, within this are not told apart."""
+
 POSE_MISTAKES = {
     "OpenCV poses were given as OpenGL's, or the other way round: negate the second and third column": lambda q: (
         q @ _FLIP
@@ -177,20 +183,38 @@ POSE_MISTAKES = {
 """How poses go wrong that were written as nerfstudio's, and what undoes it from what was then read."""
 
 
-def likely_mistake(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: float = 0.8) -> str | None:
-    """Return which mistake in writing the poses, if undone, makes the cameras look at a common place; None if none.
+def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: float = 0.8) -> tuple[str, ...]:
+    """Return which mistakes in writing the poses, if undone, make the cameras look at a common place.
+
+    Poses are doubted whose cameras do not face one, or do with no up in common where those of a mistake undone have
+    one: the inverses of poses around a subject look at a common place too, rolled in all ways.
 
     Args:
         cameras: At least three, or nothing can be said.
         doubt: Cameras of which this share or more face a common place are right as they are.
         trust: Share that must face one once the mistake is undone.
+
+    Returns:
+        The likeliest first, by how far the cameras agree on up; others follow if they agree nearly as well. Empty if
+        the poses are not doubted, or no mistake is known that explains them.
     """
     if len(cameras) < 3:
-        return None
-    share = facing_share(cameras)
-    if share is None or share >= doubt:
-        return None
+        return ()
     poses = np.array([camera.camera_to_world for camera in cameras])
-    shares = {name: facing_share(cameras, undo(poses)) or 0.0 for name, undo in POSE_MISTAKES.items()}
-    best = max(shares, key=lambda name: shares[name])
-    return best if shares[best] >= trust else None
+    share = facing_share(cameras)
+    if share is None:
+        return ()
+    undone = {name: undo(poses) for name, undo in POSE_MISTAKES.items()}
+    agreed = {name: _up_length(q) for name, q in undone.items() if (facing_share(cameras, q) or 0.0) >= trust}
+    if share >= doubt:
+        if _up_length(poses) >= NO_UP:
+            return ()
+        agreed = {name: length for name, length in agreed.items() if length >= ONE_UP}
+    # Turning the world changes nothing that cameras tell of each other: of such twins, the one with z up is meant.
+    likely = {name: length - 0.5 * float(undone[name][:, 2, 1].mean()) for name, length in agreed.items()}
+    best = max(likely.values(), default=0.0)
+    return tuple(sorted((name for name in likely if likely[name] >= best - UP_MARGIN), key=lambda name: -likely[name]))
+
+
+def _up_length(poses: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(poses[:, :3, 1].mean(axis=0)))

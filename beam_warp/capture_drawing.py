@@ -127,7 +127,7 @@ def _shown_points(report: CaptureReport) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def shown_glimpses(report: CaptureReport) -> list[Glimpse]:
-    """Return the images to show: those of the first frame that was looked at, evenly many."""
+    """Return the images to show, of the first frame that was looked at: what is left out, and evenly many others."""
     if not report.glimpses:
         return []
     first = min(glimpse.record.frame for glimpse in report.glimpses)
@@ -135,8 +135,10 @@ def shown_glimpses(report: CaptureReport) -> list[Glimpse]:
         (glimpse for glimpse in report.glimpses if glimpse.record.frame == first),
         key=lambda glimpse: (glimpse.record.split != SPLIT, glimpse.record.camera_name),
     )
-    places = sorted({round(p) for p in np.linspace(0, len(found) - 1, min(len(found), SHOWN_GLIMPSES))})
-    return [found[place] for place in places]
+    bad = [place for place, glimpse in enumerate(found) if glimpse.record.name in report.left_out][:SHOWN_GLIMPSES]
+    rest = [place for place in range(len(found)) if place not in bad]
+    even = np.linspace(0, len(rest) - 1, min(len(rest), SHOWN_GLIMPSES - len(bad)))
+    return [found[place] for place in sorted({*bad, *(rest[round(p)] for p in even)})]
 
 
 def display_pixels(glimpse: Glimpse) -> NDArray[np.uint8]:

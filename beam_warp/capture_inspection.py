@@ -6,9 +6,12 @@ each at a fraction of its resolution: how many is in the report.
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +33,13 @@ SPLIT = "train"
 
 MAX_IMAGES = 96
 """Images read by default."""
+
+QUICK_IMAGES = 48
+"""Images read by default where reconstruction waits for it."""
+
+MAX_READERS = 8
+PIXELS_AT_A_TIME = 2**24
+"""Images of so many pixels in all are read at a time, a thread each: a pixel takes up to 100 bytes meanwhile."""
 
 MAX_HEADERS = 8192
 """Files whose presence and size are looked at; of more, evenly many are."""
@@ -103,7 +113,7 @@ class Readiness:
     fallbacks: tuple[Finding, ...]
 
 
-def require_reconstructable(capture: Capture, *, max_images: int = MAX_IMAGES) -> Readiness:
+def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES) -> Readiness:
     """Refuse a capture from which nothing can be reconstructed, and say what is done without in one that can be.
 
     Args:
@@ -123,9 +133,7 @@ def require_reconstructable(capture: Capture, *, max_images: int = MAX_IMAGES) -
         kind = MissingFileError if first.code in ("missing-image", "frame-without-images") else AssetFormatError
         raise kind(f"capture must be fit for reconstruction, got {first.what}{place}. {first.remedy}{more}")
     kept = tuple(record for record in capture.records if record.name not in report.left_out)
-    return Readiness(
-        Capture(**{**vars(capture), "records": kept}), report.volume, (*report.of("warning"), *report.of("note"))
-    )
+    return Readiness(replace(capture, records=kept), report.volume, (*report.of("warning"), *report.of("note")))
 
 
 def inspect_capture(
@@ -156,22 +164,21 @@ def inspect_capture(
     left_out |= _judge_files(capture, findings)
     chosen = [record for record in _sample(capture, max_images) if record.name not in left_out]
     glimpses, damaged = [], []
-    for index, record in enumerate(chosen):
-        progress("images", index, len(chosen))
-        try:
-            glimpses.append(glimpse_of(record))
-        except BeamError as error:
-            damaged.append((record, error))
-    progress("images", len(chosen), len(chosen))
+    with ThreadPoolExecutor(_reader_count(chosen)) as readers:
+        for index, found in enumerate(readers.map(_glimpse_or_error, chosen)):
+            progress("images", index + 1, len(chosen))
+            if isinstance(found, Glimpse):
+                glimpses.append(found)
+            else:
+                damaged.append((chosen[index], found))
     if damaged:
         left_out |= {record.name for record, _ in damaged}
         findings.append(
             Finding(
                 "warning",
                 "damaged-image",
-                f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: {damaged[0][1]}".rstrip(
-                    "."
-                ),
+                f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: "
+                f"{str(damaged[0][1]).removesuffix('.')}",
                 names_of(record.name for record, _ in damaged),
             )
         )
@@ -187,6 +194,24 @@ def inspect_capture(
         up=up_direction(list(rig.values() or cameras.values())),
         left_out=frozenset(left_out & {record.name for record in training}),
     )
+
+
+def _reader_count(records: Sequence[CaptureRecord]) -> int:
+    """Return how many images to read at a time: as there are processors, while they fit into memory."""
+    largest = max((record.camera.width * record.camera.height for record in records), default=1)
+    return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_A_TIME // largest))
+
+
+def _glimpse_or_error(record: CaptureRecord) -> Glimpse | BeamError:
+    try:
+        return glimpse_of(record)
+    except BeamError as error:
+        return error
+
+
+def _below(folder: Path, path: Path | None) -> str:
+    """Show a path as the capture names it."""
+    return str(path.relative_to(folder) if path is not None and path.is_relative_to(folder) else path)
 
 
 def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
@@ -220,7 +245,7 @@ def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
                 "error" if len(missing) * step >= len(capture.records) else "warning",
                 "missing-image",
                 f"{count_of(len(missing), 'image')} of {len(capture.records)} {are(missing)} missing and left out: "
-                f"{missing[0].image_path}",
+                f"{_below(capture.folder, missing[0].image_path)}",
                 names_of(record.name for record in missing),
                 "Copy them there, or take the records out.",
             )
@@ -230,7 +255,8 @@ def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
             Finding(
                 "warning",
                 "missing-mask",
-                f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: {masks[0].mask_path}",
+                f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: "
+                f"{_below(capture.folder, masks[0].mask_path)}",
                 names_of(record.name for record in masks),
                 "Copy them there.",
             )
@@ -296,17 +322,18 @@ def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], finding
                 "They are reconstructed from the cameras that there are.",
             )
         )
-    if numbers := sorted(by_frame):
-        gaps = (
-            sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers[-1] - numbers[0] < 10**6 else []
-        )
+    numbers = np.array(sorted(by_frame))
+    if len(numbers) > 2:
+        step = int(np.diff(numbers).min())  # every second frame of a take is whole in itself
+        count = int(((np.diff(numbers) - 1) // step).sum())
+        gaps = [int(number) for number in numbers[:-1][np.diff(numbers) > step]]
         if gaps:
             findings.append(
                 Finding(
                     "warning",
                     "missing-frames",
-                    f"{count_of(len(gaps), 'frame')} between {numbers[0]} and {numbers[-1]} {are(gaps)} not there",
-                    f"frames {names_of(gaps)}",
+                    f"{count_of(count, 'frame')} between {numbers[0]} and {numbers[-1]} {are(range(count))} not there",
+                    f"after {names_of(gaps)}",
                     "Motion is tracked over the gap.",
                 )
             )

@@ -110,8 +110,8 @@ def _outlined(glimpse: Glimpse) -> NDArray[np.uint8]:
     """Return an image with the outline of its mask drawn in, of one pixel at twice the size."""
     pixels = np.repeat(np.repeat(display_pixels(glimpse), 2, axis=0), 2, axis=1)
     if glimpse.alpha is not None:
-        inside = ndimage.zoom(glimpse.alpha, 2, order=1, grid_mode=True, mode="nearest") > 0.5
-        edge = inside ^ ndimage.binary_erosion(inside, border_value=1)
+        inside = np.asarray(ndimage.zoom(glimpse.alpha, 2, order=1, grid_mode=True, mode="nearest")) > 0.5
+        edge = inside & ~np.asarray(ndimage.binary_erosion(inside, border_value=1), bool)
         pixels[edge] = [int(OUTLINE[k : k + 2], 16) for k in (1, 3, 5)]
     return pixels
 

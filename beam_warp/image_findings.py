@@ -46,7 +46,7 @@ class Glimpse:
         alpha: Coverage, ``(H, W)`` float32; None where it is not known.
         brightest: Largest value of a colour channel.
         exposure: Median luminance of the subject, or of all where coverage is not known, as a power of two; None for
-            an image without a subject.
+            an image without a subject, or a black one.
         coverage: Mean alpha; None where it is not known.
     """
 
@@ -72,12 +72,13 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
         color = np.divide(color, alpha[..., None], out=np.zeros_like(color), where=alpha[..., None] > 1e-6)
     subject = np.ones(color.shape[:2], bool) if alpha is None else alpha > SOLID
     luminance = (color @ np.array(LUMINANCE, np.float32))[subject]
+    level = float(np.median(luminance)) if len(luminance) else 0.0
     return Glimpse(
         record=record,
         pixels=display_image(np.clip(color, 0.0, 1.0)),
         alpha=alpha,
         brightest=float(view.color.max()),
-        exposure=float(np.log2(max(float(np.median(luminance)), 1e-9))) if len(luminance) else None,
+        exposure=float(np.log2(level)) if level > 0.0 else None,
         coverage=None if alpha is None else float(alpha.mean()),
     )
 

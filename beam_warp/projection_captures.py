@@ -103,7 +103,7 @@ def decompose(matrix: NDArray[np.float64]) -> Decomposition:
             f"matrix must not be singular, got singular values {spread[0]:.3g} to {spread[2]:.3g}. Export it again: "
             "a pinhole at a finite place has none such."
         )
-    position = -np.linalg.solve(left, matrix[:, 3])
+    position = -np.asarray(np.linalg.solve(left, matrix[:, 3]), np.float64)
     negated = bool(np.linalg.det(left / sizes) < 0.0)
     # RQ by QR of the matrix turned upside down and transposed.
     q, r = np.linalg.qr((-left if negated else left)[::-1].T)

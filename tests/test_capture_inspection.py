@@ -1,12 +1,13 @@
 """Inspection: every fault that is put into a sound capture is found, by its code, and nothing in a sound one."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sound_capture import CAMERAS, FLIP, FRAMES, HEIGHT, TARGET, WIDTH, rewrite, rig, save, write_sound
 
-from beam_warp.camera_rigs import MIN_SPREAD, facing_share, frustum_volume, likely_mistake, meeting_point, seen_by
+from beam_warp.camera_rigs import MIN_SPREAD, facing_share, frustum_volume, likely_mistakes, meeting_point, seen_by
 from beam_warp.cameras import Camera
 from beam_warp.capture_inspection import inspect_capture, require_reconstructable
 from beam_warp.captures import Capture
@@ -251,15 +252,23 @@ def test_the_same_pose_twice(tmp_path):
     assert found(tmp_path, "duplicate-pose").where == "c02 = c07"
 
 
-def test_frames_that_lack_cameras_and_gaps(tmp_path):
+def test_frames_that_lack_cameras(tmp_path):
     content = write_sound(tmp_path)
     content["frames"] = [r for r in content["frames"] if (r["camera"], r["frame"]) != ("c04", 1)]
     save(tmp_path, content)
     assert codes(tmp_path) == {"frame-lacks-cameras"}
     assert "frame 1 without c04" in found(tmp_path, "frame-lacks-cameras").what
-    content["frames"] = [r for r in content["frames"] if r["frame"] != 1]
-    save(tmp_path, content)
-    assert codes(tmp_path) == {"missing-frames"}
+
+
+def test_gaps_in_the_frames(tmp_path):
+    content = write_sound(tmp_path, rig(8), frames=5)
+    for numbers, missing in (((0, 2, 4), None), ((0, 1, 4), "2 frames"), ((0, 2, 3), "1 frame "), ((1, 3), None)):
+        save(tmp_path, {**content, "frames": [r for r in content["frames"] if r["frame"] in numbers]})
+        if missing is None:
+            assert codes(tmp_path) == set()
+        else:
+            assert codes(tmp_path) == {"missing-frames"}
+            assert found(tmp_path, "missing-frames").what.startswith(missing)
 
 
 @pytest.mark.parametrize(("count", "code"), [(1, "too-few-cameras"), (4, "few-cameras")])
@@ -290,7 +299,7 @@ def test_axes_meet_at_the_target_despite_strays():
     poses = np.array([camera.camera_to_world for camera in cameras])
     np.testing.assert_allclose(meeting_point(poses), TARGET, atol=1e-9)
     assert facing_share(cameras) == 1.0
-    assert likely_mistake(cameras) is None
+    assert likely_mistakes(cameras) == ()
     poses[3, :3, 3] += (5.0, 1.0, -2.0)
     np.testing.assert_allclose(meeting_point(poses), TARGET, atol=1e-2)  # its weight is 1e-3 of the others'
     parallel = np.tile(np.eye(4), (4, 1, 1))
@@ -303,6 +312,22 @@ def test_axes_meet_at_the_target_despite_strays():
         for pose, angle in zip(two, (-half, half), strict=True):
             pose[:3, 2] = (np.sin(angle), 0.0, np.cos(angle))
         assert (meeting_point(two) is not None) == meets
+
+
+@pytest.mark.parametrize("name", ["walker", "runner"])
+def test_mistakes_in_the_poses_of_the_captures_are_told_apart(data_dir, name):
+    records = Capture.read(data_dir / "captures" / name).select(split="train", frames=[0])
+    cameras = [record.camera for record in records]
+    wrongs = {
+        "OpenCV poses were given as OpenGL's": lambda q: q @ FLIP,
+        "world-to-camera poses in OpenGL axes": lambda q: np.linalg.inv(q @ FLIP) @ FLIP,
+        "world-to-camera poses in OpenCV axes": lambda q: np.linalg.inv(q) @ FLIP,
+        "world-to-camera poses were given": np.linalg.inv,
+    }
+    assert likely_mistakes(cameras) == ()
+    for told, wrong in wrongs.items():
+        changed = [replace(camera, camera_to_world=wrong(camera.camera_to_world)) for camera in cameras]
+        assert [mistake[: len(told)] for mistake in likely_mistakes(changed)] == [told]
 
 
 def test_the_common_volume_is_what_is_seen():
