@@ -135,12 +135,16 @@ def write_capture(
     cameras: Sequence[DomeCamera],
     light: EnvironmentMap,
     *,
+    surfaces: Sequence[tuple[ArrayLike, ArrayLike]] | None = None,
     samples: int = 16,
     device: str | None = None,
     seed: int = 0,
     progress: WriteProgress | None = None,
 ) -> Capture:
-    """Path trace meshes, one a frame, for some cameras and write them as a capture; see `write_demo_capture`."""
+    """Path trace meshes, one a frame, for some cameras and write them as a capture; see `write_demo_capture`.
+
+    ``surfaces`` are vertices and faces to be written as truth, where they are less dense than the meshes.
+    """
     report = progress or _quiet
     total = len(meshes) * len(cameras)
     with replacing_folder(folder) as root:
@@ -151,7 +155,8 @@ def write_capture(
         records = []
         for frame, mesh in enumerate(meshes):
             traced = TracedMesh.from_mesh(mesh, device=device)
-            write_truth_mesh(root / f"truth/mesh_{frame:04d}.npz", mesh.vertices, mesh.faces)
+            surface = (mesh.vertices, mesh.faces) if surfaces is None else surfaces[frame]
+            write_truth_mesh(root / f"truth/mesh_{frame:04d}.npz", *surface)
             for entry in cameras:
                 # A seed of its own for every image: noise that frames share would look like texture.
                 stream = (seed * 1_000_003 + len(records)) % 2**32
