@@ -43,12 +43,13 @@ def textured_meshes(
     color, roughness = texture(rest)
     meshes = []
     for mesh in known:
-        vertices = refined(np.asarray(mesh.vertices, np.float64), plans)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        normals = refined(vertex_normals(vertices, faces), plans)
         meshes.append(
             MaterialMesh(
-                vertices=vertices,
+                vertices=refined(vertices, plans),
                 faces=fine,
-                normals=vertex_normals(vertices, fine),
+                normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
                 base_color=color,
                 roughness=roughness,
             )
@@ -77,14 +78,15 @@ def refined(vertices: FloatArray, plans: Sequence[NDArray[np.int64]]) -> FloatAr
 def texture(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return base colour ``(N, 3)`` and roughness ``(N,)`` at points of the first frame: waves of several lengths."""
     rng = np.random.default_rng(SEED)
-    color = np.zeros((len(points), 3))
-    for length, count in WAVES:
-        for _ in range(count):
-            direction = rng.normal(size=3)
-            direction *= 2.0 * np.pi / length / np.linalg.norm(direction)
-            phase = points @ direction + rng.uniform(0.0, 2.0 * np.pi)
-            color += np.sin(phase)[:, None] * rng.normal(size=3) / np.sqrt(count)
-    color = 0.06 + 0.5 / (1.0 + np.exp(-1.2 * color))
+    count = sum(waves for _, waves in WAVES)
+    directions = rng.normal(size=(3, count))
+    directions *= np.concatenate([np.full(waves, 2.0 * np.pi / length) for length, waves in WAVES]) / np.linalg.norm(
+        directions, axis=0
+    )
+    amplitudes = rng.normal(size=(count, 3)) / np.concatenate([np.full(n, np.sqrt(n)) for _, n in WAVES])[:, None]
+    phases = points.astype(np.float32) @ directions.astype(np.float32)
+    waves = np.sin(phases + rng.uniform(0.0, 2.0 * np.pi, count).astype(np.float32))
+    color = 0.06 + 0.5 / (1.0 + np.exp(-1.2 * (waves @ amplitudes.astype(np.float32))))
     return color, 0.45 + 0.2 * np.sin(points @ (17.0, 9.0, 23.0))
 
 
