@@ -499,9 +499,9 @@ def touching(figure: Figure, frame_count: int) -> list[MaterialMesh]:
 def ball() -> MaterialMesh:
     """Return the object that appears."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=SPHERE_RADIUS)
-    normals: NDArray[np.float64] = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
+    normals: NDArray[np.float32] = (sphere.vertices / SPHERE_RADIUS).astype(np.float32)
     return MaterialMesh(
-        vertices=sphere.vertices + np.asarray(SPHERE_CENTER),
+        vertices=(sphere.vertices + np.asarray(SPHERE_CENTER)).astype(np.float32),
         faces=sphere.faces,
         normals=normals,
         base_color=np.tile(SPHERE_COLOR, (len(normals), 1)),
