@@ -34,6 +34,7 @@ from beam_warp.images import Image
 from beam_warp.material_mesh import MaterialMesh
 
 BLACK_IMAGE = "black-image"
+EMPTY_MASK = "empty-mask"
 MISSING_IMAGE = "missing-image"
 FRAME_LACKS_CAMERAS = "frame-lacks-cameras"
 CAMERA_EXPOSURE = "camera-exposure"
@@ -376,15 +377,25 @@ def _self_contact(at: StressStudio) -> CaptureStress:
 
 @capture_case(
     "black camera",
-    "one black mask empties the visual hull, and black is trained into every Gaussian it sees",
+    "black is trained into every Gaussian that the camera sees",
     "the camera detected and left out",
 )
 def _black_camera(at: StressStudio) -> CaptureStress:
     base = at.base()
     name = _victim(base)
+    return CaptureStress(capture=with_altered(base, name, gain=0.0), required=(Detection(BLACK_IMAGE, name),))
+
+
+@capture_case(
+    "empty camera",
+    "one mask of nothing carves all of the subject out of the visual hull",
+    "the camera detected and left out",
+)
+def _empty_camera(at: StressStudio) -> CaptureStress:
+    base = at.base()
+    name = _victim(base)
     return CaptureStress(
-        capture=with_altered(base, name, gain=0.0, coverage=0.0),
-        required=(Detection(BLACK_IMAGE, name),),
+        capture=with_altered(base, name, gain=0.0, coverage=0.0), required=(Detection(EMPTY_MASK, name),)
     )
 
 
@@ -488,9 +499,9 @@ def touching(figure: Figure, frame_count: int) -> list[MaterialMesh]:
 def ball() -> MaterialMesh:
     """Return the object that appears."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=SPHERE_RADIUS)
-    normals: NDArray[np.float64] = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
+    normals: NDArray[np.float32] = (sphere.vertices / SPHERE_RADIUS).astype(np.float32)
     return MaterialMesh(
-        vertices=sphere.vertices + np.asarray(SPHERE_CENTER),
+        vertices=(sphere.vertices + np.asarray(SPHERE_CENTER)).astype(np.float32),
         faces=sphere.faces,
         normals=normals,
         base_color=np.tile(SPHERE_COLOR, (len(normals), 1)),

@@ -119,7 +119,7 @@ class _Start:
 
     ids: NDArray[np.int64]
     positions: FloatArray
-    turns: Rotation
+    turns: FloatArray
     corners: NDArray[np.int32]
     weights: FloatArray
     offsets: FloatArray
@@ -145,7 +145,7 @@ class _Start:
         return cls(
             ids[rows],
             positions,
-            Rotation.from_quat(cloud.orientations[rows]),
+            cloud.orientations[rows].astype(np.float64),
             corners,
             nearest.weights,
             offsets,
@@ -185,7 +185,9 @@ class _Start:
         count = min(CARRIERS, len(kept))
         _, near = cKDTree(self.positions[kept]).query(self.first_vertices, k=count)
         near = near.reshape(len(self.first_vertices), count)
-        turn = (Rotation.from_quat(cloud.orientations[now[kept]]) * self.turns[kept].inv()).as_matrix()
+        turn = (
+            Rotation.from_quat(cloud.orientations[now[kept]]) * Rotation.from_quat(self.turns[kept]).inv()
+        ).as_matrix()
         before, after = self.positions[kept], cloud.positions[now[kept]].astype(np.float64)
         carried = np.zeros_like(self.first_vertices)
         for carrier in near.T:

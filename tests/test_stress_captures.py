@@ -42,12 +42,16 @@ def records_of(capture, camera):
 
 
 class TestChanges:
-    def test_black_camera_is_black_and_others_are_as_they_were(self, studio, tiny_capture):
-        stress = capture_case_of("black camera").build(studio)
-        assert stress.required == (Detection("black-image", CAMERA),)
+    @pytest.mark.parametrize(
+        ("name", "code", "factors"),
+        [("black camera", "black-image", (0, 0, 0, 1)), ("empty camera", "empty-mask", (0, 0, 0, 0))],
+    )
+    def test_void_camera_is_void_and_others_are_as_they_were(self, studio, tiny_capture, name, code, factors):
+        stress = capture_case_of(name).build(studio)
+        assert stress.required == (Detection(code, CAMERA),)
         for record, original in zip(stress.capture.records, tiny_capture.records, strict=True):
             changed, known = record.image().linear_rgba(), original.image().linear_rgba()
-            assert np.array_equal(changed, np.zeros_like(known) if record.camera_name == CAMERA else known)
+            assert np.array_equal(changed, known * factors if record.camera_name == CAMERA else known)
 
     def test_wrong_exposure_is_twice_the_light_and_the_same_coverage(self, studio, tiny_capture):
         capture = capture_case_of("wrong exposure").build(studio).capture

@@ -1,0 +1,175 @@
+"""What reconstructs in the reconstruction benchmark: the only place where it calls fitting, tracking and meshing.
+
+Settings of others are ours run with their choices where these can be made here: they say what the choices are worth,
+not how fast other people's programs are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.cameras import Camera
+from beam_warp.capture_stability import Reconstructed
+from beam_warp.captured_views import CapturedView
+from beam_warp.captures import Capture, CaptureRecord
+from beam_warp.devices import resolve_device
+from beam_warp.raster_records import RasterOptions
+from beam_warp.stress_captures import TRACKING_LOST, Detection, detections_of, training_cameras
+
+RADE_GS_LIKE: dict[str, Any] = {
+    "color_iterations": 15_000,
+    "normal_iterations": 15_000,
+    "normal_weight": 0.05,
+    "sh_degree": 3,
+    "alpha_weight": 0.0,
+    "raster": RasterOptions(antialiased=False),
+}
+"""RaDe-GS (Zhang et al. 2024) as published: 30,000 iterations, depth-normal consistency of weight 0.05 in the second
+half, degree 3, no loss of coverage, no filter that keeps energy."""
+
+
+class StepsLike(Protocol):
+    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.FrameSteps`."""
+
+    def begin(self, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
+        """Fit a key frame."""
+        ...
+
+    def advance(self, track: Any, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
+        """Track the frame after."""
+        ...
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One way to reconstruct.
+
+    Attributes:
+        name: In tables.
+        steps: Fits and tracks; a track has its ``cloud``.
+        mesh: Extracts the surface of a cloud as some cameras see it.
+        options: How its Gaussians are drawn.
+    """
+
+    name: str
+    steps: StepsLike
+    mesh: Callable[[GaussianCloud, Sequence[Camera]], trimesh.Trimesh]
+    options: RasterOptions | None = None
+
+
+def ours(gaussian_count: int, device: str | None, **fitting: Any) -> Contender:
+    """Return this package's reconstruction, with its defaults but for what is given."""
+    from beam_warp.gaussian_fitting import FitOptions
+    from beam_warp.meshing import mesh_of_gaussians
+    from beam_warp.reconstruction_steps import FitAndTrack
+
+    options = FitOptions(gaussian_count=gaussian_count, **fitting)
+    return Contender(
+        "ours",
+        FitAndTrack(fitting=options, device=device),
+        lambda cloud, cameras: mesh_of_gaussians(cloud, cameras, options=options.raster, device=device),
+        options.raster,
+    )
+
+
+def rade_gs_like(gaussian_count: int, device: str | None, iterations: int | None = None) -> Contender:
+    """Return ours with RaDe-GS's choices; ``iterations`` in all, half of them with normals, if not theirs."""
+    chosen = dict(RADE_GS_LIKE)
+    if iterations is not None:
+        chosen |= {"color_iterations": iterations // 2, "normal_iterations": iterations - iterations // 2}
+    found = ours(gaussian_count, device, **chosen)
+    return Contender("RaDe-GS-like settings", found.steps, found.mesh, found.options)
+
+
+@dataclass(frozen=True)
+class ModelledFrame:
+    """A frame that a contender has reconstructed.
+
+    Attributes:
+        frame: Its number in the capture.
+        cloud: Its Gaussians.
+        seconds: From images in memory to Gaussians on the device's host.
+        report: What the step said.
+    """
+
+    frame: int
+    cloud: GaussianCloud
+    seconds: float
+    report: dict[str, Any]
+
+
+def follow(
+    contender: Contender,
+    capture: Capture,
+    frames: Sequence[int],
+    device: Any,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[ModelledFrame]:
+    """Fit the first of some frames and track the others; reading images is not timed."""
+    track = None
+    for frame in frames:
+        views = [view_of(record) for record in capture.select(split="train", frames=[frame])]
+        started = time.perf_counter()
+        if track is None:
+            track, report = contender.steps.begin(views, _nobody)
+        else:
+            track, report = contender.steps.advance(track, views, _nobody)
+        if device.is_cuda:
+            wp.synchronize_device(device)
+        seconds = time.perf_counter() - started
+        say(f"{contender.name}, frame {frame}: {len(track.cloud):,} Gaussians, {seconds:.1f} s")
+        yield ModelledFrame(frame, track.cloud, seconds, report)
+
+
+def view_of(record: CaptureRecord) -> CapturedView:
+    """Read what a record's camera saw."""
+    image = record.image()
+    rgba = image.linear_rgba()
+    return CapturedView(
+        name=record.name,
+        camera=record.camera,
+        color=np.ascontiguousarray(rgba[..., :3]),
+        alpha=None if image.alpha is None else np.clip(rgba[..., 3], 0.0, 1.0),
+    )
+
+
+def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[Capture], Reconstructed]:
+    """Return what `beam_warp.capture_stability` tries: inspect, leave out what cannot be used, fit and track."""
+
+    def reconstruct(capture: Capture) -> Reconstructed:
+        from beam_warp.capture_inspection import require_reconstructable
+
+        ready = require_reconstructable(capture)
+        detections = list(
+            detections_of((f for f in ready.fallbacks if f.severity != "note"), training_cameras(capture))
+        )
+        clouds, key_frames, track = [], [], None
+        for index, frame in enumerate(ready.capture.frames):
+            views = [view_of(record) for record in ready.capture.select(split="train", frames=[frame])]
+            report: dict[str, Any] = {"lost": "start"}
+            if track is not None:
+                track, report = contender.steps.advance(track, views, _nobody)
+                if report.get("lost"):
+                    detections.append(Detection(TRACKING_LOST, frame=frame))
+            if report.get("lost"):
+                track, report = contender.steps.begin(views, _nobody)
+                key_frames.append(index)
+            clouds.append(track.cloud)
+        return Reconstructed(
+            sequence=GaussianSequence.from_clouds(clouds), detections=detections, key_frames=key_frames
+        )
+
+    resolve_device(device)
+    return reconstruct
+
+
+def _nobody(done: int, total: int, facts: Any = None) -> None:
+    """Report to nobody."""
