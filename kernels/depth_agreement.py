@@ -7,24 +7,17 @@ the image or at an edge, the view says nothing.
 
 import warp as wp
 
-from beam_warp.kernels.depth_pixels import DepthCamera, footprint, pixel_point, project_point, sample_pixels
+from beam_warp.kernels.depth_pixels import (
+    DepthCamera,
+    footprint,
+    is_background,
+    pixel_point,
+    project_point,
+    sample_pixels,
+)
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def is_background(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: float) -> bool:
-    """Whether a place on the image, and the pixels around it, show nothing at all."""
-    column = int(wp.floor(x))
-    row = int(wp.floor(y))
-    if column < 1 or row < 1 or column + 1 >= camera.width or row + 1 >= camera.height:
-        return False
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            if pixels[camera.first_pixel + (row + dy) * camera.width + column + dx][0] > 0.0:
-                return False
-    return True
 
 
 @wp.kernel
