@@ -162,7 +162,7 @@ def demo_gaussians(count: int) -> tuple[GaussianCloud, trimesh.Trimesh]:
         opacities=samples.opacities,
         base_color=np.clip(color, 0.0, 1.0),
     )
-    return cloud, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return cloud, trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
 
 
 def compare(
@@ -189,7 +189,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     device = resolve_device(args.device)
-    side, repeats, count = (96, 1, 8_000) if args.quick else (384, 2, 45_000)
+    side, repeats, count = (96, 1, 8_000) if args.quick else (256, 2, 45_000)
     result: dict[str, Any] = {"commit": commit(), "machine": machine(device), "image_side": side}
 
     images = sphere_images(side, device)

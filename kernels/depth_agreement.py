@@ -31,7 +31,10 @@ def compare_depths_kernel(
     out_contradicted: wp.array[int],
     out_residuals: wp.array[float],
 ):
-    """``tolerance`` in widths of the coarser of the two pixels; residuals [m] are means over confirming views."""
+    """``tolerance`` in widths of the coarser of the two pixels; residuals [m] are means over confirming views.
+
+    A pixel that does not count itself is confirmed by -1.
+    """
     pixel = first + wp.tid()
     own = cameras[view]
     value = pixels[own.first_pixel + pixel]
@@ -62,9 +65,31 @@ def compare_depths_kernel(
                         contradicted += 1
     if confirmed > 0:
         residual /= float(confirmed)
+    if not (value[2] > 0.0):
+        confirmed = -1
     out_confirmed[own.first_pixel + pixel] = confirmed
     out_contradicted[own.first_pixel + pixel] = contradicted
     out_residuals[own.first_pixel + pixel] = residual
+
+
+@wp.kernel
+def flag_agreed_kernel(
+    first: int, confirmed: wp.array[int], contradicted: wp.array[int], confirmations: int, out_flags: wp.array[int]
+):
+    pixel = first + wp.tid()
+    agreed = confirmed[pixel] >= confirmations and contradicted[pixel] <= confirmed[pixel]
+    out_flags[pixel] = wp.where(agreed, 1, 0)
+
+
+def launch_flag_agreed(confirmed, contradicted, confirmations, flags, device):
+    """Flag the pixels that enough views confirm, and no more contradict."""
+    launch(
+        flag_agreed_kernel,
+        len(flags),
+        inputs=[confirmed, contradicted, confirmations],
+        outputs=[flags],
+        device=device,
+    )
 
 
 def launch_compare_depths(view, pixel_count, cameras, pixels, tolerance, confirmed, contradicted, residuals, device):
