@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.depth_images import DepthImages
-from beam_warp.kernels.depth_agreement import launch_compare_depths
+from beam_warp.kernels.depth_agreement import launch_compare_depths, launch_flag_agreed
 
 TOLERANCE = 2.0
 """Distance [pixel] within which two views see one point: each knows its surface to about a pixel."""
@@ -41,7 +41,8 @@ class DepthConsistency:
     """What `depth_consistency` found; arrays are on the device, of all views' pixels, one view after the other.
 
     Attributes:
-        confirmed: How many other views show a surface at the point of each pixel, ``(P,)`` int.
+        confirmed: How many other views show a surface at the point of each pixel, -1 where it has no
+            weight of its own, ``(P,)`` int.
         contradicted: How many look through it, ``(P,)`` int.
         residuals: Mean distance from the confirming views' surfaces [m], 0 where none does, ``(P,)`` float.
         views: A summary of each view.
@@ -52,15 +53,16 @@ class DepthConsistency:
     residuals: wp.array
     views: tuple[ViewConsistency, ...]
 
-    def mask(self, confirmations: int = 1) -> NDArray[np.bool_]:
-        """Return the pixels that enough views confirm, and no more contradict, ``(P,)``; for `DepthImages.keep`.
+    def mask(self, confirmations: int = 1) -> wp.array:
+        """Return 1 for pixels that enough views confirm, and no more contradict, ``(P,)`` int; for `DepthImages.keep`.
 
         Args:
             confirmations: Least number of confirming views. With 0, what no other view sees is kept.
         """
         require_count("confirmations", confirmations, 0)
-        confirmed, contradicted = self.confirmed.numpy(), self.contradicted.numpy()
-        return (confirmed >= confirmations) & (contradicted <= confirmed)
+        flags = wp.empty(len(self.confirmed), dtype=int, device=self.confirmed.device)
+        launch_flag_agreed(self.confirmed, self.contradicted, confirmations, flags, flags.device)
+        return flags
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary for a report: shares over all views, and the worst view."""
@@ -118,15 +120,16 @@ def depth_consistency(images: DepthImages, *, tolerance: float = TOLERANCE) -> D
     summaries = []
     for index in range(len(images.cameras)):
         part = slice(images.first_pixels[index], images.first_pixels[index + 1])
-        usable = images.pixels[part].numpy()[:, 2] > 0.0
-        summaries.append(_summary(*(array[part].numpy()[usable] for array in (confirmed, contradicted, residuals))))
+        summaries.append(_summary(*(array[part].numpy() for array in (confirmed, contradicted, residuals))))
     return DepthConsistency(confirmed, contradicted, residuals, tuple(summaries))
 
 
 def _summary(
     confirmed: NDArray[np.int32], contradicted: NDArray[np.int32], residuals: NDArray[np.float32]
 ) -> ViewConsistency:
-    """Sum up the usable pixels of one view."""
+    """Sum up the pixels of one view that count."""
+    usable = confirmed >= 0
+    confirmed, contradicted, residuals = confirmed[usable], contradicted[usable], residuals[usable]
     seen = confirmed + contradicted > 0
     count = max(int(seen.sum()), 1)
     agreed = (confirmed > 0) & (contradicted <= confirmed)

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from beam_warp.assets import COLOR_SPACES, LINEAR_REC709
 from beam_warp.cameras import Camera
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device_arrays import device_array
-from beam_warp.devices import resolve_device, upload
+from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.depth_pixels import (
     DepthCamera,
@@ -155,31 +154,36 @@ class DepthImages:
         """Return a view's camera for kernels."""
         return self._views[index]
 
-    def keep(self, mask: NDArray[np.bool_] | wp.array) -> None:
-        """Leave out pixels: ``mask`` is False there, ``(P,)``, or 0 as ints on the device.
+    def keep(self, mask: wp.array) -> None:
+        """Leave out the pixels where ``mask`` is 0, ``(P,)`` int on the device.
 
         Raises:
-            InvalidArrayError: It has another length.
+            InvalidArrayError: It has another length, type or device.
         """
-        if mask.shape != (len(self.pixels),):
-            raise InvalidArrayError(f"mask must have shape ({len(self.pixels)},), got {mask.shape}. Pass all views'.")
-        flags = mask if isinstance(mask, wp.array) else upload(mask.astype(np.int32), int, self.device)
-        launch_drop_pixels(flags, self.pixels, self.device)
+        fits = isinstance(mask, wp.array) and mask.dtype is wp.int32 and mask.device == self.device
+        if not fits or mask.shape != (len(self.pixels),):
+            raise InvalidArrayError(
+                f"mask must be a warp array of {len(self.pixels)} int32 on {self.device}, got "
+                f"{type(mask).__name__} of shape {mask.shape}. Pass one number a pixel, of all views."
+            )
+        launch_drop_pixels(mask, self.pixels, self.device)
 
     def footprint(self) -> float:
         """Return the median width of a pixel at the surface that it shows [m].
 
-        Of at most 2^16 pixels of each view, evenly spread over those that count.
+        Of about 2^16 pixels of each view, evenly spread, and of all of them where none of those counts.
 
         Raises:
             InvalidArrayError: No pixel counts.
         """
         widths = []
         for index, camera in enumerate(self.cameras):
-            part = self.pixels[self.first_pixels[index] : self.first_pixels[index + 1]].numpy()
+            view = self.pixels[self.first_pixels[index] : self.first_pixels[index + 1]]
+            # An odd step does not stay in some columns of an image whose width is even.
+            part = view[:: len(view) // 2**16 | 1].numpy()
+            part = part if (part[:, 2] > 0.0).any() else view.numpy()
             seen = part[part[:, 2] > 0.0, 0]
-            step = -(-len(seen) // 2**16) or 1
-            widths.append(1.0 / (seen[::step].astype(np.float64) * min(camera.focal_x, camera.focal_y)))
+            widths.append(1.0 / (seen.astype(np.float64) * min(camera.focal_x, camera.focal_y)))
         joined = np.concatenate(widths)
         if not len(joined):
             raise InvalidArrayError(

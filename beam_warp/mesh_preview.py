@@ -48,9 +48,10 @@ def shaded_image(
     origin = np.asarray(mesh.vertices, np.float64).mean(axis=0)
     points = upload((mesh.vertices - origin).astype(np.float32), wp.vec3, target)
     tree = wp.Mesh(points, upload(np.asarray(mesh.faces, np.int32).reshape(-1), int, target))
-    colors = np.broadcast_to(np.float32(CLAY), (len(mesh.vertices), 3))
-    if color == "vertices" and mesh.visual.kind == "vertex":
-        colors = srgb_to_linear(np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0).astype(np.float32)
+    colors = np.broadcast_to(np.array(CLAY, np.float32), (len(mesh.vertices), 3))
+    visual: Any = mesh.visual
+    if color == "vertices" and visual.kind == "vertex":
+        colors = srgb_to_linear(np.asarray(visual.vertex_colors)[:, :3] / 255.0).astype(np.float32)
     matrix = camera.world_to_camera
     view = DepthCamera()
     view.rotation = wp.mat33(matrix[:3, :3].astype(np.float32))

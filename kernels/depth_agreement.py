@@ -7,24 +7,17 @@ the image or at an edge, the view says nothing.
 
 import warp as wp
 
-from beam_warp.kernels.depth_pixels import DepthCamera, footprint, pixel_point, project_point, sample_pixels
+from beam_warp.kernels.depth_pixels import (
+    DepthCamera,
+    footprint,
+    is_background,
+    pixel_point,
+    project_point,
+    sample_pixels,
+)
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def is_background(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: float) -> bool:
-    """Whether a place on the image, and the pixels around it, show nothing at all."""
-    column = int(wp.floor(x))
-    row = int(wp.floor(y))
-    if column < 1 or row < 1 or column + 1 >= camera.width or row + 1 >= camera.height:
-        return False
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            if pixels[camera.first_pixel + (row + dy) * camera.width + column + dx][0] > 0.0:
-                return False
-    return True
 
 
 @wp.kernel
@@ -38,7 +31,10 @@ def compare_depths_kernel(
     out_contradicted: wp.array[int],
     out_residuals: wp.array[float],
 ):
-    """``tolerance`` in widths of the coarser of the two pixels; residuals [m] are means over confirming views."""
+    """``tolerance`` in widths of the coarser of the two pixels; residuals [m] are means over confirming views.
+
+    A pixel that does not count itself is confirmed by -1.
+    """
     pixel = first + wp.tid()
     own = cameras[view]
     value = pixels[own.first_pixel + pixel]
@@ -69,9 +65,31 @@ def compare_depths_kernel(
                         contradicted += 1
     if confirmed > 0:
         residual /= float(confirmed)
+    if not (value[2] > 0.0):
+        confirmed = -1
     out_confirmed[own.first_pixel + pixel] = confirmed
     out_contradicted[own.first_pixel + pixel] = contradicted
     out_residuals[own.first_pixel + pixel] = residual
+
+
+@wp.kernel
+def flag_agreed_kernel(
+    first: int, confirmed: wp.array[int], contradicted: wp.array[int], confirmations: int, out_flags: wp.array[int]
+):
+    pixel = first + wp.tid()
+    agreed = confirmed[pixel] >= confirmations and contradicted[pixel] <= confirmed[pixel]
+    out_flags[pixel] = wp.where(agreed, 1, 0)
+
+
+def launch_flag_agreed(confirmed, contradicted, confirmations, flags, device):
+    """Flag the pixels that enough views confirm, and no more contradict."""
+    launch(
+        flag_agreed_kernel,
+        len(flags),
+        inputs=[confirmed, contradicted, confirmations],
+        outputs=[flags],
+        device=device,
+    )
 
 
 def launch_compare_depths(view, pixel_count, cameras, pixels, tolerance, confirmed, contradicted, residuals, device):

@@ -121,6 +121,23 @@ def sample_pixels(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: f
 
 
 @wp.func
+def is_background(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: float) -> bool:
+    """Whether a place on the image, and the pixels around it, show nothing at all."""
+    if not (x >= 1.0 and y >= 1.0 and x < float(camera.width - 1) and y < float(camera.height - 1)):
+        return False
+    column = int(x)
+    row = int(y)
+    # The middle first: where a surface is seen, one read decides.
+    if pixels[camera.first_pixel + row * camera.width + column][0] > 0.0:
+        return False
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            if pixels[camera.first_pixel + (row + dy) * camera.width + column + dx][0] > 0.0:
+                return False
+    return True
+
+
+@wp.func
 def covered_inverse_depth(
     depth: wp.array[float], alpha: wp.array[float], camera: DepthCamera, minimum_alpha: float, x: int, y: int
 ) -> float:

@@ -7,7 +7,7 @@ same list. Distances are gathered: a voxel asks all views, in their order.
 
 import warp as wp
 
-from beam_warp.kernels.depth_pixels import DepthCamera, pixel_point, project_point, sample_pixels
+from beam_warp.kernels.depth_pixels import DepthCamera, is_background, pixel_point, project_point, sample_pixels
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -176,13 +176,16 @@ def integrate_kernel(
 ):
     """Mean of the views' distances [voxel].
 
-    Behind a surface a view counts less and less, down to nothing at the truncation, where it cannot know.
+    Behind a surface a view counts less and less, down to nothing at the truncation, where it cannot know. Past an edge
+    it would still see solid where there is air: what more views look through, at background, than see from behind a
+    surface, is not solid, and counts as not observed.
     """
     index = first + wp.tid()
     grid = grid_of(keys, index)
     point = wp.vec3(float(grid[0]), float(grid[1]), float(grid[2])) * voxel
     total = float(0.0)
     weights = float(0.0)
+    solid = int(0)
     for view in range(cameras.shape[0]):
         camera = cameras[view]
         at = project_point(camera, point)
@@ -194,8 +197,12 @@ def integrate_kernel(
                     weight = pixel[2] * wp.min(1.0, (distance + TRUNCATION) / (TRUNCATION - 1.0))
                     total += weight * wp.min(distance, TRUNCATION)
                     weights += weight
+                    if distance < 0.0:
+                        solid += 1
+            elif is_background(pixels, camera, at[0], at[1]):
+                solid -= 1
     mean = float(0.0)
-    if weights >= LEAST_WEIGHT:
+    if weights >= LEAST_WEIGHT and (total >= 0.0 or solid >= 0):
         mean = total / weights
         if wp.abs(mean) < LEAST_DISTANCE:
             mean = wp.where(mean < 0.0, -LEAST_DISTANCE, LEAST_DISTANCE)

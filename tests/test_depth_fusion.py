@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from depth_scenes import around, plane_view, sphere_view
 
+from beam_warp.cameras import Camera
 from beam_warp.depth_fusion import fuse_depths
 from beam_warp.depth_images import DepthImages, DepthView
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -111,6 +112,20 @@ def test_hole_in_what_is_seen_is_one_in_the_surface(coarse):
     circle = 2.0 * np.pi * 0.3
     # A staircase around a circle is at most 4 / pi times as long, and each of its steps an edge inside one cell.
     assert circle / (np.sqrt(3.0) * voxel) < report.boundary_edges < 3 * 4.0 / np.pi * circle / voxel
+
+
+def test_no_surface_in_the_shadow_of_silhouettes():
+    """Few cameras, and a truncation of two fifths of the radius: behind an edge a camera still sees solid, others air.
+
+    Without the others' word there are sheets up to the truncation away from the sphere, 0.2 m.
+    """
+    voxel = 0.05
+    cameras = [
+        Camera.orbit((0, 0, 0), 3.0, 45.0 * i, 40.0 * (-1) ** i, width=64, height=64, vertical_fov=30.0)
+        for i in range(8)
+    ]
+    mesh = fuse_depths([sphere_view(camera, RADIUS) for camera in cameras], voxel=voxel, device="cpu")
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() < voxel
 
 
 def test_far_from_the_origin(coarse):

@@ -28,6 +28,7 @@ def ball(center, count=3000):
         opacities=np.full(count, 0.99),
         radiance=np.zeros((count, 1, 3)),
         radiance_color_space="lin_rec709_scene",
+        base_color=np.full((count, 3), 0.5),
     )
 
 
