@@ -40,6 +40,7 @@ from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.frame_store import frame_key, frame_names, make_folders, read_frame, write_frame
 from beam_warp.images import write_png
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction_previews import opposite_cameras, reconstruction_preview
 from beam_warp.reporting import device_facts, versions, write_json, write_report
 
@@ -94,6 +95,11 @@ class FrameSteps(Protocol):
     @property
     def device(self) -> str | None:
         """Warp device; None takes the first CUDA device, or the CPU."""
+        ...
+
+    @property
+    def raster(self) -> RasterOptions | None:
+        """How splats are drawn; None for the defaults."""
         ...
 
     def options(self) -> Mapping[str, Any]:
@@ -453,7 +459,8 @@ class _Job:
             return
         chosen = opposite_cameras([record.camera for record in self._records[frame]])
         shown = [views[index] if views is not None else read_view(self._records[frame][index]) for index in chosen]
-        drawn = reconstruction_preview(stored_cloud(self.path(frame)), shown, device=str(self._device))
+        cloud = stored_cloud(self.path(frame))
+        drawn = reconstruction_preview(cloud, shown, options=self._steps.raster, device=str(self._device))
         write_png(picture, drawn)
         write_json(note, {"key": key, "seconds": self._seconds.get(frame)})
 

@@ -9,6 +9,7 @@ from shapes import cloud_of, sphere_points, tiles
 from beam_warp.assets import LINEAR_REC709, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.images import write_exr
+from beam_warp.raster_records import RasterOptions
 
 WIDTH, HEIGHT = 20, 16
 LOST_LEVEL = 0.9
@@ -64,6 +65,7 @@ class FakeSteps:
     """A ball whose colour is that of the images; it moves by what the images and the frames before say."""
 
     device = "cpu"
+    raster = RasterOptions(antialiased=True)
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
