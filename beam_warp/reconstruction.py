@@ -40,6 +40,7 @@ from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.frame_store import frame_key, frame_names, make_folders, read_frame, write_frame
 from beam_warp.images import write_png
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction_previews import opposite_cameras, reconstruction_preview
 from beam_warp.reporting import device_facts, versions, write_json, write_report
 
@@ -94,6 +95,11 @@ class FrameSteps(Protocol):
     @property
     def device(self) -> str | None:
         """Warp device; None takes the first CUDA device, or the CPU."""
+        ...
+
+    @property
+    def raster(self) -> RasterOptions | None:
+        """How splats are drawn; None for the defaults."""
         ...
 
     def options(self) -> Mapping[str, Any]:
@@ -292,10 +298,13 @@ def stored_cloud(path: Path) -> GaussianCloud:
 
 
 class _Images:
-    """The images of one frame at a time, and those of the next while the present ones are worked on."""
+    """Images and digests, a frame at a time, and those of the next while the present ones are worked on."""
 
-    def __init__(self, records: Mapping[int, Sequence[CaptureRecord]], pool: ThreadPoolExecutor) -> None:
+    def __init__(
+        self, records: Mapping[int, Sequence[CaptureRecord]], digests: CaptureDigests, pool: ThreadPoolExecutor
+    ) -> None:
         self._records = records
+        self._digests = digests
         self._pool = pool
         self._ahead = ThreadPoolExecutor(1)
         self._expected: tuple[int, Future[list[CapturedView]]] | None = None
@@ -305,12 +314,19 @@ class _Images:
 
     def expect(self, frame: int) -> None:
         """Begin to read a frame that is likely to be asked for next."""
-        self._expected = (frame, self._ahead.submit(self._read, frame))
+        self._expected = (frame, self._ahead.submit(self._prepare, frame))
+
+    def digest(self, frame: int) -> str:
+        return self._digests.of(frame, self._records[frame], self._pool)
 
     def views(self, frame: int) -> list[CapturedView]:
         expected, self._expected = self._expected, None
         if expected is not None and expected[0] == frame:
             return expected[1].result()
+        return self._read(frame)
+
+    def _prepare(self, frame: int) -> list[CapturedView]:
+        self.digest(frame)  # is remembered
         return self._read(frame)
 
     def _read(self, frame: int) -> list[CapturedView]:
@@ -367,17 +383,16 @@ class _Job:
         self._clear({frame for frame, _ in order})
         self._progress("frames", 0, len(order))
         key = ""
-        with self._reading() as (images, pool):
+        with self._reading() as images:
             for done, (frame, previous) in enumerate(order):
-                key = self._key(frame, "" if previous is None else key, pool)
+                key = self._key(frame, images.digest(frame), "" if previous is None else key)
                 if frame_key(self.path(frame)) == key:
                     self._resumed += 1
                     views = None
                 else:
                     views = images.views(frame)
-                    following = order[done + 1][0] if done + 1 < len(order) else None
-                    if following is not None and frame_key(self.path(following)) is None:
-                        images.expect(following)
+                    if done + 1 < len(order):
+                        images.expect(order[done + 1][0])
                     self._model(frame, key, views, previous)
                 self._complete(frame, key, views)
                 self._progress("frames", done + 1, len(order), _words(self.header(frame)["report"]))
@@ -390,16 +405,16 @@ class _Job:
                 path.unlink(missing_ok=True)
 
     @contextmanager
-    def _reading(self) -> Iterator[tuple[_Images, ThreadPoolExecutor]]:
+    def _reading(self) -> Iterator[_Images]:
         with ThreadPoolExecutor(min(LOADING_THREADS, os.cpu_count() or 1)) as pool:
-            images = _Images(self._records, pool)
+            images = _Images(self._records, self._digests, pool)
             try:
-                yield images, pool
+                yield images
             finally:
                 images.close()
 
-    def _key(self, frame: int, previous: str, pool: ThreadPoolExecutor) -> str:
-        digest = self._digests.of(frame, self._records[frame], pool)
+    def _key(self, frame: int, digest: str, previous: str) -> str:
+        """Return the key of a frame whose predecessor in its segment has the key ``previous``, empty for the first."""
         text = f"{self._base}\n{frame}\n{digest}\n{previous}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -444,7 +459,8 @@ class _Job:
             return
         chosen = opposite_cameras([record.camera for record in self._records[frame]])
         shown = [views[index] if views is not None else read_view(self._records[frame][index]) for index in chosen]
-        drawn = reconstruction_preview(stored_cloud(self.path(frame)), shown, device=str(self._device))
+        cloud = stored_cloud(self.path(frame))
+        drawn = reconstruction_preview(cloud, shown, options=self._steps.raster, device=str(self._device))
         write_png(picture, drawn)
         write_json(note, {"key": key, "seconds": self._seconds.get(frame)})
 

@@ -12,6 +12,7 @@ from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.contact_sheet import Panel, lay_out, over_background
 from beam_warp.images import display_image
+from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, rasterize
 
 AMPLIFICATION = 8
@@ -37,6 +38,7 @@ def reconstruction_preview(
     views: Sequence[CapturedView],
     *,
     shadings: Sequence[NDArray[np.uint8]] = (),
+    options: RasterOptions | None = None,
     device: str | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a frame beside its photographs, a row for each view.
@@ -46,12 +48,14 @@ def reconstruction_preview(
         views: What to compare with; images of one size.
         shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
             column out.
+        options: How splats are drawn: as they were when the Gaussians were fitted.
         device: Warp device.
 
     Returns:
         8-bit sRGB, ``(H, W, 3)``.
     """
-    buffers = rasterize(cloud, [view.camera for view in views], channels=(RADIANCE, SURFACE_NORMALS), device=device)
+    cameras = [view.camera for view in views]
+    buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
     panels: list[Panel] = []
     for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
         alpha = buffer.alpha[..., None]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beam_warp.captured_views import CapturedView
 from beam_warp.gaussian_fitting import FitOptions, fit_gaussians
 from beam_warp.initialization import initial_gaussians
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction import StepProgress
 from beam_warp.tracking import Track, TrackOptions, advance_track, begin_track
 
@@ -29,6 +30,11 @@ class FitAndTrack:
     fitting: FitOptions = field(default_factory=FitOptions)
     tracking: TrackOptions = field(default_factory=TrackOptions)
     device: str | None = None
+
+    @property
+    def raster(self) -> RasterOptions:
+        """How splats are drawn."""
+        return self.fitting.raster
 
     def options(self) -> Mapping[str, Any]:
         """Return all that results depend on, but for the device; JSON-able."""

@@ -9,6 +9,7 @@ from shapes import cloud_of, sphere_points, tiles
 from beam_warp.assets import LINEAR_REC709, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.images import write_exr
+from beam_warp.raster_records import RasterOptions
 
 WIDTH, HEIGHT = 20, 16
 LOST_LEVEL = 0.9
@@ -64,6 +65,7 @@ class FakeSteps:
     """A ball whose colour is that of the images; it moves by what the images and the frames before say."""
 
     device = "cpu"
+    raster = RasterOptions(antialiased=True)
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
@@ -75,15 +77,16 @@ class FakeSteps:
     def begin(self, views, progress):
         level = self.level(views)
         self.calls.append("begin")
-        noise = np.random.default_rng([self.seed, int(level * 1e6)]).normal(size=(self.count, 3))
-        points, spacing = sphere_points(self.count)
+        count = self.count + (5 if level > LOST_LEVEL else 0)  # what is fitted anew has as many as it needs
+        noise = np.random.default_rng([self.seed, int(level * 1e6)]).normal(size=(count, 3))
+        points, spacing = sphere_points(count)
         cloud = cloud_of(
             tiles(points + 0.01 * noise, points, spacing),
-            radiance=np.full((self.count, 1, 3), (level - 0.5) / 0.28209479),
+            radiance=np.full((count, 1, 3), (level - 0.5) / 0.28209479),
             radiance_color_space=LINEAR_REC709,
-            ids=np.arange(self.count),
+            ids=np.arange(count),
         )
-        progress(1, 1, {"psnr": 30.0, "gaussians": self.count})
+        progress(1, 1, {"psnr": 30.0, "gaussians": count})
         return FakeTrack(cloud, noise * 1e-3, np.array(0)), {
             "psnr": 30.0,
             "iterations": np.int64(7),

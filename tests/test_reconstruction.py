@@ -94,7 +94,10 @@ class TestSegments:
         assert found.report["frames"][2]["lost"] == "too bright"
         assert found.report["frames"][2]["kind"] == "key"
         assert found.sequence.topology == "perFrame"
-        assert np.array_equal(found.sequence[4].ids, found.sequence[0].ids + (2 << ID_BITS))
+        assert np.array_equal(found.sequence[1].ids, np.arange(60))
+        assert np.array_equal(found.sequence[4].ids, np.arange(65) + (2 << ID_BITS))
+        assert validate(found.asset).is_valid
+        assert np.array_equal(read(found.asset)[4].ids, found.sequence[4].ids)
         (warning,) = [text for text in found.report["warnings"] if "lost" in text]
         assert "at frame 2 (too bright)" in warning
         assert any("frame 2: lost (too bright), fitted anew" in step[3] for step in said if len(step) > 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -109,11 +109,17 @@ def steps_of(modelling: Modelling, seed: int, device: str | None) -> FrameSteps:
     """Return the steps that the words ask for."""
     from beam_warp.gaussian_fitting import FitOptions
     from beam_warp.reconstruction_steps import FitAndTrack
+    from beam_warp.tracking import TrackOptions
 
-    asked: dict[str, Any] = {"preset": modelling.preset, "target_psnr": modelling.target_psnr, "seed": seed}
+    asked: dict[str, Any] = {"target_psnr": modelling.target_psnr, "seed": seed}
     if modelling.gaussians is not None:
         asked["gaussian_count"] = modelling.gaussians
-    return FitAndTrack(fitting=FitOptions(**asked), device=device)
+    tracking = TrackOptions()
+    return FitAndTrack(
+        fitting=FitOptions.of_preset(modelling.preset, **asked),
+        tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
+        device=device,
+    )
 
 
 def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:

@@ -44,7 +44,7 @@ class TestReconstruct:
         out = tmp_path / "out"
         assert beam("reconstruct", folder, "--out", out, "--gaussians", 40, "--target-psnr", 35, "--seed", 3) == 0
         said = capsys.readouterr()
-        assert "gaussians.usda: 4 frames, 2 segments, 40 Gaussians, " in said.out
+        assert "gaussians.usda: 4 frames, 2 segments, 40 to 45 Gaussians, " in said.out
         assert "dB, lowest 29.20 dB at frame 1" in said.out
         assert "warning: tracking was lost at frame 2 (too bright)" in said.err
         modelling, seed, _ = asked[0]
