@@ -33,6 +33,7 @@ from beam_warp import converters
 from beam_warp._version import __version__
 from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.capture_digests import CaptureDigests, require_files
+from beam_warp.capture_inspection import SPLIT, require_reconstructable
 from beam_warp.captured_views import CapturedView
 from beam_warp.captures import Capture, CaptureRecord
 from beam_warp.checks import require_count
@@ -132,12 +133,10 @@ class ReconstructOptions:
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
         frames: Numbers of the frames, ascending; None for all of the split.
-        split: Records to reconstruct from.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
-    split: str = "train"
 
     def __post_init__(self) -> None:
         """Check every field once."""
@@ -204,8 +203,9 @@ def reconstruct(
         progress: Called with (stage, done, total, note).
 
     Raises:
-        InvalidOptionError: The capture has no such split or frame.
-        MissingFileError: An image is not there.
+        InvalidOptionError: The capture has no such frame.
+        MissingFileError: Images are not there, and what is left does not do.
+        AssetFormatError: Nothing can be reconstructed from this capture: the message says why.
         OutputError: The folder cannot be made or written.
         BeamError: An image is damaged, or a step refuses its input.
     """
@@ -330,19 +330,7 @@ class _Images:
         return self._read(frame)
 
     def _read(self, frame: int) -> list[CapturedView]:
-        return list(self._pool.map(read_view, self._records[frame]))
-
-
-def read_view(record: CaptureRecord) -> CapturedView:
-    """Read what a record's camera saw; coverage is known where the image file has it."""
-    image = record.image()
-    rgba = image.linear_rgba()
-    return CapturedView(
-        name=record.camera_name,
-        camera=record.camera,
-        color=np.ascontiguousarray(rgba[..., :3]),
-        alpha=None if image.alpha is None else np.clip(rgba[..., 3], 0.0, 1.0),
-    )
+        return list(self._pool.map(CaptureRecord.view, self._records[frame]))
 
 
 class _Job:
@@ -356,7 +344,9 @@ class _Job:
         self._steps = steps
         self._options = options
         self._progress = progress
-        self._records = _records_by_frame(capture, options)
+        ready = require_reconstructable(_selected(capture, options))
+        self._findings = [finding.what for finding in ready.fallbacks if finding.severity == "warning"]
+        self._records = _by_frame(ready.capture.select(split=SPLIT))
         require_files(record for records in self._records.values() for record in records)
         self._folders = make_folders(out, "frames", "previews", "digests")
         self._folder, self._previews, digests = self._folders
@@ -458,7 +448,7 @@ class _Job:
         if self._note(frame).get("key") == key and picture.is_file():
             return
         chosen = opposite_cameras([record.camera for record in self._records[frame]])
-        shown = [views[index] if views is not None else read_view(self._records[frame][index]) for index in chosen]
+        shown = [views[index] if views is not None else self._records[frame][index].view() for index in chosen]
         cloud = stored_cloud(self.path(frame))
         drawn = reconstruction_preview(cloud, shown, options=self._steps.raster, device=str(self._device))
         write_png(picture, drawn)
@@ -491,7 +481,6 @@ class _Job:
                 "capture": str(self._capture.folder),
                 "frames": len(frames),
                 "cameras": len({record.camera_name for records in self._records.values() for record in records}),
-                "split": self._options.split,
             },
             "device": device_facts(self._device),
             "versions": versions(),
@@ -501,18 +490,17 @@ class _Job:
             "mean_psnr": float(np.mean([entry["psnr"] for entry in measured])) if measured else None,
             "lowest_psnr": None if lowest is None else {"frame": lowest["frame"], "psnr": lowest["psnr"]},
             "frames": frames,
-            "warnings": _warnings(frames),
+            "warnings": [*self._findings, *_warnings(frames)],
         }
 
 
-def _records_by_frame(capture: Capture, options: ReconstructOptions) -> dict[int, tuple[CaptureRecord, ...]]:
-    """Return the records of each frame, frames ascending, cameras in file order."""
-    selected = capture.select(split=options.split)
-    if not selected:
+def _selected(capture: Capture, options: ReconstructOptions) -> Capture:
+    """Return the capture with no other training records than those of the frames that are asked for."""
+    there = sorted({record.frame for record in capture.select(split=SPLIT)})
+    if not there:
         raise InvalidOptionError(
-            f"split must be one of the capture's ({', '.join(capture.splits)}), got {options.split}. Choose one."
+            f"capture must have records of the split {SPLIT}, got {', '.join(capture.splits)}. Call them so."
         )
-    there = sorted({record.frame for record in selected})
     frames = there if options.frames is None else options.frames
     absent = sorted(set(frames) - set(there))
     if absent or not frames:
@@ -520,11 +508,15 @@ def _records_by_frame(capture: Capture, options: ReconstructOptions) -> dict[int
             f"frames must be some of the capture's {len(there)} from {there[0]} to {there[-1]}, got "
             f"{absent[0] if absent else 'none'}. Choose among them."
         )
-    grouped: dict[int, list[CaptureRecord]] = {frame: [] for frame in frames}
-    for record in selected:
-        if record.frame in grouped:
-            grouped[record.frame].append(record)
-    return {frame: tuple(records) for frame, records in grouped.items()}
+    return Capture(**{**vars(capture), "records": capture.select(split=SPLIT, frames=set(frames))})
+
+
+def _by_frame(records: Sequence[CaptureRecord]) -> dict[int, tuple[CaptureRecord, ...]]:
+    """Return the records of each frame, frames ascending, cameras in file order."""
+    grouped: dict[int, list[CaptureRecord]] = {}
+    for record in sorted(records, key=lambda record: record.frame):
+        grouped.setdefault(record.frame, []).append(record)
+    return {frame: tuple(found) for frame, found in grouped.items()}
 
 
 def _remove_leftovers(out: Path) -> None:

@@ -66,7 +66,7 @@ def reconstruct(args: Reconstruct) -> int:
     part = None if args.part is None else part_of(args.part)
     capture = Capture.read(args.capture)
     options = options_of(args.modelling, capture)
-    steps = steps_of(args.modelling, args.seed, args.device)
+    steps = steps_of(args.modelling, capture, args.seed, args.device)
 
     from beam_warp.reconstruction import reconstruct as reconstruct_capture
     from beam_warp.reconstruction import reconstruct_part
@@ -105,7 +105,7 @@ def summary(report: dict[str, Any]) -> str:
     return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"])
 
 
-def steps_of(modelling: Modelling, seed: int, device: str | None) -> FrameSteps:
+def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | None) -> FrameSteps:
     """Return the steps that the words ask for."""
     from beam_warp.gaussian_fitting import FitOptions
     from beam_warp.reconstruction_steps import FitAndTrack
@@ -118,6 +118,7 @@ def steps_of(modelling: Modelling, seed: int, device: str | None) -> FrameSteps:
     return FitAndTrack(
         fitting=FitOptions.of_preset(modelling.preset, **asked),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
+        points=capture.points(),
         device=device,
     )
 

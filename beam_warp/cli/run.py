@@ -186,7 +186,7 @@ def _reconstruct(args: Run, capture: Capture, report: ProgressCallback) -> Recon
     from beam_warp.frame_store import make_folders
     from beam_warp.reconstruction import reconstruct
 
-    steps = steps_of(args.modelling, args.seed, args.device)
+    steps = steps_of(args.modelling, capture, args.seed, args.device)
     folder = args.out / "reconstruction"
     options = options_of(args.modelling, capture)
     make_folders(args.out)

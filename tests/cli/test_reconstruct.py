@@ -26,7 +26,7 @@ def asked(monkeypatch):
     """What was asked of the steps; the fake does them."""
     found = []
 
-    def steps_of(modelling, seed, device):
+    def steps_of(modelling, capture, seed, device):
         found.append((modelling, seed, device))
         return FakeSteps(count=modelling.gaussians or 60, seed=seed)
 
@@ -161,14 +161,17 @@ class TestDetection:
             capture_at(tmp_path)
 
 
-def test_the_words_reach_the_optimiser():
+def test_the_words_reach_the_optimiser(folder):
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
     pytest.importorskip("beam_warp.tracking")
-    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), seed=7, device="cpu")
+    capture = Capture.read(folder)
+    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu")
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
     assert steps.device == "cpu"
-    assert steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), seed=7, device="cpu").options()
+    assert (
+        steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu").options()
+    )
 
 
 class TestWords:
