@@ -45,6 +45,15 @@ def split(rows: dict[str, NDArray[Any]], sources: NDArray[np.int64], targets: ND
         rows["log_scales"][places, axis] += np.float32(np.log(SPLIT_SHRINK))
 
 
+def hidden(shares: NDArray[np.floating], part: float) -> NDArray[np.bool_]:
+    """Return the rows that show least, as many as together show at most a part of what all show, ``(N,)``."""
+    order = np.argsort(shares, kind="stable")
+    total = np.cumsum(shares[order])
+    result = np.zeros(len(shares), bool)
+    result[order[total <= part * total[-1]]] = True
+    return result
+
+
 def choose_strained(stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
     """Return the rows of largest stress among those that may be split, at most ``count``; ties by row."""
     candidates = np.flatnonzero(eligible & (stress > 0.0))

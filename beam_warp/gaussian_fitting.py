@@ -22,7 +22,7 @@ from beam_warp.adam import Adam
 from beam_warp.assets import GaussianCloud
 from beam_warp.captured_views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
-from beam_warp.densification import choose_strained, prune, split
+from beam_warp.densification import choose_strained, hidden, prune, split
 from beam_warp.device_arrays import float_rows
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError
@@ -106,6 +106,8 @@ class FitOptions:
         refine_every: Steps from one refinement to the next; 0 for none.
         refine_until: Part of all steps after which there is none.
         split_fraction: Most of the Gaussians that one refinement splits.
+        hidden_share: Gaussians that show least are dropped at a refinement, as many as together show this part of
+            what all show: those that sank behind others, about a third of them, and nobody pulls back.
         dead_opacity: Gaussians below it are dropped.
         seed: Same seed, same device, same result.
 
@@ -128,7 +130,8 @@ class FitOptions:
     temporal: float = 0.0
     refine_every: int = 250
     refine_until: float = 0.6
-    split_fraction: float = 0.1
+    split_fraction: float = 0.2
+    hidden_share: float = 0.01
     dead_opacity: float = 0.02
     seed: int = 0
 
@@ -142,7 +145,7 @@ class FitOptions:
         require_count("sh_degree", self.sh_degree, 0, 4)
         if self.samples != "auto":
             require_count("samples", self.samples, 1, 8)
-        for name in ("refine_until", "split_fraction", "dead_opacity"):
+        for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
         for name in ("anisotropy", "opacity", "temporal"):
             require_number(name, getattr(self, name), 0.0)
@@ -168,6 +171,7 @@ class FitOptions:
                 "color_iterations": 7_000,
                 "normal_iterations": 5_000,
                 "weights": LossWeights(alpha=0.0, normal=0.03),
+                "hidden_share": 0.0,
                 "raster": RasterOptions(),
                 "sampling_filter": False,
             },
@@ -176,6 +180,7 @@ class FitOptions:
                 "color_iterations": 6_000,
                 "normal_iterations": 6_000,
                 "weights": LossWeights(alpha=0.0, normal=0.05),
+                "hidden_share": 0.0,
                 "raster": RasterOptions(low_pass=1e-4),
             },
         }
@@ -411,8 +416,6 @@ class Fitter:
         self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
-        if self._weights.surface > 0.0:
-            group.add_attraction(index, parameters.drawn, self._weights.surface, parameters.gradient("positions"))
         if self._temporal is not None:
             self._temporal.add_gradients(chosen.temporal)
         self._adam.step()
@@ -433,6 +436,8 @@ class Fitter:
         alive = self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
         dead = alive & ~((opacity >= chosen.dead_opacity) & (seen > 0))
+        if chosen.hidden_share > 0.0:
+            dead |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
         if dead.sum() == alive.sum():  # all of them: nothing to go on from
             dead[:] = False
         prune(rows, dead)

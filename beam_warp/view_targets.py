@@ -23,7 +23,6 @@ from beam_warp.kernels.display_encoding import (
     launch_encode,
     launch_spread,
 )
-from beam_warp.kernels.surface_attraction import Attraction, launch_attract
 from beam_warp.raster_records import GaussianArrays, RasterOptions
 from beam_warp.rasterizer import PreparedCameras, Rasterizer
 
@@ -33,15 +32,6 @@ CROP_MARGIN = 8
 CROP_STEP = 16
 """Crops are multiples of it: a tile of the rasteriser."""
 
-
-SURFACE_REACH = 0.02
-"""Gaussians within this part of the depth from the drawn surface belong to it; at 3 m, 6 cm: less than a limb."""
-
-SURFACE_TOLERANCE = 0.5
-"""Half the thickness that a surface may have [pixel]."""
-
-SURFACE_COSINE = 0.2
-"""Of a Gaussian's normal and the direction to the camera: below, it belongs to another side."""
 
 MOST_SAMPLES = 4
 """Side of the square of samples of a pixel."""
@@ -56,15 +46,12 @@ class LossWeights:
         ssim: One minus the structural similarity of encoded colours.
         alpha: Mean absolute difference of coverage, where it is known.
         normal: Disagreement of the Gaussians' normals with those of the drawn depth (BEAM Eq. 2).
-        surface: Distance of Gaussians from the drawn surface [pixel], beyond half a pixel; as many times as there are
-            pixels, so that it stands to the images' terms as a Gaussian does to a pixel.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     alpha: float = 0.5
     normal: float = 0.0
-    surface: float = 0.0
 
 
 def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
@@ -105,6 +92,7 @@ class ViewTargets:
 
     Attributes:
         rasterizer: Draws one view at a time: `select` says which.
+        cameras: What it draws for, with as many pixels as there are samples.
         height: Of every view [pixel].
         width: Of every view [pixel].
     """
@@ -121,7 +109,9 @@ class ViewTargets:
             samples: Side of the square of samples that a pixel is the mean of.
             device: Warp device.
         """
-        cameras = [view.camera.supersampled(samples) for view in views]
+        cameras = tuple(view.camera.supersampled(samples) for view in views)
+        self.cameras = cameras
+        self._weigher: Rasterizer | None = None
         self.rasterizer = Rasterizer(
             gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
         )
@@ -145,7 +135,7 @@ class ViewTargets:
         )
         self._alpha, self._to_alpha = (part.alpha.reshape((*fine, 1)) for part in (images, adjoints))
         self._depth, self._to_depth = (part.depth.reshape(fine) for part in (images, adjoints))
-        self._coverage, self._median = images.alpha.reshape(fine), images.median_depth.reshape(fine)
+        self._coverage = images.alpha.reshape(fine)
         self._encoded, self._to_encoded = (wp.zeros((*size, 3), dtype=float, device=self.device) for _ in range(2))
         self._covered, self._to_covered = (wp.zeros((*size, 1), dtype=float, device=self.device) for _ in range(2))
         self._surface, self._to_surface = (wp.zeros((*fine, 3), dtype=float, device=self.device) for _ in range(2))
@@ -200,22 +190,27 @@ class ViewTargets:
             geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
 
-    def add_attraction(self, index: int, gaussians: GaussianArrays, weight: float, gradients: wp.array) -> None:
-        """Add to the positions' gradients a pull towards the surface that the view drew last."""
-        attraction = Attraction()
-        attraction.tolerance = SURFACE_TOLERANCE * self._samples
-        attraction.strength = weight / (self.height * self.width)
-        attraction.reach, attraction.least_cosine, attraction.least_alpha = SURFACE_REACH, SURFACE_COSINE, 0.5
-        launch_attract(
-            gaussians.positions,
-            gaussians.orientations,
-            self._cameras[index].views,
-            self._median,
-            self._coverage,
-            attraction,
-            gradients,
-            self.device,
-        )
+    def add_shares(self, index: int, gaussians: GaussianArrays, shares: NDArray[np.float64]) -> None:
+        """Add what each Gaussian shows of itself in a view: its weights, summed over the pixels, in pixels.
+
+        Args:
+            index: Of the view.
+            gaussians: What is drawn.
+            shares: Added to, ``(N,)``.
+        """
+        if self._weigher is None:
+            self._weigher = Rasterizer(
+                len(shares), [self.cameras[index]], value_count=1, options=self.rasterizer.options, device=self.device
+            )
+        weigher = self._weigher
+        weigher.set_cameras([self.cameras[index]])
+        ones = wp.full((len(shares), 1), 1.0, dtype=float, device=self.device)
+        weigher.draw(gaussians._replace(values=ones, radiance=None))
+        adjoints = weigher.adjoints()
+        adjoints.channels[0].fill_(1.0)  # derivatives of the image's sum to what is composited are the weights
+        values = weigher.backward().values
+        assert values is not None
+        shares += values.numpy()[:, 0] / self._samples**2
 
     def square_error(self, index: int) -> float:
         """Return the mean squared difference of what was drawn last and a view, encoded and clipped to [0, 1]."""
@@ -280,6 +275,13 @@ class TargetSet:
         for group, index in self._places:
             group.draw(index, gaussians)
         return before != [group.rasterizer.pair_capacity for group in self._groups]
+
+    def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
+        shares = np.zeros(gaussians.positions.shape[0])
+        for group, index in self._places:
+            group.add_shares(index, gaussians, shares)
+        return shares
 
     def measure(self, gaussians: GaussianArrays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Draw every view and compare.
