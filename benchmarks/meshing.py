@@ -186,15 +186,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--quick", action="store_true", help="small images and one repeat")
+    parser.add_argument("--side", type=int, default=384, metavar="PX", help="of the depth images")
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     device = resolve_device(args.device)
-    side, repeats, count = (96, 1, 8_000) if args.quick else (256, 2, 45_000)
+    side, repeats, count = (96, 1, 8_000) if args.quick else (args.side, args.repeats, 45_000)
     result: dict[str, Any] = {"commit": commit(), "machine": machine(device), "image_side": side}
 
     images = sphere_images(side, device)
     reach = np.full(3, RADIUS + 0.05)
-    result["sphere"] = compare(images, None, -reach, reach, (2.0 if args.quick else 1.0) * 0.008, repeats)
+    result["sphere"] = compare(images, None, -reach, reach, 3.0 / side, repeats)
 
     cloud, truth = demo_gaussians(count)
     cameras = surrounding_cameras(cloud, side=side)
@@ -216,7 +218,7 @@ def main() -> int:
     }
     surface = fuse_depths(drawn, voxel=drawn.footprint())
     for _ in range(3):
-        goal = 5_000 if args.quick else 50_000
+        goal = 5_000 if args.quick else 20_000
         voxel = surface.metadata["voxel"] * float(np.sqrt(len(surface.faces) / goal))
         surface = fuse_depths(drawn, voxel=voxel)
     started = time.perf_counter()
