@@ -47,6 +47,9 @@ DISC_SPACING = 0.7
 PROGRESS_EVERY = 50
 """Steps from one report of progress, and change of the positions' learning rate, to the next."""
 
+BAND_UNIT = 0.1
+"""Coefficient of a band that counts as 1 in the term of view dependence."""
+
 LEAST_GAIN = 0.15
 """Gain of twice as many Gaussians below which more of them do not pay [dB]."""
 
@@ -100,6 +103,8 @@ class FitOptions:
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
+        view_dependence: Weight of the mean squared bands above 0 of the radiance, in units of 0.1: what two dozen cameras
+            say of directions that none of them looks from is little.
         anisotropy: Weight of needles (`AnisotropyLoss`).
         opacity: Weight of opacity (`OpacityLoss`).
         temporal: Weight of changes against the start, for the frames after the first (E_temp).
@@ -115,16 +120,17 @@ class FitOptions:
         InvalidOptionError: An option is out of range.
     """
 
-    gaussian_count: int = 60_000
+    gaussian_count: int = 100_000
     target_psnr: float | None = None
     color_iterations: int = 1_000
     normal_iterations: int = 2_000
-    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=0.3))
+    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=0.5))
     rates: LearningRates = field(default_factory=LearningRates)
     sh_degree: int = 2
     samples: int | Literal["auto"] = "auto"
     raster: RasterOptions = FIT_RASTER
     sampling_filter: bool = True
+    view_dependence: float = 0.0
     anisotropy: float = 0.0
     opacity: float = 0.0
     temporal: float = 0.0
@@ -147,7 +153,7 @@ class FitOptions:
             require_count("samples", self.samples, 1, 8)
         for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("anisotropy", "opacity", "temporal"):
+        for name in ("view_dependence", "anisotropy", "opacity", "temporal"):
             require_number(name, getattr(self, name), 0.0)
 
     @classmethod
@@ -315,6 +321,7 @@ class Fitter:
         self._anisotropy = AnisotropyLoss(count, device=device)
         self._opacity = OpacityLoss(count, device=device)
         self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._bands = self._band_term(count)
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._taken = 0
@@ -346,7 +353,7 @@ class Fitter:
 
     def report(self) -> dict[str, Any]:
         """Return what was done and how well it went, JSON-able."""
-        psnr, _ = self.measure()
+        psnr = self.psnr()
         return {
             "psnr": float(psnr.mean()),
             "view_psnr": float(psnr.min()),
@@ -355,10 +362,15 @@ class Fitter:
             "samples": self.samples,
         }
 
-    def measure(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return PSNR and largest uncovered part of every view; see `TargetSet.measure`."""
+    def psnr(self) -> NDArray[np.float64]:
+        """Return the PSNR of every view's crop [dB]."""
         self.parameters.activate()
-        return self._targets.measure(self.parameters.drawn)
+        return self._targets.make_room(self.parameters.drawn)[0]
+
+    def gaps(self) -> NDArray[np.float64]:
+        """Return the largest uncovered part of the subject in every view; see `TargetSet.gaps`."""
+        self.parameters.activate()
+        return self._targets.gaps(self.parameters.drawn)
 
     def doubled(self, count: int) -> GaussianCloud:
         """Return what was fitted with the most strained Gaussians split, ``count`` in all."""
@@ -381,6 +393,17 @@ class Fitter:
             ids=np.arange(len(grown["positions"])),
         )
 
+    def _band_term(self, count: int) -> tuple[TemporalLoss, wp.array, wp.array, wp.array] | None:
+        """Return the term of view dependence and what it reads and writes; None without it."""
+        columns = 3 * (self.options.sh_degree + 1) ** 2
+        if self.options.view_dependence == 0.0 or columns == 3:
+            return None
+        radiance, gradients = (
+            float_rows(array) for array in (self.parameters.radiance, self.parameters.gradient("radiance"))
+        )
+        zeros = wp.zeros((count, columns - 3), dtype=float, device=self.device)
+        return TemporalLoss((count, columns - 3), device=self.device), radiance[:, 3:], zeros, gradients[:, 3:]
+
     def _order(self, total: int) -> NDArray[np.int64]:
         """Return which view each step looks at: all of them, shuffled, again and again."""
         rng = np.random.default_rng(self.options.seed)
@@ -399,9 +422,10 @@ class Fitter:
         if self.options.sampling_filter:
             self._limits.write(self.parameters.positions, self.parameters.filters)
         self.parameters.activate()
-        if self._targets.make_room(self.parameters.drawn):
+        psnr, is_new = self._targets.make_room(self.parameters.drawn)
+        if is_new:
             self._graphs.clear()
-        return float(self._targets.measure(self.parameters.drawn)[0].mean())
+        return float(psnr.mean())
 
     def _step(self, view: int) -> None:
         """Draw a view, compare, and move the Gaussians."""
@@ -416,6 +440,9 @@ class Fitter:
         self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
+        if self._bands is not None:
+            term, values, zeros, gradients = self._bands
+            term(values, zeros, weight=chosen.view_dependence, unit=BAND_UNIT, gradient=gradients)
         if self._temporal is not None:
             self._temporal.add_gradients(chosen.temporal)
         self._adam.step()

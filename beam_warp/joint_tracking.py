@@ -50,10 +50,10 @@ class JointOptions:
         blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
     """
 
-    levels: tuple[int, ...] = (4, 2, 1)
-    iterations: tuple[int, ...] = (100, 100, 200)
+    levels: tuple[int, ...] = (8, 4, 2, 1)
+    iterations: tuple[int, ...] = (100, 100, 100, 200)
     weights: LossWeights = field(default_factory=lambda: LossWeights(alpha=1.0))
-    rigidity: float = 0.05
+    rigidity: float = 2.0
     rotation_rate: float = 1e-2
     position_rate: float = 5e-2
     final_rate: float = 0.1

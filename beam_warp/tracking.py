@@ -189,7 +189,7 @@ def advance_track(
     fitter = Fitter(views, carried, refinement, target)
     fitter.run(progress)
     cloud = fitter.parameters.cloud().with_arrays(ids=track.cloud.ids)
-    psnr, gaps = fitter.measure()
+    psnr, gaps = fitter.psnr(), fitter.gaps()
     torn = stretch(track.graph, track.key_joints, pose.positions).torn
     following = replace(track, cloud=cloud, joints=pose.positions, previous_joints=track.joints, turns=pose.rotations)
     report = {
@@ -243,7 +243,8 @@ def _measure(
     chosen = options.refinement.samples
     samples = chosen if chosen != "auto" else _samples(cloud, views)
     targets = TargetSet(views, len(cloud), options.raster, samples, target)
-    return targets.measure(upload_gaussians(cloud, target, radiance=cloud.radiance))
+    gaussians = upload_gaussians(cloud, target, radiance=cloud.radiance)
+    return targets.make_room(gaussians)[0], targets.gaps(gaussians)
 
 
 def _why_lost(

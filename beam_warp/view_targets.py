@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,9 @@ from beam_warp.kernels.display_encoding import (
     launch_average,
     launch_encode,
     launch_spread,
+    launch_square_error,
 )
+from beam_warp.kernels.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.raster_records import GaussianArrays, RasterOptions
 from beam_warp.rasterizer import PreparedCameras, Rasterizer
 
@@ -142,6 +145,9 @@ class ViewTargets:
         self._l1, self._ssim = L1Loss(*size, device=self.device), SsimLoss(*size, device=self.device)
         self._l1_alpha, self._agreement = L1Loss(*size, 1, device=self.device), NormalLoss(*fine, device=self.device)
         self._adjoints = adjoints
+        self._errors = wp.empty(self.height * self.width, dtype=float, device=self.device)
+        self._error = wp.zeros(1, dtype=float, device=self.device)
+        self._sums = SumBuffers(self.device)
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -212,11 +218,12 @@ class ViewTargets:
         assert values is not None
         shares += values.numpy()[:, 0] / self._samples**2
 
-    def square_error(self, index: int) -> float:
-        """Return the mean squared difference of what was drawn last and a view, encoded and clipped to [0, 1]."""
+    def psnr(self, index: int) -> float:
+        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB]."""
         launch_encode(self._color, self._samples, self._encoded, self.device)
-        drawn = np.clip(self._encoded.numpy(), 0.0, 1.0)
-        return float(np.mean((drawn - np.clip(self._colors[index].numpy(), 0.0, 1.0)) ** 2))
+        launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
+        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
+        return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
 
     def draw(self, index: int, gaussians: GaussianArrays) -> None:
         """Draw Gaussians for a view, with as much room as they take."""
@@ -269,12 +276,19 @@ class TargetSet:
         """Return where a view is: among which, and at which place."""
         return self._places[number]
 
-    def make_room(self, gaussians: GaussianArrays) -> bool:
-        """Draw every view, with as much room as it takes; return whether some had to be made."""
+    def make_room(self, gaussians: GaussianArrays) -> tuple[NDArray[np.float64], bool]:
+        """Draw every view, with as much room as it takes.
+
+        Returns:
+            PSNR of each crop, encoded and clipped to [0, 1] [dB], ``(V,)``; and whether room had to be made: then what
+            was recorded with the old arrays must be recorded again.
+        """
         before = [group.rasterizer.pair_capacity for group in self._groups]
+        psnr = []
         for group, index in self._places:
             group.draw(index, gaussians)
-        return before != [group.rasterizer.pair_capacity for group in self._groups]
+            psnr.append(group.psnr(index))
+        return np.array(psnr), before != [group.rasterizer.pair_capacity for group in self._groups]
 
     def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
         """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
@@ -283,21 +297,15 @@ class TargetSet:
             group.add_shares(index, gaussians, shares)
         return shares
 
-    def measure(self, gaussians: GaussianArrays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Draw every view and compare.
-
-        Returns:
-            PSNR of each crop, encoded and clipped to [0, 1] [dB], and the largest connected part of the subject that
-            is not drawn, as a fraction of it: ``(V,)`` each.
-        """
-        psnr, missed = [], []
+    def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Draw every view; return its largest connected part of the subject that is not drawn, as a fraction, ``(V,)``."""
+        gaps = []
         for group, index in self._places:
             group.draw(index, gaussians)
-            psnr.append(-10.0 * np.log10(max(group.square_error(index), 1e-12)))
             parts, count = ndimage.label(group.missed(index))
             largest = np.bincount(parts.ravel())[1:].max() if count else 0
-            missed.append(largest / max(group.subject_pixels(index), 1))
-        return np.array(psnr), np.array(missed)
+            gaps.append(largest / max(group.subject_pixels(index), 1))
+        return np.array(gaps)
 
 
 def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:

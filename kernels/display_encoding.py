@@ -76,6 +76,18 @@ def spread_kernel(first: int, gradients: wp.array3d[float], factor: int, out_gra
                 out_gradients[y * factor + j, x * factor + i, channel] += share
 
 
+@wp.kernel
+def square_error_kernel(first: int, encoded: wp.array3d[float], target: wp.array3d[float], out_errors: wp.array[float]):
+    item = first + wp.tid()
+    y = item / target.shape[1]
+    x = item % target.shape[1]
+    total = float(0.0)
+    for channel in range(target.shape[2]):
+        difference = wp.clamp(encoded[y, x, channel], 0.0, 1.0) - wp.clamp(target[y, x, channel], 0.0, 1.0)
+        total += difference * difference
+    out_errors[item] = total
+
+
 def launch_encode(samples: Any, factor: int, out_encoded: Any, device: Any) -> None:
     """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode; arrays may be strided."""
     pixels = out_encoded.shape[0] * out_encoded.shape[1]
@@ -99,3 +111,8 @@ def launch_spread(gradients: Any, factor: int, out_gradients: Any, device: Any) 
     """Add the gradients of samples, given those of their averages."""
     pixels = gradients.shape[0] * gradients.shape[1]
     launch(spread_kernel, pixels, inputs=[gradients, factor], outputs=[out_gradients], device=device)
+
+
+def launch_square_error(encoded: Any, target: Any, out_errors: Any, device: Any) -> None:
+    """Write each pixel's sum of squared differences of values clipped to [0, 1]."""
+    launch(square_error_kernel, out_errors.size, inputs=[encoded, target], outputs=[out_errors], device=device)
