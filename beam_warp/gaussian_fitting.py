@@ -45,10 +45,7 @@ DISC_SPACING = 0.7
 """Deviation of an initial disc over the distance to its neighbours (`beam_warp.initialization`)."""
 
 PROGRESS_EVERY = 50
-"""Steps from one report of progress, and change of the positions' learning rate, to the next."""
-
-BAND_UNIT = 0.1
-"""Coefficient of a band that counts as 1 in the term of view dependence."""
+"""Steps from one report of progress, and change of the learning rates, to the next."""
 
 LEAST_GAIN = 0.15
 """Gain of twice as many Gaussians below which more of them do not pay [dB]."""
@@ -69,22 +66,24 @@ class LearningRates:
     """Sizes of steps, each in the units of what is moved.
 
     Attributes:
-        positions: At the start, in distances of the cameras from the subject.
-        final_positions: At the end; in between it falls by the same factor every step.
+        positions: In distances of the cameras from the subject.
         orientations: Of quaternions.
         scales: Of logarithms.
         opacities: Of logits.
         color: Of the spherical harmonics' band 0.
         bands: Of all other bands.
+        final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
+        final_others: The same of all other rates.
     """
 
     positions: float = 5e-4
-    final_positions: float = 5e-6
     orientations: float = 2e-3
     scales: float = 1e-2
     opacities: float = 3e-2
     color: float = 1e-2
     bands: float = 5e-4
+    final_positions: float = 0.01
+    final_others: float = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +102,6 @@ class FitOptions:
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
-        view_dependence: Weight of the mean squared bands above 0 of the radiance, in units of 0.1: what two dozen cameras
-            say of directions that none of them looks from is little.
         anisotropy: Weight of needles (`AnisotropyLoss`).
         opacity: Weight of opacity (`OpacityLoss`).
         temporal: Weight of changes against the start, for the frames after the first (E_temp).
@@ -130,7 +127,6 @@ class FitOptions:
     samples: int | Literal["auto"] = "auto"
     raster: RasterOptions = FIT_RASTER
     sampling_filter: bool = True
-    view_dependence: float = 0.0
     anisotropy: float = 0.0
     opacity: float = 0.0
     temporal: float = 0.0
@@ -153,7 +149,7 @@ class FitOptions:
             require_count("samples", self.samples, 1, 8)
         for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("view_dependence", "anisotropy", "opacity", "temporal"):
+        for name in ("anisotropy", "opacity", "temporal"):
             require_number(name, getattr(self, name), 0.0)
 
     @classmethod
@@ -168,7 +164,7 @@ class FitOptions:
             InvalidOptionError: There is no such preset, or an option is out of range.
         """
         require_choice("preset", preset, PRESETS)
-        rates = LearningRates(1.6e-4, 1.6e-6, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4)
+        rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
@@ -306,22 +302,20 @@ class Fitter:
         self._extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
         self._limits = SamplingLimits([view.camera for view in views], device=device)
         rates = options.rates
-        self._adam: Adam = self.parameters.optimizer(
-            {
-                "positions": rates.positions * self._extent,
-                "orientations": rates.orientations,
-                "log_scales": rates.scales,
-                "logits": rates.opacities,
-                "color": rates.color,
-                "bands": rates.bands,
-            }
-        )
+        self._rates = {
+            "positions": rates.positions * self._extent,
+            "orientations": rates.orientations,
+            "log_scales": rates.scales,
+            "logits": rates.opacities,
+            "color": rates.color,
+            "bands": rates.bands,
+        }
+        self._adam: Adam = self.parameters.optimizer(self._rates)
         self._stress = wp.zeros(count, dtype=float, device=device)
         self._seen = wp.zeros(count, dtype=float, device=device)
         self._anisotropy = AnisotropyLoss(count, device=device)
         self._opacity = OpacityLoss(count, device=device)
         self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
-        self._bands = self._band_term(count)
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._taken = 0
@@ -339,7 +333,7 @@ class Fitter:
                 self._weights = chosen.weights
                 self._graphs.clear()
             if iteration % PROGRESS_EVERY == 0:
-                self._set_position_rate(iteration / max(total - 1, 1))
+                self._set_rates(iteration / max(total - 1, 1))
                 progress(iteration, total, facts)
             view = int(order[iteration])
             self._graphs.run(view, lambda view=view: self._step(view))
@@ -393,29 +387,18 @@ class Fitter:
             ids=np.arange(len(grown["positions"])),
         )
 
-    def _band_term(self, count: int) -> tuple[TemporalLoss, wp.array, wp.array, wp.array] | None:
-        """Return the term of view dependence and what it reads and writes; None without it."""
-        columns = 3 * (self.options.sh_degree + 1) ** 2
-        if self.options.view_dependence == 0.0 or columns == 3:
-            return None
-        radiance, gradients = (
-            float_rows(array) for array in (self.parameters.radiance, self.parameters.gradient("radiance"))
-        )
-        zeros = wp.zeros((count, columns - 3), dtype=float, device=self.device)
-        return TemporalLoss((count, columns - 3), device=self.device), radiance[:, 3:], zeros, gradients[:, 3:]
-
     def _order(self, total: int) -> NDArray[np.int64]:
         """Return which view each step looks at: all of them, shuffled, again and again."""
         rng = np.random.default_rng(self.options.seed)
         rounds = -(-total // len(self._targets))
         return np.concatenate([rng.permutation(len(self._targets)) for _ in range(max(rounds, 1))])
 
-    def _set_position_rate(self, part: float) -> None:
-        """Let steps of positions shrink."""
+    def _set_rates(self, part: float) -> None:
+        """Let steps shrink: ``part`` of them have been taken."""
         rates = self.options.rates
-        if rates.positions > 0.0:
-            rate = rates.positions * (rates.final_positions / rates.positions) ** part
-            self._adam.set_learning_rate("positions", rate * self._extent)
+        for name in self._adam.parameters:
+            final = rates.final_positions if name == "positions" else rates.final_others
+            self._adam.set_learning_rate(name, self._rates[name] * final**part)
 
     def _renew(self) -> float:
         """Bring the sampling filter and the room for pairs up to date; return the mean PSNR of the views [dB]."""
@@ -440,9 +423,6 @@ class Fitter:
         self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
-        if self._bands is not None:
-            term, values, zeros, gradients = self._bands
-            term(values, zeros, weight=chosen.view_dependence, unit=BAND_UNIT, gradient=gradients)
         if self._temporal is not None:
             self._temporal.add_gradients(chosen.temporal)
         self._adam.step()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,19 +44,20 @@ class JointOptions:
         levels: Reductions of the images, coarse to fine: the coarser, the further a motion is found.
         iterations: Steps at each of them.
         weights: What the images' terms count.
-        rigidity: What motion that is not rigid around each joint counts (E_smooth).
-        rotation_rate: Size of steps of quaternions.
-        position_rate: Size of steps, in distances between joints.
-        final_rate: Part of both that is left at the end.
+        rigidity: What motion that is not rigid around each joint counts at full resolution (E_smooth); on reduced
+            images as many times less as these have fewer pixels: stiff joints turn too slowly for what is far away.
+        rotation_rate: Size of steps of quaternions at full resolution; at others as many times as they are reduced.
+        position_rate: Likewise, in distances between joints.
+        final_rate: Part of both that is left at the end of each level.
         blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
     """
 
     levels: tuple[int, ...] = (8, 4, 2, 1)
-    iterations: tuple[int, ...] = (100, 100, 100, 200)
+    iterations: tuple[int, ...] = (200, 200, 150, 200)
     weights: LossWeights = field(default_factory=lambda: LossWeights(alpha=1.0))
-    rigidity: float = 2.0
-    rotation_rate: float = 1e-2
-    position_rate: float = 5e-2
+    rigidity: float = 1.0
+    rotation_rate: float = 5e-3
+    position_rate: float = 3e-2
     final_rate: float = 0.1
     blend: str = "linear"
 
@@ -120,10 +122,8 @@ class JointTracker:
         chosen = self._options
         wp.copy(self._rotations, upload(start.rotations, wp.quat, self.device))
         wp.copy(self._positions, upload(start.positions, wp.vec3, self.device))
-        total = sum(chosen.iterations)
         rng = np.random.default_rng(seed)
         rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
-        done = 0
         for level, iterations in zip(chosen.levels, chosen.iterations, strict=True):
             reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
             targets = TargetSet(reduced, self._count, self._raster, samples if level == 1 else 1, self.device)
@@ -140,10 +140,10 @@ class JointTracker:
             order = np.concatenate([rng.permutation(len(targets)) for _ in range(max(rounds, 1))])
             for iteration in range(iterations):
                 for name, rate in rates.items():
-                    adam.set_learning_rate(name, rate * chosen.final_rate ** ((done + iteration) / total))
+                    left = chosen.final_rate ** (iteration / iterations)
+                    adam.set_learning_rate(name, level * rate * left)
                 view = int(order[iteration])
-                graphs.run(view, lambda view=view, targets=targets, adam=adam: self._step(targets, view, adam))
-            done += iterations
+                graphs.run(view, partial(self._step, targets, view, adam, chosen.rigidity / level**2))
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
         return JointPose(rotations.astype(np.float32), self._positions.numpy())
@@ -158,7 +158,7 @@ class JointTracker:
     def _carry(self) -> None:
         self._skin.warp(self._rotations, self._positions, self._drawn.positions, self._drawn.orientations)
 
-    def _step(self, targets: TargetSet, view: int, adam: Adam) -> None:
+    def _step(self, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
         """Draw a view, compare, and move the joints."""
         group, index = targets[view]
         self._carry()
@@ -181,7 +181,7 @@ class JointTracker:
             self._positions,
             self._rest_rotations,
             self._rest_positions,
-            weight=self._options.rigidity,
+            weight=rigidity,
             rotation_gradients=self._rotation_gradients,
             position_gradients=self._position_gradients,
         )

@@ -25,7 +25,7 @@ class FitAndTrack:
 
     Attributes:
         fitting: How key frames are fitted.
-        tracking: How other frames follow from the one before.
+        tracking: How other frames follow from the one before; drawn and compared as `fitting` says.
         points: What is known of the surfaces before, for images without masks; None if nothing is.
         device: Warp device; None takes the first CUDA device, or the CPU.
     """
@@ -40,11 +40,15 @@ class FitAndTrack:
         """How splats are drawn."""
         return self.fitting.raster
 
+    @property
+    def _tracking(self) -> TrackOptions:
+        return self.tracking.following(self.fitting)
+
     def options(self) -> Mapping[str, Any]:
         """Return all that results depend on, but for the device; JSON-able."""
         return {
             "fitting": asdict(self.fitting),
-            "tracking": asdict(self.tracking),
+            "tracking": asdict(self._tracking),
             "points": None if self.points is None else _digest(self.points),
         }
 
@@ -61,13 +65,13 @@ class FitAndTrack:
             seed=chosen.seed,
         )
         fit = fit_gaussians(views, start, chosen, device=self.device, progress=progress)
-        return begin_track(fit.cloud, views, self.tracking, device=self.device), dict(fit.report)
+        return begin_track(fit.cloud, views, self._tracking, device=self.device), dict(fit.report)
 
     def advance(
         self, track: Track, views: Sequence[CapturedView], progress: StepProgress
     ) -> tuple[Track, dict[str, Any]]:
         """Track the frame after."""
-        return advance_track(track, views, self.tracking, device=self.device, progress=progress)
+        return advance_track(track, views, self._tracking, device=self.device, progress=progress)
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""

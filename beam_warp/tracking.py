@@ -48,6 +48,7 @@ class TrackOptions:
         largest_drop: PSNR may be so much below the key frame's [dB].
         largest_gap: Connected part of the subject that may stay uncovered in a view, beyond the key frame's.
         largest_tear: Part of the joints that may be torn from a neighbour.
+        raster: How splats are drawn.
     """
 
     joint_count: int | None = None
@@ -56,7 +57,7 @@ class TrackOptions:
         default_factory=lambda: FitOptions(
             color_iterations=0,
             normal_iterations=400,
-            rates=LearningRates(1e-4, 1e-5, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4),
+            rates=LearningRates(1e-4, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4, final_positions=0.1),
             temporal=1e-3,
         )
     )
@@ -64,6 +65,17 @@ class TrackOptions:
     largest_drop: float = 6.0
     largest_gap: float = 0.03
     largest_tear: float = 0.1
+
+    def following(self, fitting: FitOptions) -> TrackOptions:
+        """Return the options for key frames that were fitted so: drawn in the same way, met by the same terms."""
+        refinement = replace(
+            self.refinement,
+            weights=fitting.weights,
+            sh_degree=fitting.sh_degree,
+            samples=fitting.samples,
+            seed=fitting.seed,
+        )
+        return replace(self, refinement=refinement, raster=fitting.raster)
 
 
 @dataclass(frozen=True, eq=False)

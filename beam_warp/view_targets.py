@@ -298,7 +298,7 @@ class TargetSet:
         return shares
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
-        """Draw every view; return its largest connected part of the subject that is not drawn, as a fraction, ``(V,)``."""
+        """Draw every view; return the largest connected part of its subject that is not drawn, a fraction, ``(V,)``."""
         gaps = []
         for group, index in self._places:
             group.draw(index, gaussians)

@@ -52,10 +52,11 @@ OTHERS = (RADE_GS_LIKE,)
 
 TARGETS = {
     "psnr": (37.0, "at least"),
+    "whole_psnr": (37.0, "at least"),
     "normals_median_degrees": (6.0, "at most"),
     "chamfer_mm": (2.0, "at most"),
 }
-"""Of the first frame."""
+"""Of the first frame; PSNR in the subject's box, and of whole images."""
 
 LARGEST_LOSS = {"psnr": 1.0, "chamfer_mm": 1.0}
 """By how much the last frame may be worse."""
@@ -95,7 +96,7 @@ class Effort:
 
 
 FULL = Effort(
-    gaussians=100_000,
+    gaussians=140_000,
     counts=(20_000, 50_000, 100_000, 200_000, 300_000),
     cameras=(8, 12, 16, 24),
     large_gaussians=140_000,
@@ -151,6 +152,7 @@ class Bench:
             truth_mesh=read_truth_mesh(chosen, modelled.frame),
             seeing=seeing,
             options=contender.options,
+            samples=modelled.samples,
             sample_count=self.effort.surface_samples,
             device=self.device.alias,
         )
@@ -189,6 +191,8 @@ def measure_walker(bench: Bench) -> Row:
         found["contenders"][name] = {
             "frames": rows,
             "seconds": [round(entry.seconds, 3) for entry in modelled],
+            "training_psnr": [round(entry.report["psnr"], 3) for entry in modelled],
+            "lost": [entry.report.get("lost", "") for entry in modelled],
             "drift": [{"frame": frame, **row.as_dict()} for frame, row in zip(frames, drift, strict=True)],
             "reached": reached(rows),
         }
@@ -268,6 +272,7 @@ def measure_large(bench: Bench) -> Row:
                         modelled.cloud,
                         capture.select(split="test", frames=[modelled.frame]),
                         options=contender.options,
+                        samples=modelled.samples,
                         device=bench.device.alias,
                     ).as_dict(),
                 }

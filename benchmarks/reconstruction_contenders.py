@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 import trimesh
 import warp as wp
 
@@ -19,21 +18,10 @@ from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
 from beam_warp.capture_stability import Reconstructed
 from beam_warp.captured_views import CapturedView
-from beam_warp.captures import Capture, CaptureRecord
+from beam_warp.captures import Capture
 from beam_warp.devices import resolve_device
 from beam_warp.raster_records import RasterOptions
 from beam_warp.stress_captures import TRACKING_LOST, Detection, detections_of, training_cameras
-
-RADE_GS_LIKE: dict[str, Any] = {
-    "color_iterations": 15_000,
-    "normal_iterations": 15_000,
-    "normal_weight": 0.05,
-    "sh_degree": 3,
-    "alpha_weight": 0.0,
-    "raster": RasterOptions(antialiased=False),
-}
-"""RaDe-GS (Zhang et al. 2024) as published: 30,000 iterations, depth-normal consistency of weight 0.05 in the second
-half, degree 3, no loss of coverage, no filter that keeps energy."""
 
 
 class StepsLike(Protocol):
@@ -67,26 +55,29 @@ class Contender:
 
 def ours(gaussian_count: int, device: str | None, **fitting: Any) -> Contender:
     """Return this package's reconstruction, with its defaults but for what is given."""
+    return _of_preset("ours", "fast", gaussian_count, device, fitting)
+
+
+def rade_gs_like(gaussian_count: int, device: str | None, iterations: int | None = None) -> Contender:
+    """Return ours with RaDe-GS's choices; ``iterations`` in all, half of them with normals, if not the preset's."""
+    changes: dict[str, Any] = {}
+    if iterations is not None:
+        changes = {"color_iterations": iterations // 2, "normal_iterations": iterations - iterations // 2}
+    return _of_preset("RaDe-GS-like settings", "rade", gaussian_count, device, changes)
+
+
+def _of_preset(name: str, preset: str, count: int, device: str | None, changes: dict[str, Any]) -> Contender:
     from beam_warp.gaussian_fitting import FitOptions
     from beam_warp.meshing import mesh_of_gaussians
     from beam_warp.reconstruction_steps import FitAndTrack
 
-    options = FitOptions(gaussian_count=gaussian_count, **fitting)
+    options = FitOptions.of_preset(preset, gaussian_count=count, **changes)
     return Contender(
-        "ours",
+        name,
         FitAndTrack(fitting=options, device=device),
         lambda cloud, cameras: mesh_of_gaussians(cloud, cameras, options=options.raster, device=device),
         options.raster,
     )
-
-
-def rade_gs_like(gaussian_count: int, device: str | None, iterations: int | None = None) -> Contender:
-    """Return ours with RaDe-GS's choices; ``iterations`` in all, half of them with normals, if not theirs."""
-    chosen = dict(RADE_GS_LIKE)
-    if iterations is not None:
-        chosen |= {"color_iterations": iterations // 2, "normal_iterations": iterations - iterations // 2}
-    found = ours(gaussian_count, device, **chosen)
-    return Contender("RaDe-GS-like settings", found.steps, found.mesh, found.options)
 
 
 @dataclass(frozen=True)
@@ -98,12 +89,14 @@ class ModelledFrame:
         cloud: Its Gaussians.
         seconds: From images in memory to Gaussians on the device's host.
         report: What the step said.
+        samples: Side of the square of samples that a pixel was the mean of, in the key frame's fit.
     """
 
     frame: int
     cloud: GaussianCloud
     seconds: float
     report: dict[str, Any]
+    samples: int
 
 
 def follow(
@@ -114,31 +107,20 @@ def follow(
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ModelledFrame]:
     """Fit the first of some frames and track the others; reading images is not timed."""
-    track = None
+    track, samples = None, 1
     for frame in frames:
-        views = [view_of(record) for record in capture.select(split="train", frames=[frame])]
+        views = [record.view() for record in capture.select(split="train", frames=[frame])]
         started = time.perf_counter()
         if track is None:
             track, report = contender.steps.begin(views, _nobody)
+            samples = int(report.get("samples", 1))
         else:
             track, report = contender.steps.advance(track, views, _nobody)
         if device.is_cuda:
             wp.synchronize_device(device)
         seconds = time.perf_counter() - started
         say(f"{contender.name}, frame {frame}: {len(track.cloud):,} Gaussians, {seconds:.1f} s")
-        yield ModelledFrame(frame, track.cloud, seconds, report)
-
-
-def view_of(record: CaptureRecord) -> CapturedView:
-    """Read what a record's camera saw."""
-    image = record.image()
-    rgba = image.linear_rgba()
-    return CapturedView(
-        name=record.name,
-        camera=record.camera,
-        color=np.ascontiguousarray(rgba[..., :3]),
-        alpha=None if image.alpha is None else np.clip(rgba[..., 3], 0.0, 1.0),
-    )
+        yield ModelledFrame(frame, track.cloud, seconds, report, samples)
 
 
 def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[Capture], Reconstructed]:
@@ -153,7 +135,7 @@ def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[
         )
         clouds, key_frames, track = [], [], None
         for index, frame in enumerate(ready.capture.frames):
-            views = [view_of(record) for record in ready.capture.select(split="train", frames=[frame])]
+            views = [record.view() for record in ready.capture.select(split="train", frames=[frame])]
             report: dict[str, Any] = {"lost": "start"}
             if track is not None:
                 track, report = contender.steps.advance(track, views, _nobody)
