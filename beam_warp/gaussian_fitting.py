@@ -83,7 +83,7 @@ class LearningRates:
     color: float = 1e-2
     bands: float = 5e-4
     final_positions: float = 0.01
-    final_others: float = 0.1
+    final_others: float = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
