@@ -205,7 +205,7 @@ class Twin:
 def test_the_gradient_of_a_step_is_that_of_its_loss(device, samples, weights):
     """From photographs to what is moved: encoding, samples, four terms, rasteriser, activation, all at once.
 
-    1e-5 of every gradient's length is the goal that all gradients here have; found in twelve such scenes: 3.5e-6 at most.
+    1e-5 of every gradient's length is the goal that all gradients here have; 3.5e-6 was the most in twelve scenes.
     """
     rng = np.random.default_rng(3)
     view = random_view(rng, camera_of(19, 14))
