@@ -451,6 +451,8 @@ class Fitter:
         changed = dead.copy()
         changed[strained] = changed[taken] = True
         self._adam.restart(changed)
+        if self._temporal is not None:
+            self._temporal.hold(changed)
         self._stress.zero_()
         self._seen.zero_()
 
@@ -467,6 +469,13 @@ class _Anchored:
         for name in self._units:
             rows = float_rows(getattr(parameters, name))
             self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
+
+    def hold(self, changed: NDArray[np.bool_]) -> None:
+        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
+        for name, (_, reference) in self._terms.items():
+            held = reference.numpy().copy()
+            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
+            reference.assign(held)
 
     def add_gradients(self, weight: float) -> None:
         for name, (term, reference) in self._terms.items():
