@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
@@ -73,6 +73,9 @@ class LearningRates:
         opacities: Of logits.
         color: Of the spherical harmonics' band 0.
         bands: Of all other bands.
+
+    Raises:
+        InvalidOptionError: A rate is negative or no number.
     """
 
     positions: float = 5e-4
@@ -82,6 +85,11 @@ class LearningRates:
     opacities: float = 3e-2
     color: float = 1e-2
     bands: float = 5e-4
+
+    def __post_init__(self) -> None:
+        """Check every rate once: the last of the positions is not reached before many steps are taken."""
+        for rate in fields(self):
+            require_number(rate.name, getattr(self, rate.name), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
