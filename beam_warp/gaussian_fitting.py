@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
@@ -65,15 +65,18 @@ class FitProgress(Protocol):
 class LearningRates:
     """Sizes of steps, each in the units of what is moved.
 
-    Attributes:
-        positions: In distances of the cameras from the subject.
-        orientations: Of quaternions.
-        scales: Of logarithms.
-        opacities: Of logits.
-        color: Of the spherical harmonics' band 0.
-        bands: Of all other bands.
+        Attributes:
+            positions: In distances of the cameras from the subject.
+            orientations: Of quaternions.
+            scales: Of logarithms.
+            opacities: Of logits.
+            color: Of the spherical harmonics' band 0.
+            bands: Of all other bands.
         final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
         final_others: The same of all other rates.
+
+    Raises:
+        InvalidOptionError: A rate is negative or no number.
     """
 
     positions: float = 5e-4
@@ -84,6 +87,11 @@ class LearningRates:
     bands: float = 5e-4
     final_positions: float = 0.01
     final_others: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Check every rate once: the last of the positions is not reached before many steps are taken."""
+        for rate in fields(self):
+            require_number(rate.name, getattr(self, rate.name), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -458,6 +466,8 @@ class Fitter:
         changed = dead.copy()
         changed[strained] = changed[taken] = True
         self._adam.restart(changed)
+        if self._temporal is not None:
+            self._temporal.hold(changed)
         self._stress.zero_()
         self._seen.zero_()
 
@@ -474,6 +484,13 @@ class _Anchored:
         for name in self._units:
             rows = float_rows(getattr(parameters, name))
             self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
+
+    def hold(self, changed: NDArray[np.bool_]) -> None:
+        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
+        for name, (_, reference) in self._terms.items():
+            held = reference.numpy().copy()
+            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
+            reference.assign(held)
 
     def add_gradients(self, weight: float) -> None:
         for name, (term, reference) in self._terms.items():

@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from beam_warp.adam import Adam, Parameters
-from beam_warp.assets import LINEAR_REC709, GaussianCloud
+from beam_warp.assets import LINEAR_REC709, MAX_SH_DEGREE, GaussianCloud
+from beam_warp.checks import require_count
 from beam_warp.device_arrays import float_rows
 from beam_warp.devices import upload
+from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.activation import Shapes, launch_activate, launch_add_rows, launch_add_shape_gradients
 from beam_warp.raster_records import GaussianArrays, GaussianGradients
 
@@ -43,9 +46,15 @@ class GaussianParameters:
             device: Warp device.
             row_count: Room for Gaussians, at least the cloud's; its number without.
             sh_degree: Of the radiance; the cloud's is cut or filled up with zeros.
+
+        Raises:
+            InvalidArrayError: The cloud has no radiance, or not in scene-linear Rec.709.
+            InvalidOptionError: ``row_count`` or ``sh_degree`` is out of range.
         """
+        captured = require_scene_linear("start", cloud)
         count = len(cloud)
-        rows = count if row_count is None else row_count
+        rows = count if row_count is None else require_count("row_count", row_count, count)
+        require_count("sh_degree", sh_degree, 0, MAX_SH_DEGREE)
         self.device = device
 
         def padded(array: Any, fill: float = 0.0) -> Any:
@@ -55,9 +64,8 @@ class GaussianParameters:
 
         bands = (sh_degree + 1) ** 2
         radiance = np.zeros((count, bands, 3), np.float32)
-        if cloud.radiance is not None:
-            kept = min(bands, cloud.radiance.shape[1])
-            radiance[:, :kept] = cloud.radiance[:, :kept]
+        kept = min(bands, captured.shape[1])
+        radiance[:, :kept] = captured[:, :kept]
         opacities = np.clip(cloud.opacities.astype(np.float64), 1e-12, 1.0 - 1e-12)
         logits = np.clip(np.log(opacities / (1.0 - opacities)), -LOGIT_LIMIT, LOGIT_LIMIT)
         self.positions = upload(padded(cloud.positions), wp.vec3, device)
@@ -155,3 +163,17 @@ class GaussianParameters:
             radiance_color_space=LINEAR_REC709,
             ids=np.flatnonzero(alive),
         )
+
+
+def require_scene_linear(name: str, cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return a cloud's radiance after checking that it is light: display colours would be taken for it.
+
+    Raises:
+        InvalidArrayError: There is none, or not in scene-linear Rec.709.
+    """
+    if cloud.radiance is None or cloud.radiance_color_space != LINEAR_REC709:
+        raise InvalidArrayError(
+            f"{name} must have radiance in {LINEAR_REC709}, got {cloud.radiance_color_space or 'none'}. "
+            "Begin from initial_gaussians, or with a cloud that was fitted in linear light."
+        )
+    return cloud.radiance

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from beam_warp.adam import Adam, Parameters
 from beam_warp.assets import GaussianCloud
 from beam_warp.captured_views import CapturedView
+from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.devices import upload
+from beam_warp.errors import InvalidOptionError
 from beam_warp.joint_graph import JointGraph
 from beam_warp.motion_losses import RigidityLoss
 from beam_warp.raster_records import GaussianArrays, RasterOptions
-from beam_warp.skinning import Anchors, Skin
+from beam_warp.skinning import BLENDS, Anchors, Skin
 from beam_warp.step_graphs import StepGraphs
 from beam_warp.view_targets import LossWeights, TargetSet
 
@@ -50,6 +52,9 @@ class JointOptions:
         position_rate: Likewise, in distances between joints.
         final_rate: Part of both that is left at the end of each level.
         blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
+
+    Raises:
+        InvalidOptionError: An option is out of range, or levels and iterations are not as many.
     """
 
     levels: tuple[int, ...] = (8, 4, 2, 1)
@@ -60,6 +65,21 @@ class JointOptions:
     position_rate: float = 3e-2
     final_rate: float = 0.1
     blend: str = "linear"
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        if not len(self.levels) or len(self.levels) != len(self.iterations):
+            raise InvalidOptionError(
+                f"levels and iterations must be as many, at least one, got {len(self.levels)} and "
+                f"{len(self.iterations)}. Give each level its steps."
+            )
+        for level, iterations in zip(self.levels, self.iterations, strict=True):
+            require_count("levels", level)
+            require_count("iterations", iterations, 0)
+        for name in ("rigidity", "rotation_rate", "position_rate"):
+            require_number(name, getattr(self, name), 0.0)
+        require_number("final_rate", self.final_rate, 0.0, 1.0)
+        require_choice("blend", self.blend, BLENDS)
 
 
 class JointTracker:
@@ -146,14 +166,15 @@ class JointTracker:
                 graphs.run(view, partial(self._step, targets, view, adam, chosen.rigidity / level**2))
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
-        return JointPose(rotations.astype(np.float32), self._positions.numpy())
+        return JointPose(rotations.astype(np.float32), self._positions.numpy().copy())  # on the CPU it is the array
 
     def carried(self, cloud: GaussianCloud) -> GaussianCloud:
         """Return a cloud where the joints carry it now."""
         self._carry()
         orientations = self._drawn.orientations.numpy().astype(np.float64)
         orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
-        return cloud.with_arrays(positions=self._drawn.positions.numpy(), orientations=orientations.astype(np.float32))
+        positions = self._drawn.positions.numpy().copy()  # on the CPU it is the array
+        return cloud.with_arrays(positions=positions, orientations=orientations.astype(np.float32))
 
     def _carry(self) -> None:
         self._skin.warp(self._rotations, self._positions, self._drawn.positions, self._drawn.orientations)

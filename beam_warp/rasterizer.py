@@ -193,10 +193,7 @@ class Rasterizer:
         Raises:
             InvalidOptionError: A number or size differs from this rasteriser's.
         """
-        sizes = [(camera.width, camera.height) for camera in self.cameras]
-        given = [(camera.width, camera.height) for camera in cameras]
-        if given != sizes:
-            raise InvalidOptionError(f"cameras must have the sizes {sizes}, got {given}. Make another Rasterizer.")
+        self._require_sizes(cameras)
         layout = ViewLayout.of(cameras)
         return PreparedCameras(tuple(cameras), layout, wp.array(layout.views, dtype=View, device=self.device))
 
@@ -209,9 +206,17 @@ class Rasterizer:
             InvalidOptionError: A number or size differs.
         """
         prepared = cameras if isinstance(cameras, PreparedCameras) else self.prepare_cameras(cameras)
+        self._require_sizes(prepared.cameras)
         self.cameras = prepared.cameras
         self._layout = prepared.layout
         wp.copy(self._views, prepared.views)
+
+    def _require_sizes(self, cameras: Sequence[Camera]) -> None:
+        """Refuse cameras for which other arrays would be needed."""
+        sizes = [(camera.width, camera.height) for camera in self.cameras]
+        given = [(camera.width, camera.height) for camera in cameras]
+        if given != sizes:
+            raise InvalidOptionError(f"cameras must have the sizes {sizes}, got {given}. Make another Rasterizer.")
 
     @property
     def first_pixels(self) -> tuple[int, ...]:

@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, GaussianCloud
+from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, GaussianCloud, sh_degree_of
 from beam_warp.captured_views import CapturedView
+from beam_warp.checks import require_count, require_number
 from beam_warp.devices import resolve_device
+from beam_warp.errors import InvalidArrayError
 from beam_warp.gaussian_fitting import FIT_RASTER, FitOptions, FitProgress, Fitter, LearningRates, no_fit_progress
+from beam_warp.gaussian_parameters import require_scene_linear
 from beam_warp.joint_graph import JointGraph, stretch
 from beam_warp.joint_selection import select_joints
 from beam_warp.joint_tracking import JointOptions, JointPose, JointTracker
@@ -44,11 +47,15 @@ class TrackOptions:
     Attributes:
         joint_count: Joints; None for one for every `GAUSSIANS_PER_JOINT` Gaussians.
         joints: How they are moved.
-        refinement: How the Gaussians that they carried are fitted; counts and refinements are not used.
+        refinement: How the Gaussians that they carried are fitted; counts, refinements and the degree of the radiance,
+            which is the key frame's, are not used.
         largest_drop: PSNR may be so much below the key frame's [dB].
         largest_gap: Connected part of the subject that may stay uncovered in a view, beyond the key frame's.
         largest_tear: Part of the joints that may be torn from a neighbour.
         raster: How splats are drawn.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
     """
 
     joint_count: int | None = None
@@ -76,6 +83,13 @@ class TrackOptions:
             seed=fitting.seed,
         )
         return replace(self, refinement=refinement, raster=fitting.raster)
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        if self.joint_count is not None:
+            require_count("joint_count", self.joint_count)
+        for name in ("largest_drop", "largest_gap", "largest_tear"):
+            require_number(name, getattr(self, name), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +155,14 @@ def begin_track(
         options: See `TrackOptions`.
         device: Warp device; None takes the first CUDA device, or the CPU.
 
+    Raises:
+        InvalidArrayError: There is no view or no Gaussian, or the cloud's radiance is not scene-linear Rec.709.
+        DeviceError: There is no such device.
+
     Source: Jiang et al. 2024, DualGS; `docs/tracking.md` lists what differs.
     """
+    _require_something(cloud, views)
+    require_scene_linear("cloud", cloud)
     count = options.joint_count or int(np.clip(len(cloud) // GAUSSIANS_PER_JOINT, *JOINT_LIMITS))
     rows = select_joints(cloud.positions, min(count, len(cloud)), opacities=cloud.opacities)
     normals = outward_normals(cloud, views)
@@ -180,7 +200,12 @@ def advance_track(
     Returns:
         The track of the frame, and a report, JSON-able: ``psnr`` of the training views' crops [dB], ``gap``,
         ``torn``, ``gaussians``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
+
+    Raises:
+        InvalidArrayError: There is no view.
+        DeviceError: There is no such device.
     """
+    _require_something(track.cloud, views)
     began = time.perf_counter()
     target = resolve_device(device)
     chosen = options.refinement
@@ -194,6 +219,7 @@ def advance_track(
         chosen,
         gaussian_count=len(carried),
         refine_every=0,
+        sh_degree=sh_degree_of(require_scene_linear("cloud", carried).shape[1]),  # the key frame's
         samples=samples,
         raster=options.raster,
         sampling_filter=False,  # it is in the scales already
@@ -234,6 +260,14 @@ def outward_normals(cloud: GaussianCloud, views: Sequence[CapturedView]) -> NDAr
     normals[flat[:, 0] > 0.5 * flat[:, 1]] = 0.0
     normals[thin != 2] = 0.0  # which side is out is not known
     return normals.astype(np.float32)
+
+
+def _require_something(cloud: GaussianCloud, views: Sequence[CapturedView]) -> None:
+    """Refuse nothing."""
+    if not len(views) or not len(cloud):
+        raise InvalidArrayError(
+            f"views and cloud must hold something, got {len(views)} views and {len(cloud)} Gaussians. Pass some."
+        )
 
 
 def _expected(track: Track) -> JointPose:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from beam_warp.captured_views import CapturedView
+from beam_warp.checks import require_number
 from beam_warp.depth_normals import DepthNormals
 from beam_warp.device_arrays import pixel_channels
 from beam_warp.devices import upload
@@ -49,12 +50,20 @@ class LossWeights:
         ssim: One minus the structural similarity of encoded colours.
         alpha: Mean absolute difference of coverage, where it is known.
         normal: Disagreement of the Gaussians' normals with those of the drawn depth (BEAM Eq. 2).
+
+    Raises:
+        InvalidOptionError: A weight is negative or no number.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     alpha: float = 0.5
     normal: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check every weight once; a term that counts 0 is left out, and NaN must not pass for it."""
+        for name in ("l1", "ssim", "alpha", "normal"):
+            require_number(name, getattr(self, name), 0.0)
 
 
 def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
@@ -322,4 +331,6 @@ def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spa
     """
     footprints = [float((center - view.camera.position) @ view.camera.forward) / view.camera.focal_x for view in views]
     footprint = float(np.median(footprints))
-    return int(np.clip(np.ceil(2.0 * footprint / spacing), 1, MOST_SAMPLES)) if footprint > 0.0 else 1
+    if not footprint > 0.0:
+        return 1
+    return int(np.ceil(2.0 * footprint / spacing)) if MOST_SAMPLES * spacing > 2.0 * footprint else MOST_SAMPLES

@@ -39,6 +39,22 @@ def sigmoid(x: float) -> float:
     return 1.0 / (1.0 + wp.exp(-x))
 
 
+@wp.func
+def widened(scale: float, filter: float) -> float:
+    wide = wp.sqrt(scale * scale + filter * filter)
+    if wide < scale:  # steps may shrink a scale until its square is no float
+        wide = scale
+    return wide
+
+
+@wp.func
+def part_of(some: float, whole: float) -> float:
+    part = float(1.0)
+    if whole != 0.0:  # a scale of 0 without a filter stays as it is
+        part = some / whole
+    return part
+
+
 @wp.kernel
 def activate_kernel(first: int, shapes: Shapes, out_scales: wp.array[wp.vec3], out_opacities: wp.array[float]):
     item = first + wp.tid()
@@ -49,8 +65,8 @@ def activate_kernel(first: int, shapes: Shapes, out_scales: wp.array[wp.vec3], o
     opacity = sigmoid(shapes.logits[item])
     for axis in range(3):
         if axis != thin:
-            wide = wp.sqrt(scales[axis] * scales[axis] + filter * filter)
-            opacity *= scales[axis] / wide
+            wide = widened(scales[axis], filter)
+            opacity *= part_of(scales[axis], wide)
             scales[axis] = wide
     out_scales[item] = scales
     out_opacities[item] = opacity
@@ -74,18 +90,22 @@ def add_shape_gradients_kernel(
     kept = float(1.0)
     for axis in range(3):
         if axis != thin:
-            kept *= scales[axis] / wp.sqrt(scales[axis] * scales[axis] + filter * filter)
+            kept *= part_of(scales[axis], widened(scales[axis], filter))
     opacity_gradient = opacity_gradients[item]
     gradient = scale_gradients[item]
     found = out_log_scales[item]
     for axis in range(3):
-        square = scales[axis] * scales[axis]
-        excess = filter * filter
+        scale = scales[axis]
         if axis == thin:
-            excess = 0.0
-        # ds'/dlog s = s^2 / s'; dlog(s / s')/dlog s = 1 - s^2 / s'^2
-        found[axis] += gradient[axis] * square / wp.sqrt(square + excess)
-        found[axis] += opacity_gradient * peak * kept * (excess / (square + excess))
+            found[axis] += gradient[axis] * scale
+        else:
+            # ds'/dlog s = s^2 / s'; dlog(s / s')/dlog s = 1 - s^2 / s'^2 = (f / s')^2
+            wide = widened(scale, filter)
+            gone = float(0.0)
+            if filter > 0.0:
+                gone = filter / wide
+            found[axis] += gradient[axis] * scale * part_of(scale, wide)
+            found[axis] += opacity_gradient * peak * kept * gone * gone
     out_log_scales[item] = found
     out_logits[item] += opacity_gradient * kept * peak * (1.0 - peak)
 

@@ -47,7 +47,8 @@ def set_gradients(adam, gradients):
 
 
 def values_of(adam):
-    return {name: group.values.numpy().reshape(len(group.values), -1) for name, group in adam.parameters.items()}
+    """Copies: on the CPU the array itself would move with the next step."""
+    return {name: group.values.numpy().reshape(len(group.values), -1).copy() for name, group in adam.parameters.items()}
 
 
 class Twin:
@@ -140,6 +141,60 @@ class TestTwin:
             adam.step()
             twin.step(gradients)
         assert_close(values_of(adam), twin, 10)
+
+
+@pytest.mark.parametrize("count", [1, 257])
+class TestRestart:
+    def test_rows_begin_again_and_the_others_go_on(self, device, rng, count):
+        values, marks = random_rows(rng, count), rng.uniform(size=count) < 0.5
+        adam, twin = Adam(parameters_of(values, device)), Twin(values, RATES)
+        for step in range(8):
+            if step == 5:
+                adam.restart(marks)
+                for part in (twin.means, twin.squares):
+                    for array in part.values():
+                        array[marks] = 0.0
+                twin.steps[marks] = 0.0
+            gradients = random_rows(rng, count)
+            set_gradients(adam, gradients)
+            adam.step()
+            twin.step(gradients)
+        assert_close(values_of(adam), twin, 8)
+
+    def test_nothing_else_changes(self, device, rng, count):
+        """No value moves, no array is another one: steps that were captured go on."""
+        values = random_rows(rng, count)
+        adam = Adam(parameters_of(values, device))
+        set_gradients(adam, random_rows(rng, count))
+        adam.step()
+        before, places = values_of(adam), [group.values.ptr for group in adam.parameters.values()]
+        adam.restart(np.ones(count, bool))
+        assert [group.values.ptr for group in adam.parameters.values()] == places
+        for name, found in values_of(adam).items():
+            assert (found == before[name]).all()
+        gradients = random_rows(rng, count)
+        set_gradients(adam, gradients)
+        adam.step()
+        for name, found in values_of(adam).items():  # a first step again: the rate, against the sign
+            bound = 8.0 * EPSILON * RATES[name] + 2.0 * EPSILON * (np.abs(before[name]) + RATES[name])
+            assert (np.abs(found - before[name] + RATES[name] * np.sign(gradients[name])) <= bound).all()
+
+    def test_a_fresh_row_without_a_gradient_stays(self, device, rng, count):
+        values = random_rows(rng, count)
+        adam = Adam(parameters_of(values, device))
+        set_gradients(adam, random_rows(rng, count))
+        adam.step()
+        adam.restart(np.ones(count, bool))
+        before = values_of(adam)
+        set_gradients(adam, {name: np.zeros_like(array) for name, array in values.items()})
+        for _ in range(3):
+            adam.step()
+        assert all((found == before[name]).all() for name, found in values_of(adam).items())
+
+    def test_a_mask_of_another_length_is_refused(self, device, rng, count):
+        adam = Adam(parameters_of(random_rows(rng, count), device))
+        with pytest.raises(InvalidArrayError, match="rows must have shape"):
+            adam.restart(np.ones(count + 1, bool))
 
 
 def test_rows_without_a_past(device, rng):

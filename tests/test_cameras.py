@@ -42,6 +42,33 @@ def test_directions_invert_project(rng):
     np.testing.assert_allclose(pixels[..., 1], rows + 0.5, atol=DOUBLE_ROUNDING)
 
 
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_samples_of_a_pixel_lie_in_it(rng, factor):
+    """A point's place grows with the image, and the samples of a pixel are spread evenly around its centre's ray."""
+    camera = Camera(7, 5, 6.0, 5.0, 3.2, 2.4, Camera.orbit((0, 0, 1), 4.0, 37.0, 21.0, **SIZE).camera_to_world)
+    fine = camera.supersampled(factor)
+    assert (fine.width, fine.height) == (7 * factor, 5 * factor)
+    points = rng.uniform(-1.0, 1.0, (20, 3))
+    expected = camera.project(points) * (factor, factor, 1.0)
+    np.testing.assert_allclose(fine.project(points), expected, atol=20 * DOUBLE_ROUNDING)
+
+    def slopes(one):  # of every ray, on the image plane at depth 1
+        local = one.directions() @ one.camera_to_world[:3, :3]
+        return local[..., :2] / local[..., 2:]
+
+    blocks = slopes(fine).reshape(5, factor, 7, factor, 2)
+    np.testing.assert_allclose(blocks.mean(axis=(1, 3)), slopes(camera), atol=DOUBLE_ROUNDING)
+
+
+def test_samples_out_of_range_are_refused():
+    camera = Camera.orbit((0, 0, 0), 1.0, 0.0, 0.0, **SIZE)
+    for factor in (0, -1, 1.5, True):
+        with pytest.raises(InvalidOptionError, match="factor must be an integer"):
+            camera.supersampled(factor)
+    with pytest.raises(InvalidOptionError, match="width must be an integer"):
+        camera.supersampled(10_000)
+
+
 def test_points_behind_are_on_no_pixel():
     pixels = Camera.look_at((0, -2, 0), (0, 0, 0), **SIZE).project([[0, -3, 0], [0, -2, 0]])
     assert np.isnan(pixels[:, :2]).all()

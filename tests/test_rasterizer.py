@@ -246,6 +246,37 @@ def test_redraw_follows_contents_and_cameras(device, rng):
         np.testing.assert_array_equal(one, other)
 
 
+def test_prepared_cameras_are_the_cameras(device, rng):
+    """One view after the other with cameras that were brought before: the bits of rasterisers of their own."""
+    made = cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    cameras = [around(), around(azimuth=110.0), around(azimuth=200.0)]
+    drawer = Rasterizer(200, cameras[:1], value_count=3, device=device)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    prepared = [drawer.prepare_cameras([camera]) for camera in cameras]
+    for camera, brought in [*zip(cameras, prepared, strict=True), (cameras[0], prepared[0])]:
+        drawer.set_cameras(brought)
+        assert drawer.cameras == (camera,)
+        drawer.draw(arrays)
+        filled(np.random.default_rng(1), drawer)
+        fresh = Rasterizer(200, [camera], value_count=3, device=device)
+        fresh.draw(upload_gaussians(made, fresh.device, values=values))
+        filled(np.random.default_rng(1), fresh)
+        for one, other in zip(state(drawer), state(fresh), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_prepared_cameras_of_other_sizes_are_refused(device, rng):
+    drawer, other = Rasterizer(1, [around(33, 17)], device=device), Rasterizer(1, [around(17, 33)], device=device)
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.prepare_cameras([around(17, 33)])
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.prepare_cameras([around(33, 17)] * 2)
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.set_cameras(other.prepare_cameras([around(17, 33)]))
+    assert drawer.cameras[0].width == 33
+
+
 def test_redraw_without_room_says_so_and_draw_makes_it(device, rng):
     """Few splats first, then ten times as many pairs; nothing crashes in between."""
     small = cloud(rng)
