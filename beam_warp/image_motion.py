@@ -25,8 +25,6 @@ def motion_in_pixels(
         rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pair = [points.astype(np.float64) @ rotation.T + shift for points in (before, after)]
         visible = (pair[0][:, 2] > 0.0) & (pair[1][:, 2] > 0.0)
-        places = [
-            points[visible, :2] / points[visible, 2:] * (camera.focal_x, camera.focal_y) for points in pair
-        ]
+        places = [points[visible, :2] / points[visible, 2:] * (camera.focal_x, camera.focal_y) for points in pair]
         farthest[visible] = np.maximum(farthest[visible], np.linalg.norm(places[1] - places[0], axis=1))
     return farthest

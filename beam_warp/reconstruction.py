@@ -90,7 +90,7 @@ class FrameSteps(Protocol):
     """How the Gaussians of a frame are found; the same input gives the same bits.
 
     Reports are JSON-able. Their ``psnr`` and ``gaussians`` are shown and summed up; ``lost``, of a tracked frame, says
-    why tracking is lost, empty if it is not; ``findings`` are what else is to be said of the frame, each the fields of a
+    why tracking is lost, empty if it is not; ``findings`` are what is to be said of the frame, each the fields of a
     `beam_warp.capture_findings.Finding`. All of them must be repeatable but ``seconds``, which is not kept.
     """
 
