@@ -16,6 +16,7 @@ from beam_warp.assets import GaussianSequence
 from beam_warp.captures import Capture
 from beam_warp.devices import device_label, resolve_device
 from beam_warp.errors import BeamError
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction_scores import read_truth_mesh, score_frame
 from beam_warp.stress_captures import (
     CAPTURE_CASES,
@@ -25,6 +26,7 @@ from beam_warp.stress_captures import (
     CaptureStress,
     Detection,
     StressStudio,
+    in_words,
     training_cameras,
 )
 from beam_warp.tracking_drift import tracking_drift
@@ -40,12 +42,16 @@ class Reconstructed:
     Attributes:
         sequence: One cloud for each of the capture's frames, in their order, with persistent ids within a segment.
         detections: What was noticed.
+        done: What was done about it, in words.
         key_frames: Indices into the sequence at which a segment starts; the first is 0.
+        raster: How its Gaussians are drawn; None for the defaults.
     """
 
     sequence: GaussianSequence
     detections: Sequence[Detection] = ()
+    done: Sequence[str] = ()
     key_frames: Sequence[int] = (0,)
+    raster: RasterOptions | None = None
 
 
 Reconstruct = Callable[[Capture], Reconstructed]
@@ -61,7 +67,10 @@ class CaptureOutcome:
         device: Warp device.
         frames: Frames of the capture.
         cameras: Its training cameras.
+        size: Width and height of its images [pixel].
+        gaussians: Of the last frame.
         detected: What was found, in words.
+        done: What was done about it, in words.
         missed: What must have been found and was not, in words.
         refused: The error it was refused with; empty if it was reconstructed.
         key_frames: Where segments start.
@@ -76,7 +85,10 @@ class CaptureOutcome:
     device: str
     frames: int
     cameras: int
+    size: tuple[int, ...] = ()
+    gaussians: int = 0
     detected: tuple[str, ...] = ()
+    done: tuple[str, ...] = ()
     missed: tuple[str, ...] = ()
     refused: str = ""
     key_frames: tuple[int, ...] = ()
@@ -131,6 +143,7 @@ def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: Captu
         "device": device_label(resolve_device(studio.device)),
         "frames": len(capture.frames),
         "cameras": len(training_cameras(capture)),
+        "size": (capture.records[0].camera.width, capture.records[0].camera.height),
     }
     start = time.perf_counter()
     try:
@@ -142,11 +155,13 @@ def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: Captu
         crash = f"ended with {type(error).__name__}: {error}"
         return CaptureOutcome(**known, faults=(crash,), seconds=time.perf_counter() - start)
     seconds = time.perf_counter() - start
-    first, last = end_scores(capture, result.sequence, device=studio.device)
+    first, last = end_scores(capture, result.sequence, options=result.raster, device=studio.device)
     missed = tuple(str(need) for need in stress.required if not any(found.covers(need) for found in result.detections))
     return CaptureOutcome(
         **known,
-        detected=tuple(str(found) for found in result.detections),
+        gaussians=len(result.sequence[len(result.sequence) - 1]),
+        detected=in_words(result.detections),
+        done=tuple(result.done),
         missed=missed,
         key_frames=tuple(result.key_frames),
         first=first,
@@ -158,7 +173,7 @@ def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: Captu
 
 
 def end_scores(
-    capture: Capture, sequence: GaussianSequence, *, device: str | None = None
+    capture: Capture, sequence: GaussianSequence, *, options: RasterOptions | None = None, device: str | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the scores of the first and of the last frame that has test views; empty ones without any."""
     frames = [
@@ -169,7 +184,7 @@ def end_scores(
     if not frames:
         return {}, {}
     scores = {
-        index: score_frame(sequence[index], records, device=device).as_dict()
+        index: score_frame(sequence[index], records, options=options, device=device).as_dict()
         for index, records in (frames[0], frames[-1])
     }
     return scores[frames[0][0]], scores[frames[-1][0]]
@@ -213,39 +228,54 @@ def _faults(
     return faults
 
 
+TITLES = (
+    "case",
+    "a reconstruction without precautions",
+    "must",
+    "detected",
+    "done",
+    "PSNR first, last [dB]",
+    "against the sound capture",
+    "normals first, last [°]",
+    "depth first, last [mm]",
+    "drift per vertex [mm]",
+    "verdict",
+)
+
+
 def markdown_table(outcomes: Sequence[CaptureOutcome]) -> str:
     """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
-    titles = (
-        "case",
-        "a reconstruction without precautions",
-        "must",
-        "detected",
-        "PSNR first, last [dB]",
-        "normals first, last [°]",
-        "drift per vertex [mm]",
-        "verdict",
-    )
-    lines = [_row(titles), "|" + "---|" * len(titles)]
+    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
     for case in CAPTURE_CASES:
-        for outcome in outcomes:
-            if outcome.case == case.name:
-                lines.append(
-                    _row(
-                        (
-                            case.name,
-                            case.fails,
-                            case.must,
-                            "refused: " + outcome.refused
-                            if outcome.refused
-                            else ", ".join(outcome.detected) or "nothing",
-                            _pair(outcome, "psnr", ".2f"),
-                            _pair(outcome, "normals_median_degrees", ".1f"),
-                            f"{outcome.drift['vertices']['mean_mm']:.1f}" if "vertices" in outcome.drift else "–",
-                            "; ".join(outcome.faults) or "ok",
-                        )
-                    )
-                )
+        lines += [
+            _row((case.name, case.fails, case.must, *cells(outcome, outcomes)))
+            for outcome in outcomes
+            if outcome.case == case.name
+        ]
     return "\n".join(lines) + "\n"
+
+
+def cells(outcome: CaptureOutcome, outcomes: Sequence[CaptureOutcome]) -> tuple[str, ...]:
+    """Return what a table says of a case, from *detected* on; the sound capture is looked for among all outcomes."""
+    sound = next((other for other in outcomes if other.case == CAPTURE_CASES[0].name), None)
+    return (
+        "refused: " + outcome.refused if outcome.refused else ", ".join(outcome.detected) or "nothing",
+        ", ".join(outcome.done) or "nothing",
+        _pair(outcome, "psnr", ".2f"),
+        _against(outcome, sound),
+        _pair(outcome, "normals_median_degrees", ".1f"),
+        _pair(outcome, "depth_median_mm", ".1f"),
+        f"{outcome.drift['vertices']['mean_mm']:.1f}" if "vertices" in outcome.drift else "–",
+        "; ".join(outcome.faults) or "ok",
+    )
+
+
+def _against(outcome: CaptureOutcome, sound: CaptureOutcome | None) -> str:
+    """Return the difference of PSNR from the sound capture's, of the first and the last frame."""
+    if sound is None or not (sound.first and outcome.first):
+        return "–"
+    pairs = ((outcome.first, sound.first), (outcome.last, sound.last))
+    return ", ".join(f"{mine['psnr'] - other['psnr']:+.2f}" for mine, other in pairs)
 
 
 def _pair(outcome: CaptureOutcome, name: str, form: str) -> str:

@@ -65,13 +65,13 @@ class FitProgress(Protocol):
 class LearningRates:
     """Sizes of steps, each in the units of what is moved.
 
-        Attributes:
-            positions: In distances of the cameras from the subject.
-            orientations: Of quaternions.
-            scales: Of logarithms.
-            opacities: Of logits.
-            color: Of the spherical harmonics' band 0.
-            bands: Of all other bands.
+    Attributes:
+        positions: In distances of the cameras from the subject.
+        orientations: Of quaternions.
+        scales: Of logarithms.
+        opacities: Of logits.
+        color: Of the spherical harmonics' band 0.
+        bands: Of all other bands.
         final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
         final_others: The same of all other rates.
 

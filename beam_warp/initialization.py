@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -233,6 +234,38 @@ def seen_colors(
         Scene-linear Rec.709, ``(N, 3)`` float32.
     """
     target = resolve_device(device)
+    samples = _samples(views, cloud, target)
+    count = len(cloud)
+    colors = wp.empty(count, dtype=wp.vec3, device=target)
+    seen = wp.empty(count, dtype=int, device=target)
+    launch_agree_colors(samples, colors, seen, target)
+    result, known = colors.numpy(), seen.numpy() > 0
+    if not known.any():
+        return np.full((count, 3), 0.5, np.float32)
+    if not known.all():
+        result[~known] = result[known][cKDTree(cloud.positions[known]).query(cloud.positions[~known], workers=-1)[1]]
+    return result
+
+
+def view_samples(
+    views: Sequence[CapturedView], cloud: GaussianCloud, *, device: str | None = None
+) -> NDArray[np.float32]:
+    """Return what each view shows of every Gaussian.
+
+    Args:
+        views: What the cameras saw.
+        cloud: Gaussians; those of a cloud with normals are seen from their side only.
+        device: Warp device; the first GPU without, or the CPU where there is none.
+
+    Returns:
+        Scene-linear Rec.709, not premultiplied, and a weight in [0, 1], 0 where the view does not see the Gaussian:
+        ``(V, N, 4)`` float32.
+    """
+    return _samples(views, cloud, resolve_device(device)).numpy()
+
+
+def _samples(views: Sequence[CapturedView], cloud: GaussianCloud, target: Any) -> wp.array:
+    """Return what each view shows of every Gaussian, on the device."""
     count = len(cloud)
     gaussians = GaussianArrays(
         upload(cloud.positions, wp.vec3, target),
@@ -261,15 +294,7 @@ def seen_colors(
             samples,
             target,
         )
-    colors = wp.empty(count, dtype=wp.vec3, device=target)
-    seen = wp.empty(count, dtype=int, device=target)
-    launch_agree_colors(samples, colors, seen, target)
-    result, known = colors.numpy(), seen.numpy() > 0
-    if not known.any():
-        return np.full((count, 3), 0.5, np.float32)
-    if not known.all():
-        result[~known] = result[known][cKDTree(cloud.positions[known]).query(cloud.positions[~known], workers=-1)[1]]
-    return result
+    return samples
 
 
 def _facing_orientations(normals: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -90,7 +90,8 @@ class FrameSteps(Protocol):
     """How the Gaussians of a frame are found; the same input gives the same bits.
 
     Reports are JSON-able. Their ``psnr`` and ``gaussians`` are shown and summed up; ``lost``, of a tracked frame, says
-    why tracking is lost, empty if it is not. All of them must be repeatable but ``seconds``, which is not kept.
+    why tracking is lost, empty if it is not; ``findings`` are what is to be said of the frame, each the fields of a
+    `beam_warp.capture_findings.Finding`. All of them must be repeatable but ``seconds``, which is not kept.
     """
 
     @property
@@ -330,7 +331,7 @@ class _Images:
         return self._read(frame)
 
     def _read(self, frame: int) -> list[CapturedView]:
-        return list(self._pool.map(CaptureRecord.view, self._records[frame]))
+        return list(self._pool.map(lambda record: record.view(), self._records[frame]))  # kinds of records differ
 
 
 class _Job:
@@ -345,7 +346,7 @@ class _Job:
         self._options = options
         self._progress = progress
         ready = require_reconstructable(_selected(capture, options))
-        self._findings = [finding.what for finding in ready.fallbacks if finding.severity == "warning"]
+        self._findings = [finding for finding in ready.fallbacks if finding.severity == "warning"]
         self._records = _by_frame(ready.capture.select(split=SPLIT))
         require_files(record for records in self._records.values() for record in records)
         self._folders = make_folders(out, "frames", "previews", "digests")
@@ -417,12 +418,15 @@ class _Job:
         started = time.perf_counter()
         lost = ""
         track, report, segment = None, {}, frame
+        said: list[Any] = []
         if previous is not None:
             track, report = self._steps.advance(self._stored_track(previous), views, self._within("track", frame))
             lost = str(report.get("lost", ""))
+            said = list(report.get("findings", []))
             segment = int(self.header(previous)["report"]["segment"])
         if track is None or lost:
             track, report = self._steps.begin(views, self._within("fit", frame))
+            said += [finding for finding in report.get("findings", []) if finding not in said]
             segment = frame
         report = {
             **_plain({name: value for name, value in report.items() if name != "seconds"}),
@@ -431,6 +435,7 @@ class _Job:
             "segment": segment,
             "lost": lost,
             "gaussians": len(track.cloud),
+            "findings": _plain(said),
         }
         write_frame(self.path(frame), key, _stored_arrays(track, report))
         self._seconds[frame] = time.perf_counter() - started
@@ -490,7 +495,8 @@ class _Job:
             "mean_psnr": float(np.mean([entry["psnr"] for entry in measured])) if measured else None,
             "lowest_psnr": None if lowest is None else {"frame": lowest["frame"], "psnr": lowest["psnr"]},
             "frames": frames,
-            "warnings": [*self._findings, *_warnings(frames)],
+            "findings": [vars(finding) for finding in self._findings],
+            "warnings": [*(finding.what for finding in self._findings), *_warnings(frames)],
         }
 
 
@@ -576,6 +582,7 @@ def _warnings(frames: Sequence[Mapping[str, Any]]) -> list[str]:
         for entry in frames
         if entry["lost"]
     ]
+    found += _summed_up(frames)
     key_psnr = {entry["segment"]: entry.get("psnr") for entry in frames if entry["kind"] == "key"}
     falls = [
         (key_psnr[entry["segment"]] - entry["psnr"], entry["frame"])
@@ -589,3 +596,18 @@ def _warnings(frames: Sequence[Mapping[str, Any]]) -> list[str]:
             "bound the drift; see --segment-length"
         )
     return found
+
+
+def _summed_up(frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what steps said of frames, once for each kind; that tracking was lost is said already."""
+    by_code: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
+    for entry in frames:
+        for finding in entry["findings"]:
+            if not entry["lost"] or finding["what"] != f"tracking is lost: {entry['lost']}":
+                by_code.setdefault(finding["code"], []).append((entry["frame"], finding))
+    return [
+        f"frame {rows[0][0]}: {rows[0][1]['what']}"
+        + (f" ({rows[0][1]['where']})" if rows[0][1]["where"] else "")
+        + (f"; so in {len({frame for frame, _ in rows})} of {len(frames)} frames" if len(rows) > 1 else "")
+        for rows in by_code.values()
+    ]

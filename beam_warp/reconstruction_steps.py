@@ -10,13 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.assets import GaussianCloud
+from beam_warp.capture_findings import Finding
 from beam_warp.captured_views import CapturedView
 from beam_warp.captures import SparsePoints
 from beam_warp.gaussian_fitting import FitOptions, fit_gaussians
+from beam_warp.image_motion import motion_in_pixels
 from beam_warp.initialization import initial_gaussians
 from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction import StepProgress
-from beam_warp.tracking import Track, TrackOptions, advance_track, begin_track
+from beam_warp.tracking import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.view_gains import ViewGains, judge_gains, matched, view_gains
+
+MOST_UNPAIRED = 0.5
+"""Part of the Gaussians that fewer than two views see from which on that is said: most of the surface."""
+
+STRUCTURE_REACH = 5
+"""Half a window of structural similarity [pixel]: what lies farther from its place has no pull towards it. At the
+coarsest level of tracking a pixel is as many as its reduction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,29 +64,87 @@ class FitAndTrack:
         }
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
-        """Fit a key frame from its images alone."""
-        chosen = self.fitting
-        known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
-        start = initial_gaussians(
-            views,
-            chosen.gaussian_count,
-            points=None if known is None else known.positions,
-            point_colors=None if known is None else known.colors,
-            device=self.device,
-            seed=chosen.seed,
-        )
-        fit = fit_gaussians(views, start, chosen, device=self.device, progress=progress)
-        return begin_track(fit.cloud, views, self._tracking, device=self.device), dict(fit.report)
+        """Fit a key frame from its images alone, their exposures matched."""
+        start = self._start(views)
+        gains = self._gains(start, views)
+        findings = judge_gains(gains, views)
+        if findings:
+            views = matched(views, gains)
+            start = self._start(views)  # of colours that agree
+        unpaired = float((gains.views_of_points < 2).mean())
+        if unpaired > MOST_UNPAIRED:
+            findings.append(
+                Finding(
+                    "warning",
+                    "few-cameras",
+                    f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of "
+                    "outlines",
+                    remedy="Add cameras.",
+                )
+            )
+        fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
+        said = {**_exposures(gains), "unpaired": unpaired, "findings": [vars(finding) for finding in findings]}
+        return begin_track(fit.cloud, views, self._tracking, device=self.device), {**fit.report, **said}
 
     def advance(
         self, track: Track, views: Sequence[CapturedView], progress: StepProgress
     ) -> tuple[Track, dict[str, Any]]:
-        """Track the frame after."""
-        return advance_track(track, views, self._tracking, device=self.device, progress=progress)
+        """Track the frame after, exposures of its images matched."""
+        gains = self._gains(track.cloud, views)
+        findings = judge_gains(gains, views)
+        views = matched(views, gains)
+        following, report = advance_track(track, views, self._tracking, device=self.device, progress=progress)
+        cameras = [view.camera for view in views]
+        motion = motion_in_pixels(track.joints, following.joints, cameras)
+        surprise = motion_in_pixels(2.0 * track.joints - track.previous_joints, following.joints, cameras)
+        reach = STRUCTURE_REACH * max(self._tracking.joints.levels)
+        if not surprise.max() <= reach:
+            findings.append(
+                Finding(
+                    "warning",
+                    "fast-motion",
+                    f"a joint moved {surprise.max():.0f} pixels from where it was expected, where {reach} are found "
+                    "for certain",
+                    remedy="Record more frames a second, or plan shorter segments.",
+                )
+            )
+        if report["lost"]:
+            covered = report["gap"] <= track.baseline[1] + self._tracking.largest_gap
+            code = "tracking-lost" if covered else "new-surface"
+            findings.append(Finding("warning", code, f"tracking is lost: {report['lost']}"))
+        said = {
+            **_exposures(gains),
+            "motion": {"median": float(np.median(motion)), "largest": float(motion.max())},
+            "surprise": float(surprise.max()),
+            "findings": [vars(finding) for finding in findings],
+        }
+        return following, {**report, **said}
+
+    def _start(self, views: Sequence[CapturedView]) -> GaussianCloud:
+        """Return what a fit begins with."""
+        known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
+        return initial_gaussians(
+            views,
+            self.fitting.gaussian_count,
+            points=None if known is None else known.positions,
+            point_colors=None if known is None else known.colors,
+            device=self.device,
+            seed=self.fitting.seed,
+        )
+
+    def _gains(self, cloud: GaussianCloud, views: Sequence[CapturedView]) -> ViewGains:
+        """Compare the views' exposures."""
+        return view_gains(cloud.with_arrays(normals=outward_normals(cloud, views)), views, device=self.device)
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
+
+
+def _exposures(gains: ViewGains) -> dict[str, float]:
+    """Return what a report says of exposures [stop]."""
+    off = np.abs(gains.stops)
+    return {"exposure_spread": float(np.nanmax(off))} if np.isfinite(off).any() else {}
 
 
 def _digest(points: SparsePoints) -> str:

@@ -11,9 +11,12 @@ from typing import Any, TypeVar
 
 from beam_warp._version import __version__
 from beam_warp.analytic_occlusion import SHAPES, OcclusionOutcome
+from beam_warp.capture_stability import SILENT_LOSS_DB, CaptureOutcome, markdown_table
 from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
+from beam_warp.image_findings import EXPOSURE_STOPS as INSPECTED_STOPS
 from beam_warp.stability import Outcome
 from beam_warp.stress_cases import CASES
+from beam_warp.view_gains import EXPOSURE_STOPS
 
 HOW_TO_READ = """\
 Scenes on which ray tracers lose hits, return NaN or never return, and what this one makes of them. The numbers are
@@ -54,6 +57,31 @@ origins lie above the surface, both by a number of spacings: it must shrink with
 """
 
 
+CAPTURES_TITLE = "## Captures on which reconstructions fail"
+
+CAPTURES_TEXT = """\
+The demo figure's dance, path traced for a dome of cameras, with something wrong, and what `beam reconstruct` makes of
+it: the same inspection, steps and report. Scores are of two test views of the first and the last frame: PSNR inside the
+subject's box, median angle of normals, median error of depth. Drift is the mean distance of the truth's vertices,
+carried by the Gaussians nearest to them in the first frame, from where they are in the last one of its segment.
+*Against the sound capture* is PSNR less that of *as it is*, of other images where the case shows something else.
+
+A case fails if what must be detected was not, if a sound camera is blamed, if something is found where nothing is
+wrong, if the last frame is more than {silent:g} dB worse than the first and nothing was said, if frames are missing, or
+if the run ends in anything but a reconstruction or a refusal where that is allowed.
+
+- The inspection, before anything starts: `black-image`, `empty-mask`, `missing-image`, `frame-lacks-cameras`,
+  `few-cameras` below 8 of them; `camera-exposure` from {inspected:g} stops on, with 10 cameras or more.
+- The points of the surface that views share, in every frame: `camera-exposure` from {stops:g} stops on, which is undone
+  before the frame is fitted or tracked; `few-cameras` where fewer than two views see most of the surface.
+- Tracking: `fast-motion` where a joint is farther from where its last step led than the coarsest level finds;
+  `new-surface` where a connected part of the subject is not covered, and `tracking-lost` where PSNR fell far or joints
+  are torn apart, upon which the frame becomes a key frame.
+
+Without texture and at self-contact nothing is detected, and nothing need be: the scores say what they cost.
+"""
+
+
 @dataclass(frozen=True)
 class StabilityResult:
     """Everything that one or several runs found.
@@ -61,19 +89,23 @@ class StabilityResult:
     Attributes:
         outcomes: Of the stress cases.
         occlusion: Of the shapes with known ambient occlusion.
+        captures: Of the captures on which reconstructions fail.
     """
 
-    outcomes: tuple[Outcome, ...]
-    occlusion: tuple[OcclusionOutcome, ...]
+    outcomes: tuple[Outcome, ...] = ()
+    occlusion: tuple[OcclusionOutcome, ...] = ()
+    captures: tuple[CaptureOutcome, ...] = ()
 
     @property
     def passed(self) -> bool:
         """Whether every verdict is good."""
-        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion))
+        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion, *self.captures))
 
     def joined(self, other: StabilityResult) -> StabilityResult:
         """Return both results as one, this one's first."""
-        return StabilityResult(self.outcomes + other.outcomes, self.occlusion + other.occlusion)
+        return StabilityResult(
+            self.outcomes + other.outcomes, self.occlusion + other.occlusion, self.captures + other.captures
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record."""
@@ -82,6 +114,7 @@ class StabilityResult:
             "passed": self.passed,
             "cases": [outcome.as_dict() for outcome in self.outcomes],
             "occlusion": [outcome.as_dict() for outcome in self.occlusion],
+            "captures": [outcome.as_dict() for outcome in self.captures],
         }
 
 
@@ -97,6 +130,7 @@ def read_result(path: Path) -> StabilityResult:
         return StabilityResult(
             tuple(_record(Outcome, row) for row in record["cases"]),
             tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
+            tuple(_record(CaptureOutcome, row) for row in record.get("captures", [])),  # older ones have none
         )
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
@@ -106,7 +140,7 @@ def read_result(path: Path) -> StabilityResult:
         ) from error
 
 
-_Record = TypeVar("_Record", Outcome, OcclusionOutcome)
+_Record = TypeVar("_Record", Outcome, OcclusionOutcome, CaptureOutcome)
 
 
 def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
@@ -118,7 +152,7 @@ def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
     return kind(**values)
 
 
-def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome]) -> list[str]:
+def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome]) -> list[str]:
     """Return the devices that occur, in order."""
     return list(dict.fromkeys(outcome.device for outcome in outcomes))
 
@@ -133,13 +167,39 @@ def allowed_by(outcome: Outcome) -> str:
     return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
 
 
-def markdown(result: StabilityResult, command: str) -> str:
+def markdown(result: StabilityResult, command: str, before: str = "") -> str:
     """Return the page.
 
     Args:
         result: Of any number of devices and hierarchies.
         command: That makes the page, for its text.
+        before: The page as it is: tracing or captures stay as they are there if the result has none.
     """
+    kept = before.split(CAPTURES_TITLE)
+    tracing = _tracing(result, command) if result.outcomes or not before else kept[0].rstrip() + "\n"
+    if result.captures:
+        return tracing + "\n" + _captures(result.captures)
+    return tracing + ("\n" + CAPTURES_TITLE + kept[1] if len(kept) > 1 else "")
+
+
+def _captures(outcomes: Sequence[CaptureOutcome]) -> str:
+    """Return the part about reconstruction, a table for each device and size."""
+    text = CAPTURES_TEXT.format(silent=SILENT_LOSS_DB, inspected=INSPECTED_STOPS, stops=EXPOSURE_STOPS)
+    lines = [CAPTURES_TITLE, "", text]
+    for device, size in dict.fromkeys((outcome.device, outcome.size) for outcome in outcomes):
+        rows = [outcome for outcome in outcomes if (outcome.device, outcome.size) == (device, size)]
+        sound = rows[0]
+        facts = (
+            f"{device}: {sound.cameras} cameras of {' x '.join(map(str, size))} pixels, {sound.frames} frames, up to "
+            f"{max(outcome.gaussians for outcome in rows):,} Gaussians; reconstructed in "
+            f"{sum(outcome.seconds for outcome in rows):.0f} s in all."
+        )
+        lines += [facts, "", markdown_table(rows)]
+    return "\n".join(lines)
+
+
+def _tracing(result: StabilityResult, command: str) -> str:
+    """Return the part about ray tracing."""
     devices = devices_of(result.outcomes)
     lines = ["# Stability", "", HOW_TO_READ.format(command=command), "## Stress cases", ""]
     lines += _header(
@@ -182,14 +242,15 @@ def markdown(result: StabilityResult, command: str) -> str:
 
 
 def write_page(path: Path, result: StabilityResult, command: str) -> None:
-    """Write the page whole or not at all.
+    """Write the page whole or not at all; what the result has nothing of stays as it was there.
 
     Raises:
         OutputError: It cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(markdown(result, command), encoding="utf-8")
+        before = path.read_text(encoding="utf-8") if path.is_file() else ""
+        temporary.write_text(markdown(result, command, before), encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)

@@ -41,9 +41,14 @@ CAMERA_EXPOSURE = "camera-exposure"
 FEW_CAMERAS = "few-cameras"
 TRACKING_LOST = "tracking-lost"
 NEW_SURFACE = "new-surface"
+FAST_MOTION = "fast-motion"
 """Codes of what must be detected: of the inspection of a capture, and of tracking."""
 
 WRONG_EXPOSURE = 2.0
+SLIGHTLY_WRONG_EXPOSURE = 2.0**-0.5
+BRIEF_FRAMES = 2
+"""Frames of a case that a camera is at fault in: a key frame and a tracked one."""
+
 GREY = 0.35
 """Base colour and roughness of the figure without texture: 0.35 and 0.6."""
 GREY_ROUGHNESS = 0.6
@@ -118,6 +123,18 @@ def detections_of(said: Iterable[SaidOfCapture], cameras: Sequence[str]) -> tupl
     return tuple(found)
 
 
+def in_words(detections: Sequence[Detection]) -> tuple[str, ...]:
+    """Return detections in words, those of the same kind and camera as one: ``new-surface in frame 2, 3``."""
+    frames: dict[tuple[str, str | None], list[int | None]] = {}
+    for found in detections:
+        frames.setdefault((found.code, found.camera), []).append(found.frame)
+    words = []
+    for (code, camera), numbers in frames.items():
+        known = sorted({number for number in numbers if number is not None})
+        words.append(str(Detection(code, camera)) + (f" in frame {', '.join(map(str, known))}" if known else ""))
+    return tuple(words)
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureStress:
     """A capture with something wrong, and what must be found out about it.
@@ -174,6 +191,11 @@ class StressStudio:
     def base(self) -> Capture:
         """Return the capture that cases change."""
         return self.given or self.traced("as it is", self.dancing)
+
+    def brief(self) -> Capture:
+        """Return its first frames, for cases that a camera is at fault in."""
+        base = self.base()
+        return replace(base, records=base.select(frames=base.frames[:BRIEF_FRAMES]))
 
     def traced(self, name: str, make: Callable[[], Sequence[MaterialMesh]]) -> Capture:
         """Return a capture of meshes, one a frame, path traced when first asked for."""
@@ -381,7 +403,7 @@ def _self_contact(at: StressStudio) -> CaptureStress:
     "the camera detected and left out",
 )
 def _black_camera(at: StressStudio) -> CaptureStress:
-    base = at.base()
+    base = at.brief()
     name = _victim(base)
     return CaptureStress(capture=with_altered(base, name, gain=0.0), required=(Detection(BLACK_IMAGE, name),))
 
@@ -392,7 +414,7 @@ def _black_camera(at: StressStudio) -> CaptureStress:
     "the camera detected and left out",
 )
 def _empty_camera(at: StressStudio) -> CaptureStress:
-    base = at.base()
+    base = at.brief()
     name = _victim(base)
     return CaptureStress(
         capture=with_altered(base, name, gain=0.0, coverage=0.0), required=(Detection(EMPTY_MASK, name),)
@@ -405,7 +427,7 @@ def _empty_camera(at: StressStudio) -> CaptureStress:
     "refused before anything is optimised, or the camera detected and left out",
 )
 def _camera_without_files(at: StressStudio) -> CaptureStress:
-    base = at.base()
+    base = at.brief()
     name = _victim(base)
     gone = tuple(
         replace(r, image_path=r.image_path.with_name(f"absent_{r.image_path.name}")) if r.camera_name == name else r
@@ -422,7 +444,7 @@ def _camera_without_files(at: StressStudio) -> CaptureStress:
     "the camera's absence detected from the second frame on",
 )
 def _camera_that_stops(at: StressStudio) -> CaptureStress:
-    base = at.base()
+    base = at.brief()
     name, first = _victim(base), base.frames[0]
     kept = tuple(r for r in base.records if r.camera_name != name or r.frame == first)
     return CaptureStress(capture=replace(base, records=kept), required=(Detection(FRAME_LACKS_CAMERAS, name),))
@@ -434,10 +456,24 @@ def _camera_that_stops(at: StressStudio) -> CaptureStress:
     "the camera's exposure detected, and corrected or left out",
 )
 def _wrong_exposure(at: StressStudio) -> CaptureStress:
-    base = at.base()
+    base = at.brief()
     name = _victim(base)
     return CaptureStress(
         capture=with_altered(base, name, gain=WRONG_EXPOSURE),
+        required=(Detection(CAMERA_EXPOSURE, name),),
+    )
+
+
+@capture_case(
+    "exposure half a stop off",
+    "the same, where no histogram shows it: light from one side makes views differ by more",
+    "the camera's exposure detected, and corrected",
+)
+def _slightly_wrong_exposure(at: StressStudio) -> CaptureStress:
+    base = at.brief()
+    name = _victim(base)
+    return CaptureStress(
+        capture=with_altered(base, name, gain=SLIGHTLY_WRONG_EXPOSURE),
         required=(Detection(CAMERA_EXPOSURE, name),),
     )
 

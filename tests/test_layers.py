@@ -64,6 +64,8 @@ RANKS = {
     "beam_warp.skinning": 6,
     "beam_warp.adam": 6,
     "beam_warp.tracking": 10,
+    "beam_warp.view_gains": 8,
+    "beam_warp.image_motion": 4,
     "beam_warp.joint_tracking": 9,
     "beam_warp.gaussian_fitting": 9,
     "beam_warp.densification": 8,
@@ -94,7 +96,7 @@ RANKS = {
     "beam_warp.stress_cases": 9,
     "beam_warp.stability": 10,
     "beam_warp.analytic_occlusion": 10,
-    "beam_warp.stability_report": 11,
+    "beam_warp.stability_report": 12,
     "beam_warp.surfaces": 10,
     "beam_warp.deferred": 9,
     "beam_warp.materials": 11,
@@ -109,6 +111,7 @@ RANKS = {
     "beam_warp.demo_capture": 8,
     "beam_warp.stress_captures": 9,
     "beam_warp.capture_stability": 11,
+    "beam_warp.stressed_reconstruction": 15,
     "beam_warp.surface_distances": 6,
     "beam_warp.tracking_drift": 7,
     "beam_warp.reconstruction_scores": 10,
@@ -126,8 +129,8 @@ RANKS = {
     "beam_warp.tracing_plan": 11,
     "beam_warp.tracing_references": 12,
     "beam_warp.tracing_study": 13,
-    "beam_warp.cli": 15,
-    "beam_warp": 16,
+    "beam_warp.cli": 16,
+    "beam_warp": 17,
 }
 
 WITHOUT_WARP = (

@@ -1,15 +1,16 @@
-"""``beam stability``: scenes on which ray tracers fail, on this machine's devices."""
+"""``beam stability``: scenes on which ray tracers fail and captures on which reconstructions do, on this machine."""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import ProgressCallback, print_json, progress
 from beam_warp.errors import OutputError
 
 if TYPE_CHECKING:
@@ -18,19 +19,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stability:
-    """Trace scenes on which ray tracers fail, compare every ray with float64, and say what was detected and done.
+    """Trace scenes on which ray tracers fail, reconstruct captures on which reconstructions fail; tell what was found.
 
-    Exit code 1 if a ray is off by more than rounding explains. One page for several devices: run it on each with
-    --json, and on the last with --beside.
+    Every ray is compared with float64. Exit code 1 if one is off by more than rounding explains, or if a capture was
+    reconstructed badly and nothing was said. One page for several devices: run it on each with --json, and on the last
+    with --beside.
 
     Example: beam stability --out stability.md
     """
 
+    only: Annotated[
+        Literal["tracing", "reconstruction"] | None, arg(help="Only one of both; a page that is there keeps the other.")
+    ] = None
     out: Annotated[Path | None, arg(metavar="FILE", help="Also write the results as a Markdown page.")] = None
     beside: Annotated[
         tuple[Path, ...], arg(metavar="FILE", help="Results of other devices, as --json printed them, for the page.")
     ] = ()
-    large: Annotated[bool, arg(help="Also the scenes that take minutes and gigabytes.")] = False
+    large: Annotated[bool, arg(help="Also scenes of minutes and gigabytes; larger captures, for GPUs.")] = False
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
     quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
     json: Annotated[bool, arg(help="Print the results as JSON.")] = False
@@ -41,18 +46,15 @@ def stability(args: Stability) -> int:
     if args.out is not None and not args.out.parent.is_dir():
         raise OutputError(f"out must be in a folder that exists, got {args.out.parent}. Create it first.")
 
-    from beam_warp.analytic_occlusion import SHAPES, measure_shapes
-    from beam_warp.stability import run_cases
     from beam_warp.stability_report import StabilityResult, read_result, write_page
-    from beam_warp.stress_cases import CASES
 
     others = [read_result(path) for path in args.beside]
-    cases = [case for case in CASES if args.large or not case.large]
+    result = StabilityResult()
     with progress(args.quiet or args.json) as report:
-        result = StabilityResult(
-            tuple(run_cases(cases, args.device, progress=lambda done, total: report("cases", done, total))),
-            tuple(measure_shapes(SHAPES, args.device, progress=lambda done, total: report("shapes", done, total))),
-        )
+        if args.only != "reconstruction":
+            result = result.joined(_trace(args, report))
+        if args.only != "tracing":
+            result = result.joined(_reconstruct(args, report))
     if args.out is not None:
         joined = result
         for other in others:
@@ -69,11 +71,49 @@ def stability(args: Stability) -> int:
     return 0 if result.passed else 1
 
 
+def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
+    """Trace the scenes and the shapes."""
+    from beam_warp.analytic_occlusion import SHAPES, measure_shapes
+    from beam_warp.stability import run_cases
+    from beam_warp.stability_report import StabilityResult
+    from beam_warp.stress_cases import CASES
+
+    cases = [case for case in CASES if args.large or not case.large]
+    return StabilityResult(
+        tuple(run_cases(cases, args.device, progress=lambda done, total: report("cases", done, total))),
+        tuple(measure_shapes(SHAPES, args.device, progress=lambda done, total: report("shapes", done, total))),
+    )
+
+
+def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
+    """Reconstruct the captures."""
+    from beam_warp.capture_stability import run_capture_cases
+    from beam_warp.stability_report import StabilityResult
+    from beam_warp.stress_captures import CAPTURE_CASES
+    from beam_warp.stressed_reconstruction import LARGE, QUICK, reconstructing
+
+    effort = LARGE if args.large else QUICK
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        outcomes = run_capture_cases(
+            reconstructing(effort.steps(args.device), place),
+            effort.studio(place, args.device),
+            CAPTURE_CASES,
+            progress=lambda done, total: report("captures", done, total),
+        )
+        return StabilityResult(captures=tuple(outcomes))
+
+
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
     lines = [
         f"failed: {outcome.case} on {outcome.device}, {outcome.hierarchy}: {'; '.join(outcome.faults)}"
         for outcome in result.outcomes
+        if not outcome.passed
+    ]
+    lines += [
+        f"failed: {outcome.case} on {outcome.device}: {'; '.join(outcome.faults)}"
+        for outcome in result.captures
         if not outcome.passed
     ]
     return lines + [
@@ -84,6 +124,30 @@ def _faults(result: StabilityResult) -> list[str]:
 
 
 def _print_tables(result: StabilityResult) -> None:
+    """Print what was run."""
+    if result.outcomes:
+        _print_tracing(result)
+    if result.captures:
+        _print_captures(result)
+
+
+def _print_captures(result: StabilityResult) -> None:
+    """Print one row a capture."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from beam_warp.capture_stability import TITLES, cells
+    from beam_warp.stability_report import devices_of
+
+    titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
+    table = Table(*titles, title=f"stress captures on {', '.join(devices_of(result.captures))}")
+    for outcome in result.captures:
+        *found, verdict = cells(outcome, result.captures)
+        table.add_row(outcome.case, *found, verdict if outcome.passed else f"[red]{verdict}[/red]")
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def _print_tracing(result: StabilityResult) -> None:
     """Print one row a case, the worst of its hierarchies, and one a shape."""
     from rich.console import Console
     from rich.table import Table
