@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from beam_warp.assets import GaussianCloud
 from beam_warp.capture_findings import Finding
@@ -66,7 +67,8 @@ class FitAndTrack:
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""
         start = self._start(views)
-        gains = self._gains(start, views)
+        up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
+        gains = self._gains(start, outward_normals(start, up), views)
         findings = judge_gains(gains, views)
         if findings:
             views = matched(views, gains)
@@ -90,7 +92,7 @@ class FitAndTrack:
         self, track: Track, views: Sequence[CapturedView], progress: StepProgress
     ) -> tuple[Track, dict[str, Any]]:
         """Track the frame after, exposures of its images matched."""
-        gains = self._gains(track.cloud, views)
+        gains = self._gains(track.cloud, track.normals(), views)
         findings = judge_gains(gains, views)
         views = matched(views, gains)
         following, report = advance_track(track, views, self._tracking, device=self.device, progress=progress)
@@ -132,9 +134,11 @@ class FitAndTrack:
             seed=self.fitting.seed,
         )
 
-    def _gains(self, cloud: GaussianCloud, views: Sequence[CapturedView]) -> ViewGains:
-        """Compare the views' exposures."""
-        return view_gains(cloud.with_arrays(normals=outward_normals(cloud, views)), views, device=self.device)
+    def _gains(self, cloud: GaussianCloud, normals: NDArray[np.floating], views: Sequence[CapturedView]) -> ViewGains:
+        """Compare the views' exposures by Gaussians of which it is known which way they face."""
+        faces = normals.any(axis=1)
+        seen = cloud.select(faces).with_arrays(normals=normals[faces]) if faces.any() else cloud
+        return view_gains(seen, views, device=self.device)
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""

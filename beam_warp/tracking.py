@@ -26,7 +26,7 @@ from beam_warp.gaussian_parameters import require_scene_linear
 from beam_warp.joint_graph import JointGraph, stretch
 from beam_warp.joint_selection import select_joints
 from beam_warp.joint_tracking import JointOptions, JointPose, JointTracker
-from beam_warp.raster_records import RasterOptions
+from beam_warp.raster_records import GaussianArrays, RasterOptions
 from beam_warp.rasterizing import upload_gaussians
 from beam_warp.skinning import Anchors
 from beam_warp.view_targets import TargetSet, sample_side
@@ -35,6 +35,9 @@ GAUSSIANS_PER_JOINT = 25
 """A joint for so many Gaussians, within the limits below."""
 
 JOINT_LIMITS = (60, 4_000)
+
+NOISE_PSNR = 44.0
+"""What the noise of good photographs allows, of encoded colours: 1.6 of 255 [dB]."""
 
 SMALLEST_COSINE = 0.2
 """Of the normals of neighbours on a body: two limbs in contact are not one."""
@@ -100,6 +103,7 @@ class Track:
         cloud: This frame's Gaussians; row i is the same one in every frame of the track.
         anchors: Of the Gaussians to the joints, from the key frame.
         graph: Of the joints, from the key frame.
+        local_normals: Which way the surface faces, in each Gaussian's own axes, ``(N, 3)`` float32; 0 where unknown.
         key_joints: Where the joints were in the key frame, ``(M, 3)`` float32 [m].
         joints: Where they are, ``(M, 3)``.
         previous_joints: Where they were a frame before; where they are in a key frame.
@@ -110,15 +114,20 @@ class Track:
     cloud: GaussianCloud
     anchors: Anchors
     graph: JointGraph
+    local_normals: NDArray[np.float32]
     key_joints: NDArray[np.float32]
     joints: NDArray[np.float32]
     previous_joints: NDArray[np.float32]
     turns: NDArray[np.float32]
     baseline: NDArray[np.float64]
 
-    OWN = ("key_joints", "joints", "previous_joints", "turns", "baseline")
+    OWN = ("local_normals", "key_joints", "joints", "previous_joints", "turns", "baseline")
     ANCHORS = ("joints", "weights")
     GRAPH = ("neighbors", "weights", "incoming", "incoming_starts")
+
+    def normals(self) -> NDArray[np.float32]:
+        """Return which way the surface faces now, ``(N, 3)``; 0 where it is not known."""
+        return Rotation.from_quat(self.cloud.orientations).apply(self.local_normals).astype(np.float32)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything as arrays by name, from which `from_arrays` makes the same track."""
@@ -165,7 +174,9 @@ def begin_track(
     require_scene_linear("cloud", cloud)
     count = options.joint_count or int(np.clip(len(cloud) // GAUSSIANS_PER_JOINT, *JOINT_LIMITS))
     rows = select_joints(cloud.positions, min(count, len(cloud)), opacities=cloud.opacities)
-    normals = outward_normals(cloud, views)
+    targets, gaussians = _drawn(cloud, views, options, device)
+    psnr, _ = targets.make_room(gaussians)
+    normals = outward_normals(cloud, targets.seen_directions(gaussians))
     joints = cloud.positions[rows]
     graph = JointGraph.build(joints, normals=normals[rows], smallest_cosine=SMALLEST_COSINE)
     anchors = Anchors.fit(
@@ -175,9 +186,10 @@ def begin_track(
         joint_normals=normals[rows],
         smallest_cosine=SMALLEST_COSINE,
     )
-    psnr, gaps = _measure(cloud, views, options, device)
     still = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (len(joints), 1))
-    return Track(cloud, anchors, graph, joints, joints, joints, still, np.array([psnr.mean(), gaps.max()]))
+    baseline = np.array([psnr.mean(), targets.gaps(gaussians).max()])
+    local = Rotation.from_quat(cloud.orientations).apply(normals, inverse=True).astype(np.float32)
+    return Track(cloud, anchors, graph, local, joints, joints, joints, still, baseline)
 
 
 def advance_track(
@@ -242,28 +254,23 @@ def advance_track(
     return following, report
 
 
-def outward_normals(cloud: GaussianCloud, views: Sequence[CapturedView]) -> NDArray[np.float32]:
-    """Return the thin axes of Gaussians, turned towards the cameras that can see them, ``(N, 3)``; 0 for balls.
+def outward_normals(cloud: GaussianCloud, sides: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the thin axes of Gaussians, turned to a side, ``(N, 3)``; 0 where it is not known.
 
-    A camera sees a Gaussian from the front if the photograph's subject is there; of all cameras, the mean direction to
-    them weighted by how squarely they face the disc decides the sign, unless the fit's own orientation is clear: local
-    z points outward where a hull began it, and steps turn it little.
+    Args:
+        cloud: Gaussians; those whose thin axis is more than half of the next have no normal.
+        sides: On which side of each the outside is, ``(N, 3)`` of any length; 0 where that is not known.
     """
-    axes = Rotation.from_quat(cloud.orientations).as_matrix()
-    thin = cloud.scales.argmin(axis=1)
-    picked = np.arange(len(cloud))
-    normals = axes[picked, :, thin]
-    outward = axes[:, :, 2]
-    along = (normals * outward).sum(axis=1)
-    normals *= np.where(along < 0.0, -1.0, 1.0)[:, None]
-    flat = np.sort(cloud.scales, axis=1)
-    normals[flat[:, 0] > 0.5 * flat[:, 1]] = 0.0
-    normals[thin != 2] = 0.0  # which side is out is not known
+    picked, order = np.arange(len(cloud)), np.argsort(cloud.scales, axis=1, kind="stable")
+    thin, next_one = order[:, 0], order[:, 1]
+    normals = Rotation.from_quat(cloud.orientations).as_matrix()[picked, :, thin]
+    normals *= np.sign((normals * sides).sum(axis=1))[:, None]
+    normals[~(cloud.scales[picked, thin] <= 0.5 * cloud.scales[picked, next_one])] = 0.0
     return normals.astype(np.float32)
 
 
 def _require_something(cloud: GaussianCloud, views: Sequence[CapturedView]) -> None:
-    """Refuse nothing."""
+    """Refuse no views and no Gaussians."""
     if not len(views) or not len(cloud):
         raise InvalidArrayError(
             f"views and cloud must hold something, got {len(views)} views and {len(cloud)} Gaussians. Pass some."
@@ -281,16 +288,15 @@ def _samples(cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
     return sample_side(views, np.median(cloud.positions, axis=0), spacing)
 
 
-def _measure(
+def _drawn(
     cloud: GaussianCloud, views: Sequence[CapturedView], options: TrackOptions, device: str | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return PSNR and gaps of a cloud in views."""
+) -> tuple[TargetSet, GaussianArrays]:
+    """Return views, and a cloud to draw for them."""
     target = resolve_device(device)
     chosen = options.refinement.samples
     samples = chosen if chosen != "auto" else _samples(cloud, views)
     targets = TargetSet(views, len(cloud), options.raster, samples, target)
-    gaussians = upload_gaussians(cloud, target, radiance=cloud.radiance)
-    return targets.make_room(gaussians)[0], targets.gaps(gaussians)
+    return targets, upload_gaussians(cloud, target, radiance=cloud.radiance)
 
 
 def _why_lost(
@@ -304,7 +310,8 @@ def _why_lost(
     """Return why a frame is not the same subject moved on, or nothing."""
     before, gap = track.baseline
     reasons = []
-    if not psnr >= before - options.largest_drop:
+    # Above that, a key frame is fitted to the noise of its own photographs, which no other frame has.
+    if not psnr >= min(before, NOISE_PSNR) - options.largest_drop:
         reasons.append(f"PSNR fell from {before:.1f} dB in the key frame to {psnr:.1f} dB")
     if not gaps.max() <= gap + options.largest_gap:
         name = views[int(gaps.argmax())].name

@@ -205,27 +205,22 @@ class ViewTargets:
             geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
 
-    def add_shares(self, index: int, gaussians: GaussianArrays, shares: NDArray[np.float64]) -> None:
-        """Add what each Gaussian shows of itself in a view: its weights, summed over the pixels, in pixels.
-
-        Args:
-            index: Of the view.
-            gaussians: What is drawn.
-            shares: Added to, ``(N,)``.
-        """
+    def shares(self, index: int, gaussians: GaussianArrays) -> NDArray[np.float32]:
+        """Return what each Gaussian shows of itself in a view: its weights summed over the pixels, ``(N,)`` [pixel]."""
+        count = gaussians.positions.shape[0]
         if self._weigher is None:
             self._weigher = Rasterizer(
-                len(shares), [self.cameras[index]], value_count=1, options=self.rasterizer.options, device=self.device
+                count, [self.cameras[index]], value_count=1, options=self.rasterizer.options, device=self.device
             )
         weigher = self._weigher
         weigher.set_cameras([self.cameras[index]])
-        ones = wp.full((len(shares), 1), 1.0, dtype=float, device=self.device)
+        ones = wp.full((count, 1), 1.0, dtype=float, device=self.device)
         weigher.draw(gaussians._replace(values=ones, radiance=None))
         adjoints = weigher.adjoints()
         adjoints.channels[0].fill_(1.0)  # derivatives of the image's sum to what is composited are the weights
         values = weigher.backward().values
         assert values is not None
-        shares += values.numpy()[:, 0] / self._samples**2
+        return values.numpy()[:, 0] / np.float32(self._samples**2)
 
     def psnr(self, index: int) -> float:
         """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB]."""
@@ -301,10 +296,23 @@ class TargetSet:
 
     def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
         """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
-        shares = np.zeros(gaussians.positions.shape[0])
+        total = np.zeros(gaussians.positions.shape[0])
         for group, index in self._places:
-            group.add_shares(index, gaussians, shares)
-        return shares
+            total += group.shares(index, gaussians)
+        return total
+
+    def seen_directions(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Return the mean direction from each Gaussian to the views, by how much they see of it, ``(N, 3)``.
+
+        It lies on the side of a surface from which it is seen; it is 0 for what no view sees.
+        """
+        positions = gaussians.positions.numpy().astype(np.float64)
+        total = np.zeros_like(positions)
+        for group, index in self._places:
+            towards = group.cameras[index].position - positions
+            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            total += group.shares(index, gaussians)[:, None] * towards
+        return total
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
         """Draw every view; return the largest connected part of its subject that is not drawn, a fraction, ``(V,)``."""

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.skinning import conjugate, product, unit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.joint_graph import JointGraph, stretch
-from beam_warp.joint_motion import extrapolate_poses
 from beam_warp.joint_selection import select_joints
 
 EPSILON = 2.0**-24
@@ -211,36 +209,3 @@ class TestStretch:
         graph = JointGraph.build(np.eye(3))
         with pytest.raises(InvalidArrayError, match=r"positions must have shape \(3, 3\), got \(2, 3\)"):
             stretch(graph, np.eye(3), np.eye(3)[:2])
-
-
-class TestExtrapolation:
-    def test_constant_turn(self):
-        """A joint that turned from 20 to 50 degrees about an axis will be at 80, and as far on."""
-        axis = unit(np.array([1.0, -2.0, 0.5]))
-        before, now, after = (Rotation.from_rotvec(np.radians(a) * axis).as_quat()[None] for a in (20, 50, 80))
-        rotations, positions = extrapolate_poses(-3.0 * now, [[1.0, 2, 3]], 0.5 * before, [[0.0, 2.5, 3]])
-        assert np.abs(rotations + after).max() <= 4.0 * EPSILON  # on the side of -now
-        assert (positions == [[2.0, 1.5, 3.0]]).all()
-
-    @given(seed=st.integers(0, 2**32 - 1))
-    @settings(max_examples=30, deadline=None)
-    def test_product(self, seed):
-        rng = np.random.default_rng(seed)
-        now, before = (unit(rng.standard_normal((20, 4))) for _ in range(2))
-        found, _ = extrapolate_poses(now, np.zeros((20, 3)), before, np.zeros((20, 3)))
-        expected = product(now, product(conjugate(before), now))
-        assert np.abs(np.abs((found * expected).sum(1)) - 1.0).max() <= 8.0 * EPSILON
-        assert ((found * now).sum(1) >= -EPSILON).all()
-
-    def test_at_rest(self):
-        now = np.array([[0.0, 0, 0, 1]])
-        rotations, positions = extrapolate_poses(now, np.ones((1, 3)), now, np.ones((1, 3)))
-        assert (rotations == now).all()
-        assert (positions == 1.0).all()
-
-    def test_refusals(self):
-        one, zero, point = np.array([[0.0, 0, 0, 1]]), np.zeros((1, 4)), np.zeros((1, 3))
-        with pytest.raises(InvalidArrayError, match="previous_rotations must be quaternions of a length above 0"):
-            extrapolate_poses(one, point, zero, point)
-        with pytest.raises(InvalidArrayError, match=r"positions must have shape \(1, 3\), got \(2, 3\)"):
-            extrapolate_poses(one, np.zeros((2, 3)), one, point)

@@ -117,7 +117,6 @@ class TestLost:
         """Nearly a diameter: some of the subject is not covered, and views are named in which."""
         _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), OPTIONS, device=device)
         assert "of the subject are not covered in view" in report["lost"]
-        assert "of the joints are torn from a neighbour" in report["lost"]
 
     def test_nothing_is_lost_where_everything_is_allowed(self, device):
         options = replace(BRIEF, largest_drop=1000.0, largest_gap=1.0, largest_tear=1.0)
@@ -185,15 +184,25 @@ class TestCaptures:
 
 
 class TestNormals:
-    def test_discs_face_along_their_local_z(self):
+    def test_discs_face_to_their_side(self):
         cloud = ball_cloud(50)
-        found = outward_normals(cloud, [])
         expected = cloud.positions / np.linalg.norm(cloud.positions, axis=1, keepdims=True)
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_allclose(outward_normals(cloud, expected + 0.3), expected, atol=1e-6)
+        np.testing.assert_allclose(outward_normals(cloud, -2.0 * expected), -expected, atol=1e-6)
 
-    def test_balls_and_needles_face_nowhere(self):
-        scales = [[0.1, 0.1, 0.08], [0.01, 0.1, 0.1], [0.1, 0.1, 0.1]]
-        assert not outward_normals(ball_cloud(3).with_arrays(scales=scales), []).any()
+    def test_balls_and_needles_and_what_nobody_sees_face_nowhere(self):
+        scales = [[0.1, 0.1, 0.08], [0.1, 0.1, 0.1], [0.1, 0.09, 0.05]]
+        cloud = ball_cloud(3)
+        assert not outward_normals(cloud.with_arrays(scales=scales), cloud.positions).any()
+        assert not outward_normals(cloud, np.zeros((3, 3))).any()
+
+    def test_a_key_frame_is_turned_towards_its_cameras(self, device):
+        """Whichever way local z points: outside is where it is seen from."""
+        track = rough_track(device)
+        faces = track.normals().any(axis=1)
+        outward = track.cloud.positions[faces] / np.linalg.norm(track.cloud.positions[faces], axis=1, keepdims=True)
+        assert faces.mean() > 0.5
+        assert ((track.normals()[faces] * outward).sum(axis=1) > 0.0).mean() > 0.95
 
 
 def test_a_pose_stays_what_it_was_when_the_next_is_found(device):
