@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 Row = Mapping[str, Any]
 
 MEASURES: tuple[tuple[str, Callable[[Row], float], float | None], ...] = (
-    ("PSNR of novel views [dB]", lambda row: row["psnr"], 37.0),
+    ("PSNR of novel views, in the box [dB]", lambda row: row["psnr"], 37.0),
     ("normals, median error [°]", lambda row: row["normals_median_degrees"], 6.0),
     ("Chamfer distance [mm]", lambda row: row["surface"]["chamfer_mm"], 2.0),
 )
@@ -45,6 +45,8 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             rows = _rows(result, section)
             for axes, (_, value, _) in zip(row, MEASURES, strict=True):
                 axes.plot([r[across] for r in rows], [value(r) for r in rows], "o-", label=name)
+            whole = [r["whole_psnr"] for r in rows]
+            row[0].plot([r[across] for r in rows], whole, "s--", color="C0", alpha=0.5, label="of whole images")
         _draw_times(panels[2, 0], result, name)
         _draw_drift(panels[2, 1], result, name)
         _draw_contenders(panels[2, 2], result, name)
@@ -54,9 +56,14 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.set(title=title, xlabel=across)
             if across == "Gaussians":
                 axes.set_xscale("log")
-    panels[2, 0].set(title="time of a frame at full resolution [s]", xlabel="frame", yscale="log")
+                counts = sorted({r["gaussians"] for result in results for r in _rows(result, "gaussians")})
+                axes.set_xticks(counts, [f"{count // 1000}k" if count >= 1000 else str(count) for count in counts])
+                axes.set_xticks([], minor=True)
+    panels[2, 0].set(title="time of a frame at full resolution [s]", xlabel="frame", ylim=(0.0, None))
     panels[2, 1].set(title="drift per vertex against the true surface, mean [mm]", xlabel="frame")
-    panels[2, 2].set(title="PSNR of novel views by frame [dB]", xlabel="frame")
+    panels[2, 2].set(title="PSNR of novel views by frame, in the box [dB]", xlabel="frame")
+    for axes in panels[2]:
+        axes.xaxis.get_major_locator().set_params(integer=True)
     for axes in panels.flat:
         axes.grid(True, which="both", alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
@@ -111,7 +118,10 @@ def main() -> int:
     paths = arguments.results or sorted((HERE / "results").glob("reconstruction_*.json"))
     if not paths:
         parser.error("there are no results: run reconstruction.py --out first")
-    draw([json.loads(path.read_text(encoding="utf-8")) for path in paths], arguments.out / "reconstruction.png")
+    results = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    draw(
+        [result for result in results if result["benchmark"] == "reconstruction"], arguments.out / "reconstruction.png"
+    )
     return 0
 
 
