@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,8 @@ class FitAndTrack:
 
     Attributes:
         fitting: How key frames are fitted.
-        tracking: How other frames follow from the one before.
+        tracking: How other frames follow from the one before. They are drawn as key frames are, and sampled as finely:
+            its ``raster`` and its refinement's ``samples`` are not used.
         points: What is known of the surfaces before, for images without masks; None if nothing is.
         device: Warp device; None takes the first CUDA device, or the CPU.
     """
@@ -61,13 +62,18 @@ class FitAndTrack:
             seed=chosen.seed,
         )
         fit = fit_gaussians(views, start, chosen, device=self.device, progress=progress)
-        return begin_track(fit.cloud, views, self.tracking, device=self.device), dict(fit.report)
+        return begin_track(fit.cloud, views, self._tracking(), device=self.device), dict(fit.report)
 
     def advance(
         self, track: Track, views: Sequence[CapturedView], progress: StepProgress
     ) -> tuple[Track, dict[str, Any]]:
         """Track the frame after."""
-        return advance_track(track, views, self.tracking, device=self.device, progress=progress)
+        return advance_track(track, views, self._tracking(), device=self.device, progress=progress)
+
+    def _tracking(self) -> TrackOptions:
+        """Return how frames follow a key frame that was fitted so: drawn otherwise, it would look worse than it is."""
+        refinement = replace(self.tracking.refinement, samples=self.fitting.samples)
+        return replace(self.tracking, raster=self.fitting.raster, refinement=refinement)
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
