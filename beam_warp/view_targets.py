@@ -303,7 +303,8 @@ class TargetSet:
         for group, index in self._places:
             group.draw(index, gaussians)
             psnr.append(-10.0 * np.log10(max(group.square_error(index), 1e-12)))
-            parts, count = ndimage.label(group.missed(index))
+            labelled: Any = ndimage.label(group.missed(index))  # its types say that it may be a number
+            parts, count = labelled
             largest = np.bincount(parts.ravel())[1:].max() if count else 0
             missed.append(largest / max(group.subject_pixels(index), 1))
         return np.array(psnr), np.array(missed)
