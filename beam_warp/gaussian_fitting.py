@@ -262,7 +262,8 @@ def _grow(
     views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: FitProgress
 ) -> tuple[Fitter, dict[str, Any]]:
     """Fit few Gaussians, and twice as many from there, until more do not pay."""
-    assert options.target_psnr is not None
+    wanted = options.target_psnr
+    assert wanted is not None
     count = min(max(FEWEST_GAUSSIANS, options.gaussian_count // 16), len(start))
     cloud = start.select(np.linspace(0, len(start) - 1, count).astype(int))
     cloud = cloud.with_arrays(scales=cloud.scales * np.sqrt(len(start) / count))
@@ -275,7 +276,7 @@ def _grow(
         iterations += report["iterations"]
         growth.append({"gaussians": report["gaussians"], "psnr": report["psnr"]})
         gain = growth[-1]["psnr"] - growth[-2]["psnr"] if len(growth) > 1 else np.inf
-        if growth[-1]["psnr"] >= options.target_psnr or gain < LEAST_GAIN or count >= options.gaussian_count:
+        if growth[-1]["psnr"] >= wanted or gain < LEAST_GAIN or count >= options.gaussian_count:
             return fitter, {**report, "iterations": iterations, "growth": growth}
         count = min(2 * count, options.gaussian_count)
         cloud = fitter.doubled(count)
@@ -389,7 +390,7 @@ class Fitter:
             positions=grown["positions"],
             orientations=orientations,
             scales=np.exp(grown["log_scales"]),
-            opacities=1.0 / (1.0 + np.exp(-grown["logits"])),
+            opacities=(1.0 / (1.0 + np.exp(-grown["logits"]))).astype(np.float32),
             radiance=grown["radiance"],
             radiance_color_space=self.parameters.cloud().radiance_color_space,
             ids=np.arange(len(grown["positions"])),

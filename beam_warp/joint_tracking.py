@@ -114,7 +114,7 @@ class JointTracker:
         self._spacing = graph.spacing
         self._skin = Skin(cloud.positions, cloud.orientations, anchors, joints, blend=options.blend, device=device)
         self._rigidity = RigidityLoss(graph, device=device)
-        at_rest = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (count, 1))
+        at_rest = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
         self._rest_rotations = upload(at_rest, wp.quat, device)
         self._rest_positions = upload(joints.astype(np.float32), wp.vec3, device)
         self._rotations = wp.clone(self._rest_rotations)

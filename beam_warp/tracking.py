@@ -142,13 +142,11 @@ class Track:
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Track:
         """Return the track of which these are `arrays`."""
+        fields: dict[str, Any] = {name: array for name, array in arrays.items() if name in ATTRIBUTES}
         return cls(
-            GaussianCloud(
-                **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
-                radiance_color_space=LINEAR_REC709,
-            ),
-            Anchors(*(arrays[f"anchor_{name}"] for name in cls.ANCHORS)),
-            JointGraph(*(arrays[f"graph_{name}"] for name in cls.GRAPH), float(arrays["graph_spacing"])),
+            GaussianCloud(**fields, radiance_color_space=LINEAR_REC709),
+            Anchors(**{name: arrays[f"anchor_{name}"] for name in cls.ANCHORS}),
+            JointGraph(**{name: arrays[f"graph_{name}"] for name in cls.GRAPH}, spacing=float(arrays["graph_spacing"])),
             *(arrays[f"track_{name}"] for name in cls.OWN),
         )
 
@@ -186,7 +184,7 @@ def begin_track(
         joint_normals=normals[rows],
         smallest_cosine=SMALLEST_COSINE,
     )
-    still = np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (len(joints), 1))
+    still = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (len(joints), 1))
     baseline = np.array([psnr.mean(), targets.gaps(gaussians).max()])
     local = Rotation.from_quat(cloud.orientations).apply(normals, inverse=True).astype(np.float32)
     return Track(cloud, anchors, graph, local, joints, joints, joints, still, baseline)

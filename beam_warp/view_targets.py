@@ -319,7 +319,8 @@ class TargetSet:
         gaps = []
         for group, index in self._places:
             group.draw(index, gaussians)
-            parts, count = ndimage.label(group.missed(index))
+            labelled: Any = ndimage.label(group.missed(index))  # its types say that it may be a number
+            parts, count = labelled
             largest = np.bincount(parts.ravel())[1:].max() if count else 0
             gaps.append(largest / max(group.subject_pixels(index), 1))
         return np.array(gaps)

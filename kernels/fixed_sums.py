@@ -49,6 +49,15 @@ class SumBuffers:
 def launch_sum_floats(values: Any, scale: float, buffers: SumBuffers, out_sum: Any, device: Any) -> None:
     """Write ``scale`` times the sum of one-dimensional ``values``, added in float64, to ``out_sum[0]``."""
     many, few = buffers.lanes
-    launch(sum_floats_kernel, LANES[0], inputs=[values, values.size, LANES[0]], outputs=[many], device=device)
+    # Lanes of small images are a float or none: as one launch they are summed sooner than spread over threads.
+    alone = LANES[0] if values.size <= 16 * LANES[0] else None
+    launch(
+        sum_floats_kernel,
+        LANES[0],
+        inputs=[values, values.size, LANES[0]],
+        outputs=[many],
+        device=device,
+        min_chunk=alone,
+    )
     launch(sum_lanes_kernel, LANES[1], inputs=[many, LANES[0], LANES[1]], outputs=[few], device=device)
     launch(finish_sum_kernel, 1, inputs=[few, wp.float64(scale)], outputs=[out_sum], device=device)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -120,5 +121,17 @@ def _run_in_chunks(run: Callable[[int, int], None], items: range, device: Any, t
         for start in starts[1:]:
             run_chunk(start)
     elif len(starts) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run_chunk, starts[1:]))
+        running = [_pool(threads).submit(run_chunk, start) for start in starts[1:]]
+        wait(running)  # all of them, also if one fails: they write to arrays that the caller may let go
+        for chunk_run in running:
+            chunk_run.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Return threads that stay: to start them takes longer than most launches."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="beam-warp")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads are not forked

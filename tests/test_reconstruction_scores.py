@@ -7,10 +7,10 @@ from skimage.metrics import structural_similarity
 
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709, GaussianCloud
 from beam_warp.cameras import Camera
-from beam_warp.errors import InvalidArrayError, MissingFileError
-from beam_warp.images import srgb_to_linear
+from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingFileError
+from beam_warp.images import linear_to_srgb, srgb_to_linear
 from beam_warp.rasterizing import GBuffer, rasterize
-from beam_warp.reconstruction_scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
+from beam_warp.reconstruction_scores import block_means, read_truth_mesh, score_frame, seen_radiance, truth_frames
 
 SH_BASIS_0 = 0.28209479177387814
 
@@ -113,9 +113,43 @@ class TestViews:
             "psnr", "ssim", "solid_psnr", "whole_psnr", "whole_ssim", "alpha_error", "views",
         }  # fmt: skip
 
+    def test_a_pixel_is_the_mean_of_its_samples(self, tiny_capture, discs, device):
+        """In linear light, before it is encoded; what geometry says is measured as without samples."""
+        records = tiny_capture.select(split="test", frames=[0])
+        once, fine = (score_frame(discs, records, samples=samples, device=device).as_dict() for samples in (1, 3))
+        buffer = rasterize(discs, records[0].camera.supersampled(3), channels=("radiance",), device=device)
+        linear = np.maximum(buffer.channels["radiance"].astype(np.float64) * buffer.alpha[..., None], 0.0)
+        linear, alpha = (
+            np.stack([image[j::3, i::3] for j in range(3) for i in range(3)]).mean(axis=0)
+            for image in (linear, buffer.alpha.astype(np.float64))
+        )
+        image = records[0].image().linear_rgba()
+        ours, theirs = (linear_to_srgb(np.clip(rgb, 0.0, 1.0)) for rgb in (linear, image[..., :3].astype(np.float64)))
+        assert fine["whole_psnr"] == pytest.approx(-10.0 * np.log10(np.mean((ours - theirs) ** 2)), abs=1e-4)
+        truth_alpha = records[0].truth().alpha
+        assert fine["alpha_error"] == pytest.approx(np.abs(alpha - truth_alpha).mean(), rel=1e-5)
+        assert fine["whole_psnr"] != once["whole_psnr"]
+        for name in ("normals_mean_degrees", "normals_median_degrees", "depth_median_mm", "median_depth_median_mm"):
+            assert fine[name] == once[name]
+
+    def test_samples_out_of_range_are_refused(self, tiny_capture, discs, device):
+        records = tiny_capture.select(split="test", frames=[0])
+        for samples in (0, -1, 1.5):
+            with pytest.raises(InvalidOptionError, match="factor must be an integer"):
+                score_frame(discs, records, samples=samples, device=device)
+
     def test_no_views_are_refused(self, discs):
         with pytest.raises(InvalidArrayError, match="records must hold at least one view"):
             score_frame(discs, [], device="cpu")
+
+
+@pytest.mark.parametrize("tail", [(), (3,)])
+def test_means_of_squares(rng, tail):
+    image = rng.uniform(size=(6, 9, *tail))
+    found = block_means(image, 3)
+    assert found.shape == (2, 3, *tail)
+    np.testing.assert_allclose(found[1, 2], image[3:6, 6:9].mean(axis=(0, 1)), rtol=1e-14)
+    assert block_means(image, 1) is image
 
 
 class TestSurface:

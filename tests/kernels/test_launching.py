@@ -1,6 +1,9 @@
 """Launching: kernels with atomics must not be spread over CPU threads."""
 
 import ast
+import os
+import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -49,3 +52,56 @@ def test_a_scene_is_the_same_with_many_threads(monkeypatch, rng):
         scene = Scene.from_gaussians(cloud, "cpu", build=build)
         assert np.sort(scene._tree.layout.items.numpy()).tolist() == np.flatnonzero(cloud.opacities > 1 / 255).tolist()
     assert np.array_equal(visibility(Scene.from_gaussians(cloud, "cpu"), *rays), alone)
+
+
+class _Cpu:
+    is_cuda = False
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_item_is_run_once(threads):
+    done = []
+    launching._run_in_chunks(
+        lambda start, count: done.extend(range(start, start + count)), range(5, 103), _Cpu, threads, 7
+    )
+    assert sorted(done) == list(range(5, 103))
+
+
+def test_a_failure_is_heard_of_after_all_chunks_have_ended():
+    """They write to arrays that the caller may free."""
+    done = []
+
+    def run(start, count):
+        if start == 7:
+            raise RuntimeError("no")
+        time.sleep(0.01)
+        done.append(start)
+
+    with pytest.raises(RuntimeError, match="no"):
+        launching._run_in_chunks(run, range(70), _Cpu, 3, 7)
+    assert sorted(done) == [start for start in range(0, 70, 7) if start != 7]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_has_threads_of_its_own():
+    """Threads do not survive a fork: work handed to those of the parent would never be done."""
+    done = []
+    launching._run_in_chunks(lambda start, count: done.append(count), range(70), _Cpu, 3, 7)
+    child = os.fork()
+    if not child:  # nothing of pytest's may run here
+        code = 1
+        try:
+            launching._run_in_chunks(lambda start, count: done.append(count), range(70), _Cpu, 3, 7)
+            code = 0 if sum(done) == 140 else 2
+        finally:
+            os._exit(code)
+    for _ in range(200):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        pytest.fail("the child hangs")
+    assert os.waitstatus_to_exitcode(status) == 0
