@@ -1,7 +1,7 @@
 """How bright each view is against the others, by the points of the surface that several of them see.
 
-Before anything is optimised: a fit paints the difference into colours that depend on direction, and little of it is left
-to be found.
+Before anything is optimised: a fit paints the difference into colours that depend on direction, and little of it is
+left to be found.
 """
 
 from __future__ import annotations
