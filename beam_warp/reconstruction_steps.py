@@ -130,7 +130,7 @@ class FitAndTrack:
 
     def _gains(self, cloud: GaussianCloud, views: Sequence[CapturedView]) -> ViewGains:
         """Compare the views' exposures."""
-        return view_gains(cloud.with_arrays(normals=outward_normals(cloud, views)), views, device=self.device)
+        return view_gains(cloud, outward_normals(cloud, views), views, device=self.device)
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""

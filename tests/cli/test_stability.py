@@ -7,10 +7,12 @@ import pytest
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from beam_warp import analytic_occlusion, stability, stress_captures, stress_cases
+from beam_warp import analytic_occlusion, capture_stability, stability, stress_captures, stress_cases
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
+
+BLACK_CAMERA = stress_captures.capture_case_of("black camera")
 
 NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 
@@ -19,6 +21,7 @@ NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 def few_cases(monkeypatch):
     monkeypatch.setattr(stress_cases, "CASES", [stress_cases.case_of(name) for name in NAMES])
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
+    assert capture_stability.CAPTURE_CASES  # imported before: tables name all of them
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
@@ -78,7 +81,7 @@ def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
 def one_capture(monkeypatch, tiny_capture):
     """A case that is run for real, of as few steps as there can be, on a capture that is there."""
     from beam_warp import stressed_reconstruction
-    from beam_warp.stress_captures import StressStudio, capture_case_of
+    from beam_warp.stress_captures import StressStudio
 
     class Effort(stressed_reconstruction.StressEffort):
         def studio(self, folder, device):
@@ -86,12 +89,14 @@ def one_capture(monkeypatch, tiny_capture):
 
     effort = Effort(size=64, camera_count=6, gaussian_count=300, fit=(4, 2), levels=(1, 1, 1), refinement=1)
     monkeypatch.setattr(stressed_reconstruction, "QUICK", effort)
-    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [capture_case_of("black camera")])
+    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [BLACK_CAMERA])
 
 
 def test_captures_alone(one_capture, tmp_path, capsys):
     page = tmp_path / "page.md"
-    page.write_text("# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nold\n", encoding="utf-8")
+    page.write_text(
+        "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n", encoding="utf-8"
+    )
     assert run("--only", "reconstruction", "--out", page) == 0
     out, _ = capsys.readouterr()
     assert "stress captures on cpu" in out
@@ -99,7 +104,7 @@ def test_captures_alone(one_capture, tmp_path, capsys):
     assert "coaxial disc" not in out
     text = page.read_text(encoding="utf-8")
     assert text.startswith("# Stability\n\nrays\n\n## Captures")  # what was not run stays
-    assert "old" not in text
+    assert "what was before" not in text
     row = next(line for line in text.splitlines() if line.startswith("| black camera |"))
     assert "| black-image of train_03 | 1 of 6 cameras left out |" in row
     assert row.endswith("| ok |")
@@ -107,11 +112,13 @@ def test_captures_alone(one_capture, tmp_path, capsys):
 
 def test_tracing_alone_keeps_captures(one_capture, tmp_path, capsys):
     page = tmp_path / "page.md"
-    page.write_text("# Stability\n\nold\n\n## Captures on which reconstructions fail\n\nkept\n", encoding="utf-8")
+    page.write_text(
+        "# Stability\n\nrays of before\n\n## Captures on which reconstructions fail\n\nkept\n", encoding="utf-8"
+    )
     assert run("--only", "tracing", "--out", page, "--quiet") == 0
     text = page.read_text(encoding="utf-8")
     assert "| broken rows |" in text
-    assert "old" not in text
+    assert "rays of before" not in text
     assert text.endswith("\n## Captures on which reconstructions fail\n\nkept\n")
 
 
@@ -128,11 +135,11 @@ def test_captures_of_another_device_stand_below(one_capture, tmp_path, capsys):
 
 
 def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
-    from beam_warp.stress_captures import CaptureStress, Detection, capture_case_of
+    from beam_warp.stress_captures import CaptureStress, Detection
 
-    case = capture_case_of("black camera")
     broken = dataclasses.replace(
-        case, build=lambda at: CaptureStress(capture=at.brief(), required=(Detection("black-image", "train_03"),))
+        BLACK_CAMERA,
+        build=lambda at: CaptureStress(capture=at.brief(), required=(Detection("black-image", "train_03"),)),
     )
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [broken])
     assert run("--only", "reconstruction", "--quiet") == 1
