@@ -112,6 +112,25 @@ class Camera:
             center_y=self.center_y * factor,
         )
 
+    def reduced(self, factor: int) -> Camera:
+        """Return the camera that has one pixel for ``factor`` x ``factor`` of this one.
+
+        Rows and columns beyond the last whole pixel are left out.
+
+        Raises:
+            InvalidOptionError: Nothing would be left.
+        """
+        require_count("factor", factor, 1, min(self.width, self.height))
+        return replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            focal_x=self.focal_x / factor,
+            focal_y=self.focal_y / factor,
+            center_x=self.center_x / factor,
+            center_y=self.center_y / factor,
+        )
+
     def directions(self) -> NDArray[np.float64]:
         """Return unit world directions from the camera through every pixel centre, ``(height, width, 3)`` float64."""
         x = (np.arange(self.width) + 0.5 - self.center_x) / self.focal_x

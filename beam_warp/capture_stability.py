@@ -238,7 +238,7 @@ TITLES = (
     "against the sound capture",
     "normals first, last [°]",
     "depth first, last [mm]",
-    "drift per vertex [mm]",
+    "drift per vertex [mm], over frames",
     "verdict",
 )
 
@@ -265,9 +265,15 @@ def cells(outcome: CaptureOutcome, outcomes: Sequence[CaptureOutcome]) -> tuple[
         _against(outcome, sound),
         _pair(outcome, "normals_median_degrees", ".1f"),
         _pair(outcome, "depth_median_mm", ".1f"),
-        f"{outcome.drift['vertices']['mean_mm']:.1f}" if "vertices" in outcome.drift else "–",
+        _drift(outcome),
         "; ".join(outcome.faults) or "ok",
     )
+
+
+def _drift(outcome: CaptureOutcome) -> str:
+    """Return the drift, and over how many frames."""
+    frames = min([key for key in outcome.key_frames if key > 0] + [outcome.frames])
+    return f"{outcome.drift['vertices']['mean_mm']:.1f} over {frames}" if "vertices" in outcome.drift else "–"
 
 
 def _against(outcome: CaptureOutcome, sound: CaptureOutcome | None) -> str:

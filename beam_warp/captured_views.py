@@ -89,15 +89,9 @@ class CapturedView:
             blocks = whole.reshape(height, factor, width, factor, *whole.shape[2:])
             return blocks.mean(axis=(1, 3), dtype=np.float32)
 
-        camera = replace(
-            self.camera,
-            width=width,
-            height=height,
-            focal_x=self.camera.focal_x / factor,
-            focal_y=self.camera.focal_y / factor,
-            center_x=self.camera.center_x / factor,
-            center_y=self.camera.center_y / factor,
-        )
         return replace(
-            self, camera=camera, color=mean(self.color), alpha=None if self.alpha is None else mean(self.alpha)
+            self,
+            camera=self.camera.reduced(factor),
+            color=mean(self.color),
+            alpha=None if self.alpha is None else mean(self.alpha),
         )

@@ -112,3 +112,9 @@ def mean_scores(scores: Mapping[str, list[Score]]) -> dict[str, dict[str, float]
         }
         for name, views in scores.items()
     }
+
+
+def block_means(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """Return the means of squares of ``side`` x ``side`` samples, ``(H, W, ...)`` of ``(H side, W side, ...)``."""
+    height, width = image.shape[0] // side, image.shape[1] // side
+    return image.reshape(height, side, width, side, *image.shape[2:]).mean(axis=(1, 3)) if side > 1 else image

@@ -234,8 +234,8 @@ def seen_colors(
         Scene-linear Rec.709, ``(N, 3)`` float32.
     """
     target = resolve_device(device)
-    samples = _samples(views, cloud, target)
     count = len(cloud)
+    samples = _samples(views, cloud, np.zeros((count, 3)) if cloud.normals is None else cloud.normals, target)
     colors = wp.empty(count, dtype=wp.vec3, device=target)
     seen = wp.empty(count, dtype=int, device=target)
     launch_agree_colors(samples, colors, seen, target)
@@ -248,23 +248,26 @@ def seen_colors(
 
 
 def view_samples(
-    views: Sequence[CapturedView], cloud: GaussianCloud, *, device: str | None = None
+    views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], *, device: str | None = None
 ) -> NDArray[np.float32]:
     """Return what each view shows of every Gaussian.
 
     Args:
         views: What the cameras saw.
-        cloud: Gaussians; those of a cloud with normals are seen from their side only.
+        cloud: Gaussians.
+        normals: From which side each is seen, ``(N, 3)``; from all where it is 0.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
         Scene-linear Rec.709, not premultiplied, and a weight in [0, 1], 0 where the view does not see the Gaussian:
         ``(V, N, 4)`` float32.
     """
-    return _samples(views, cloud, resolve_device(device)).numpy()
+    return _samples(views, cloud, normals, resolve_device(device)).numpy()
 
 
-def _samples(views: Sequence[CapturedView], cloud: GaussianCloud, target: Any) -> wp.array:
+def _samples(
+    views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], target: Any
+) -> wp.array:
     """Return what each view shows of every Gaussian, on the device."""
     count = len(cloud)
     gaussians = GaussianArrays(
@@ -273,8 +276,7 @@ def _samples(views: Sequence[CapturedView], cloud: GaussianCloud, target: Any) -
         upload(cloud.scales, wp.vec3, target),
         wp.full(count, HIDING_OPACITY, dtype=float, device=target),
     )
-    normals = np.zeros((count, 3), np.float32) if cloud.normals is None else cloud.normals
-    directions = upload(normals, wp.vec3, target)
+    directions = upload(normals.astype(np.float32), wp.vec3, target)
     samples = wp.empty((len(views), count), dtype=wp.vec4, device=target)
     slack = DEPTH_SLACK * float(np.median(cloud.scales.max(axis=1)))
     for row, view in enumerate(views):

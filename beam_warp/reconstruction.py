@@ -42,7 +42,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.frame_store import frame_key, frame_names, make_folders, read_frame, write_frame
 from beam_warp.images import write_png
 from beam_warp.raster_records import RasterOptions
-from beam_warp.reconstruction_previews import opposite_cameras, reconstruction_preview
+from beam_warp.reconstruction_previews import mesh_shadings, opposite_cameras, reconstruction_preview
 from beam_warp.reporting import device_facts, versions, write_json, write_report
 
 ASSET_NAME = "gaussians.usda"
@@ -50,7 +50,7 @@ ASSET_NAME = "gaussians.usda"
 ID_BITS = 32
 """Identities of a segment start at the number of its first frame times 2 to this power: no two segments share one."""
 
-DRIFT_WARNING = 1.0
+DRIFT_WARNING = 3.0
 """PSNR that a tracked frame may lie below its key frame before it is said [dB]."""
 
 LOADING_THREADS = 8
@@ -452,10 +452,19 @@ class _Job:
         picture = self._previews / f"frame_{frame:06d}.png"
         if self._note(frame).get("key") == key and picture.is_file():
             return
-        chosen = opposite_cameras([record.camera for record in self._records[frame]])
+        cameras = [record.camera for record in self._records[frame]]
+        chosen = opposite_cameras(cameras)
         shown = [views[index] if views is not None else self._records[frame][index].view() for index in chosen]
         cloud = stored_cloud(self.path(frame))
-        drawn = reconstruction_preview(cloud, shown, options=self._steps.raster, device=str(self._device))
+        options, device = self._steps.raster, str(self._device)
+        drawn = reconstruction_preview(
+            cloud,
+            shown,
+            shadings=mesh_shadings(cloud, cameras, chosen, options=options, device=device),
+            options=options,
+            samples=int(self.header(frame)["report"].get("samples", 1)),
+            device=device,
+        )
         write_png(picture, drawn)
         write_json(note, {"key": key, "seconds": self._seconds.get(frame)})
 

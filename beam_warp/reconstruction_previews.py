@@ -11,7 +11,11 @@ from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.contact_sheet import Panel, lay_out, over_background
+from beam_warp.errors import InvalidArrayError
+from beam_warp.evaluation import block_means
 from beam_warp.images import display_image
+from beam_warp.mesh_preview import shaded_image
+from beam_warp.meshing import mesh_of_gaussians
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, rasterize
 
@@ -39,6 +43,7 @@ def reconstruction_preview(
     *,
     shadings: Sequence[NDArray[np.uint8]] = (),
     options: RasterOptions | None = None,
+    samples: int = 1,
     device: str | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a frame beside its photographs, a row for each view.
@@ -49,18 +54,24 @@ def reconstruction_preview(
         shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
             column out.
         options: How splats are drawn: as they were when the Gaussians were fitted.
+        samples: Side of the square of samples of a pixel: likewise.
         device: Warp device.
 
     Returns:
         8-bit sRGB, ``(H, W, 3)``.
     """
-    cameras = [view.camera for view in views]
+    cameras = [view.camera.supersampled(samples) for view in views]
     buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
     panels: list[Panel] = []
     for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
-        alpha = buffer.alpha[..., None]
+        alpha = block_means(buffer.alpha, samples)[..., None]
+        radiance, normals = (
+            np.divide(block_means(buffer.channels[name] * buffer.alpha[..., None], samples), alpha, where=alpha > 0.0)
+            * (alpha > 0.0)
+            for name in (RADIANCE, SURFACE_NORMALS)
+        )
         photograph = _shown(view)
-        render = over_background(display_image(buffer.channels[RADIANCE]) / 255.0, alpha)
+        render = over_background(display_image(radiance) / 255.0, alpha)
         difference = np.abs(photograph.astype(np.int16) - render) * AMPLIFICATION
         if view.alpha is None:  # nothing is known of what lies around the subject
             difference = np.rint(difference * alpha)
@@ -68,12 +79,40 @@ def reconstruction_preview(
             (f"{view.name}: photograph", photograph),
             ("render", render),
             (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
-            ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels[SURFACE_NORMALS] + 0.5, alpha)),
+            ("normals (x, y, z as r, g, b)", over_background(0.5 * normals + 0.5, alpha)),
         ]
         if shadings:
             row.append(("mesh", shadings[index]))
         panels += [(title, _fitted(pixels)) for title, pixels in row]
     return lay_out(panels, len(panels) // len(views))
+
+
+def mesh_shadings(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    shown: Sequence[int],
+    *,
+    options: RasterOptions | None = None,
+    device: str | None = None,
+) -> list[NDArray[np.uint8]]:
+    """Return what some cameras see of the surface that all of them see of a cloud, ``(H, W, 3)`` 8-bit sRGB each.
+
+    Args:
+        cloud: Gaussians.
+        cameras: From where its depth is drawn, with as few pixels as a preview shows.
+        shown: Which of them are shown.
+        options: How splats are drawn.
+        device: Warp device.
+
+    Returns:
+        A picture for each; none where there is no surface.
+    """
+    smaller = [camera.reduced(min(-(-camera.height // MOST_ROWS), camera.width)) for camera in cameras]
+    try:
+        mesh = mesh_of_gaussians(cloud, smaller, options=options, device=device)
+    except InvalidArrayError:
+        return []
+    return [shaded_image(mesh, cameras[index], device=device) for index in shown]
 
 
 def _shown(view: CapturedView) -> NDArray[np.uint8]:

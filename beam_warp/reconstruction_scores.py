@@ -15,7 +15,7 @@ from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.captures import Capture, CaptureRecord
 from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileError
-from beam_warp.evaluation import SOLID_ALPHA, Score, compare, psnr, ssim
+from beam_warp.evaluation import SOLID_ALPHA, Score, block_means, compare, psnr, ssim
 from beam_warp.images import linear_to_srgb, srgb_to_linear
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, GBuffer, rasterize
@@ -156,12 +156,6 @@ def seen_radiance(buffer: GBuffer, cloud: GaussianCloud) -> NDArray[np.float64]:
     """Return what a camera sees as scene-linear colour over black, ``(H, W, 3)``: not below 0, not cut above."""
     over_black = np.maximum(buffer.channels[RADIANCE].astype(np.float64) * buffer.alpha[..., None], 0.0)
     return srgb_to_linear(over_black) if cloud.radiance_color_space == DISPLAY_SRGB else over_black
-
-
-def block_means(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
-    """Return the means of squares of ``side`` x ``side`` samples, ``(H, W, ...)`` of ``(H side, W side, ...)``."""
-    height, width = image.shape[0] // side, image.shape[1] // side
-    return image.reshape(height, side, width, side, *image.shape[2:]).mean(axis=(1, 3)) if side > 1 else image
 
 
 def read_truth_mesh(capture: Capture, frame: int) -> trimesh.Trimesh:

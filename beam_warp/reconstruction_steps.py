@@ -66,33 +66,27 @@ class FitAndTrack:
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""
-        start = self._start(views)
-        up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
-        gains = self._gains(start, outward_normals(start, up), views)
-        findings = judge_gains(gains, views)
-        if findings:
-            views = matched(views, gains)
-            start = self._start(views)  # of colours that agree
-        unpaired = float((gains.views_of_points < 2).mean())
-        if unpaired > MOST_UNPAIRED:
-            findings.append(
-                Finding(
-                    "warning",
-                    "few-cameras",
-                    f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of "
-                    "outlines",
-                    remedy="Add cameras.",
-                )
-            )
+        start, findings, said = self._start(views), [], {}
+        if all(view.alpha is not None for view in views):  # else it is no surface, and does not say who sees what
+            up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
+            gains = view_gains(start, outward_normals(start, up), views, device=self.device)
+            findings = judge_gains(gains, views)
+            if findings:
+                views = matched(views, gains)
+                start = self._start(views)  # of colours that agree
+            unpaired = float((gains.views_of_points < 2).mean())
+            said = {**_exposures(gains), "unpaired": unpaired}
+            if unpaired > MOST_UNPAIRED:
+                findings.append(_few_cameras(unpaired))
         fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
-        said = {**_exposures(gains), "unpaired": unpaired, "findings": [vars(finding) for finding in findings]}
-        return begin_track(fit.cloud, views, self._tracking, device=self.device), {**fit.report, **said}
+        track = begin_track(fit.cloud, views, self._tracking, device=self.device)
+        return track, {**fit.report, **said, "findings": [vars(finding) for finding in findings]}
 
     def advance(
         self, track: Track, views: Sequence[CapturedView], progress: StepProgress
     ) -> tuple[Track, dict[str, Any]]:
         """Track the frame after, exposures of its images matched."""
-        gains = self._gains(track.cloud, track.normals(), views)
+        gains = view_gains(track.cloud, track.normals(), views, device=self.device)
         findings = judge_gains(gains, views)
         views = matched(views, gains)
         following, report = advance_track(track, views, self._tracking, device=self.device, progress=progress)
@@ -134,15 +128,19 @@ class FitAndTrack:
             seed=self.fitting.seed,
         )
 
-    def _gains(self, cloud: GaussianCloud, normals: NDArray[np.floating], views: Sequence[CapturedView]) -> ViewGains:
-        """Compare the views' exposures by Gaussians of which it is known which way they face."""
-        faces = normals.any(axis=1)
-        seen = cloud.select(faces).with_arrays(normals=normals[faces]) if faces.any() else cloud
-        return view_gains(seen, views, device=self.device)
-
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
+
+
+def _few_cameras(unpaired: float) -> Finding:
+    """Say that cameras are too few, or too far apart, to see depth."""
+    return Finding(
+        "warning",
+        "few-cameras",
+        f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of outlines",
+        remedy="Add cameras.",
+    )
 
 
 def _exposures(gains: ViewGains) -> dict[str, float]:

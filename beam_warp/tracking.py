@@ -209,7 +209,7 @@ def advance_track(
 
     Returns:
         The track of the frame, and a report, JSON-able: ``psnr`` of the training views' crops [dB], ``gap``,
-        ``torn``, ``gaussians``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
+        ``torn``, ``gaussians``, ``samples``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
 
     Raises:
         InvalidArrayError: There is no view.
@@ -246,6 +246,7 @@ def advance_track(
         "gap": float(gaps.max()),
         "torn": float(torn),
         "gaussians": len(cloud),
+        "samples": samples,
         "lost": _why_lost(track, float(psnr.mean()), gaps, torn, views, options),
         "seconds": time.perf_counter() - began,
     }

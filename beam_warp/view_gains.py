@@ -60,7 +60,9 @@ class ViewGains:
     views_of_points: NDArray[np.int64]
 
 
-def view_gains(cloud: GaussianCloud, views: Sequence[CapturedView], *, device: str | None = None) -> ViewGains:
+def view_gains(
+    cloud: GaussianCloud, normals: NDArray[np.floating], views: Sequence[CapturedView], *, device: str | None = None
+) -> ViewGains:
     """Compare views by what they show of the same Gaussians.
 
     Sample L[v, i], the logarithm of the luminance that view v shows of Gaussian i, is s[v] + a[i] and what depends on
@@ -69,14 +71,15 @@ def view_gains(cloud: GaussianCloud, views: Sequence[CapturedView], *, device: s
     not move the others.
 
     Args:
-        cloud: Near the surface; those of a cloud with normals are seen from their side only.
+        cloud: Near the surface.
+        normals: From which side each Gaussian is seen, ``(N, 3)``; from all where it is 0.
         views: Of one moment.
         device: Warp device; None takes the first CUDA device, or the CPU.
 
     Source: iteratively reweighted least squares, Holland and Welsch 1977.
     """
     reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
-    samples = view_samples(reduced, cloud, device=device)
+    samples = view_samples(reduced, cloud, normals, device=device)
     seen = (samples[..., 3] > 0.0).sum(axis=0)
     picked = samples[:, np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_POINTS)).astype(int)].astype(np.float64)
     luminance, weights = picked[..., :3] @ np.array(LUMINANCE), picked[..., 3]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import trimesh
@@ -16,6 +16,7 @@ import warp as wp
 
 from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
+from beam_warp.capture_findings import Finding
 from beam_warp.capture_stability import Reconstructed
 from beam_warp.captured_views import CapturedView
 from beam_warp.captures import Capture
@@ -139,18 +140,29 @@ def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[
             report: dict[str, Any] = {"lost": "start"}
             if track is not None:
                 track, report = contender.steps.advance(track, views, _nobody)
-                if report.get("lost"):
-                    detections.append(Detection(TRACKING_LOST, frame=frame))
+                detections += _said(report, training_cameras(capture), frame)
             if report.get("lost"):
                 track, report = contender.steps.begin(views, _nobody)
+                detections += _said(report, training_cameras(capture), frame)
                 key_frames.append(index)
             clouds.append(track.cloud)
         return Reconstructed(
-            sequence=GaussianSequence.from_clouds(clouds), detections=detections, key_frames=key_frames
+            sequence=GaussianSequence.from_clouds(clouds),
+            detections=detections,
+            key_frames=key_frames,
+            raster=contender.options,
         )
 
     resolve_device(device)
     return reconstruct
+
+
+def _said(report: dict[str, Any], cameras: Sequence[str], frame: int) -> list[Detection]:
+    """Return what a step noticed in a frame; a view that shows what is lost is not to blame for it."""
+    said = detections_of((replace(Finding(**entry), what="") for entry in report.get("findings", [])), cameras)
+    if report.get("lost") and not said:
+        said = (Detection(TRACKING_LOST),)
+    return [replace(detection, frame=frame) for detection in said]
 
 
 def _nobody(done: int, total: int, facts: Any = None) -> None:

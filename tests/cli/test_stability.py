@@ -7,10 +7,12 @@ import pytest
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from beam_warp import analytic_occlusion, stability, stress_cases
+from beam_warp import analytic_occlusion, capture_stability, stability, stress_captures, stress_cases
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
+
+BLACK_CAMERA = stress_captures.capture_case_of("black camera")
 
 NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 
@@ -19,6 +21,8 @@ NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 def few_cases(monkeypatch):
     monkeypatch.setattr(stress_cases, "CASES", [stress_cases.case_of(name) for name in NAMES])
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
+    assert capture_stability.CAPTURE_CASES  # imported before: tables name all of them
+    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
 
@@ -71,6 +75,75 @@ def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
     monkeypatch.setattr(stress_cases, "CASES", [broken])
     assert run("--quiet") == 1
     assert "failed: one Gaussian on cpu, wide: traced must be 2, got 1" in capsys.readouterr().err
+
+
+@pytest.fixture
+def one_capture(monkeypatch, tiny_capture):
+    """A case that is run for real, of as few steps as there can be, on a capture that is there."""
+    from beam_warp import stressed_reconstruction
+    from beam_warp.stress_captures import StressStudio
+
+    class Effort(stressed_reconstruction.StressEffort):
+        def studio(self, folder, device):
+            return StressStudio(folder, given=tiny_capture, device=device)
+
+    effort = Effort(size=64, camera_count=6, gaussian_count=300, fit=(4, 2), levels=(1, 1, 1), refinement=1)
+    monkeypatch.setattr(stressed_reconstruction, "QUICK", effort)
+    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [BLACK_CAMERA])
+
+
+def test_captures_alone(one_capture, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n", encoding="utf-8"
+    )
+    assert run("--only", "reconstruction", "--out", page) == 0
+    out, _ = capsys.readouterr()
+    assert "stress captures on cpu" in out
+    assert "black-image of" in out
+    assert "coaxial disc" not in out
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# Stability\n\nrays\n\n## Captures")  # what was not run stays
+    assert "what was before" not in text
+    row = next(line for line in text.splitlines() if line.startswith("| black camera |"))
+    assert "black-image of train_03 | 1 of 6 cameras left out, told |" in row  # told: six cameras are few
+    assert row.endswith("| ok |")
+
+
+def test_tracing_alone_keeps_captures(one_capture, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Stability\n\nrays of before\n\n## Captures on which reconstructions fail\n\nkept\n", encoding="utf-8"
+    )
+    assert run("--only", "tracing", "--out", page, "--quiet") == 0
+    text = page.read_text(encoding="utf-8")
+    assert "| broken rows |" in text
+    assert "rays of before" not in text
+    assert text.endswith("\n## Captures on which reconstructions fail\n\nkept\n")
+
+
+def test_captures_of_another_device_stand_below(one_capture, tmp_path, capsys):
+    assert run("--only", "reconstruction", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    record["captures"][0] |= {"device": "Some GPU", "faults": ["not detected: black-image of train_03"]}
+    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
+    page = tmp_path / "page.md"
+    assert run("--only", "reconstruction", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 0
+    text = page.read_text(encoding="utf-8")
+    assert text.index("cpu: 6 cameras of 64 x 64 pixels") < text.index("Some GPU: 6 cameras of 64 x 64 pixels")
+    assert "| not detected: black-image of train_03 |" in text
+
+
+def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
+    from beam_warp.stress_captures import CaptureStress, Detection
+
+    broken = dataclasses.replace(
+        BLACK_CAMERA,
+        build=lambda at: CaptureStress(capture=at.brief(), required=(Detection("black-image", "train_03"),)),
+    )
+    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [broken])
+    assert run("--only", "reconstruction", "--quiet") == 1
+    assert "failed: black camera on cpu: not detected: black-image of train_03" in capsys.readouterr().err
 
 
 def test_results_that_are_none_are_refused(tmp_path, capsys):
