@@ -66,8 +66,7 @@ def reconstruction_preview(
     for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
         alpha = block_means(buffer.alpha, samples)[..., None]
         radiance, normals = (
-            np.divide(block_means(buffer.channels[name] * buffer.alpha[..., None], samples), alpha, where=alpha > 0.0)
-            * (alpha > 0.0)
+            _straight(block_means(buffer.channels[name] * buffer.alpha[..., None], samples), alpha)
             for name in (RADIANCE, SURFACE_NORMALS)
         )
         photograph = _shown(view)
@@ -119,8 +118,12 @@ def _shown(view: CapturedView) -> NDArray[np.uint8]:
     """Return a photograph for a display, over the background where its coverage is known."""
     alpha = np.ones(view.color.shape[:2], np.float32) if view.alpha is None else view.alpha
     covered = alpha[..., None]
-    straight = np.divide(view.color, covered, out=np.zeros_like(view.color), where=covered > 0.0)
-    return over_background(display_image(straight) / 255.0, covered)
+    return over_background(display_image(_straight(view.color, covered)) / 255.0, covered)
+
+
+def _straight(premultiplied: NDArray[np.floating], alpha: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return an image without its alpha; 0 where that is 0."""
+    return np.divide(premultiplied, alpha, out=np.zeros_like(premultiplied), where=alpha > 0.0)
 
 
 def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
