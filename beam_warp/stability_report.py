@@ -62,12 +62,12 @@ CAPTURES_TITLE = "## Captures on which reconstructions fail"
 CAPTURES_TEXT = """\
 The demo figure's dance, path traced for a dome of cameras, with something wrong, and what `beam reconstruct` makes of
 it: the same inspection, steps and report. `beam stability --only reconstruction` runs few steps on small images, for
-which two CPU cores take minutes; with `--large` the images are larger and the schedule is the default. Scores are of
-two test views of the first and the last frame: PSNR inside the subject's box, median angle of normals, median error of
-depth. Drift is the mean distance of the truth's vertices,
-carried by the Gaussians nearest to them in the first frame, from where they are in the last one of its segment.
-*Against the sound capture* is PSNR less that of *as it is*, of other images where the case shows something else. Cases
-that a camera is at fault in have two frames.
+which two CPU cores take minutes; with `--large` the images are larger and the schedule is the default.
+
+Scores are of two test views of the first and the last frame: PSNR inside the subject's box, median angle of normals,
+median error of depth. Drift is the mean distance of the truth's vertices, carried by the Gaussians nearest to them in
+the first frame, from where they are in the last one of its segment. *Against the sound capture* is PSNR less that of
+*as it is*, of other images where the case shows something else. Cases that a camera is at fault in have two frames.
 
 A case fails if what must be detected was not, if a sound camera is blamed, if something is found where nothing is
 wrong, if the last frame is more than {silent:g} dB worse than the first and nothing was said, if frames are missing, or
