@@ -2,6 +2,8 @@
 
 import ast
 from pathlib import Path
+from threading import get_ident
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,7 +47,41 @@ def test_a_scene_is_the_same_with_many_threads(monkeypatch, rng):
     alone = visibility(Scene.from_gaussians(cloud, "cpu"), *rays)
     monkeypatch.setenv("BEAM_WARP_THREADS", "16")
     monkeypatch.setattr(launching, "MIN_CHUNK", 64)
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
     for build in ("quality", "fast"):
         scene = Scene.from_gaussians(cloud, "cpu", build=build)
         assert np.sort(scene._tree.layout.items.numpy()).tolist() == np.flatnonzero(cloud.opacities > 1 / 255).tolist()
     assert np.array_equal(visibility(Scene.from_gaussians(cloud, "cpu"), *rays), alone)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 9, 10, 11, 20, 401])
+def test_every_item_is_worked_on_once(monkeypatch, threads, count):
+    """Chunks of 10 and more; sizes straddle one and two of them, and are more than all threads take at a time."""
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
+    done = []
+    cpu = SimpleNamespace(is_cuda=False)
+    launching._run_in_chunks(
+        lambda start, length: done.extend(range(start, start + length)), range(count), cpu, threads, 10
+    )
+    assert sorted(done) == list(range(count))
+
+
+def test_work_that_is_short_stays_on_one_thread(monkeypatch):
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 1e9)
+    threads = set()
+    cpu = SimpleNamespace(is_cuda=False)
+    launching._run_in_chunks(lambda start, length: threads.add(get_ident()), range(1000), cpu, 4, 10)
+    assert threads == {get_ident()}
+
+
+def test_an_error_in_a_chunk_is_raised(monkeypatch):
+    """Whichever thread it happens on, and no chunk is begun after the call has ended."""
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
+
+    def run(start, length):
+        if start > 100:
+            raise ValueError("chunk")
+
+    with pytest.raises(ValueError, match="chunk"):
+        launching._run_in_chunks(run, range(1000), SimpleNamespace(is_cuda=False), 3, 10)
