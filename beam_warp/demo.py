@@ -274,7 +274,7 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress =
     result.report["scores"] = score_views(scene.truth, relit)
     write_png(out / "relit.png", comparison(scene.truth[0], relit[0], lightings))
     images = demo_from_images(
-        out, options.images, scene.lights, device=options.device, seed=options.seed, progress=progress
+        out, options.images, scene.lights, lightings, device=options.device, seed=options.seed, progress=progress
     )
     result.report["from_images"] = images.report
     result.report["seconds"]["build demo"] = built

@@ -97,6 +97,7 @@ def demo_from_images(
     out: Path,
     options: FromImagesOptions,
     lights: Mapping[str, EnvironmentMap],
+    lightings: Mapping[str, EnvironmentLighting],
     *,
     device: str | None,
     seed: int,
@@ -112,6 +113,7 @@ def demo_from_images(
         out: Folder, which exists.
         options: See `FromImagesOptions`.
         lights: Environments by name; the first one is that of the capture, all are put on the result.
+        lightings: The same, ready to light with.
         device: Warp device; None takes the first CUDA device, or the CPU.
         seed: Same seed, same device: same result.
         progress: Called with (stage, done, total).
@@ -164,7 +166,6 @@ def demo_from_images(
         demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS)), device=device
     )
     truths = [Truth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
-    lightings = {name: EnvironmentLighting.from_environment(at, device=device) for name, at in lights.items()}
     relit = relit_views(result.sequence[last], cameras, lightings, raster=steps.raster, device=device)
     report: dict[str, Any] = {
         "options": asdict(options),

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from beam_warp.deferred import EnvironmentLighting
 from beam_warp.demo import DemoOptions, run_demo
 from beam_warp.demo_environments import demo_environments
 from beam_warp.demo_figure import build_figure
@@ -56,7 +57,18 @@ def test_lights_are_maps_of_the_same_exposure():
 def small_demo(tmp_path_factory):
     """The whole demo at a twentieth of its size: its folder, its options and its result."""
     out = tmp_path_factory.mktemp("small") / "demo"
-    images = FromImagesOptions(size=64, frame_count=2, camera_count=8, test_camera_count=1, gaussian_count=1500)
+    images = FromImagesOptions(
+        size=64,
+        frame_count=2,
+        camera_count=8,
+        test_camera_count=1,
+        samples=4,
+        gaussian_count=1500,
+        color_iterations=30,
+        normal_iterations=30,
+        joint_iterations=20,
+        track_iterations=10,
+    )
     options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu", images=images)
     return out, options, run_demo(out, options)
 
@@ -83,7 +95,7 @@ def test_small_demo_from_images_recovers_its_truth(small_demo):
     A pixel is 37 mm wide, so that a surface off by more than one is not found; the subject fills a sixth of its box, so
     that images which miss it score below 15 dB.
     """
-    out, options, result = small_demo
+    out, _, result = small_demo
     found = result.report["from_images"]
     assert json.loads((out / "report.json").read_text())["from_images"] == json.loads(json.dumps(found))
     assert [entry["kind"] for entry in found["frames"]] == ["key", "tracked"]
@@ -108,10 +120,12 @@ def test_small_demo_from_images_recovers_its_truth(small_demo):
 
 def test_demo_takes_up_its_capture_and_refuses_another(small_demo):
     out, options, _ = small_demo
+    lights = {"studio": demo_environments()["studio"]}
+    lightings = {"studio": EnvironmentLighting.from_environment(lights["studio"], device="cpu")}
     images = replace(options.images, frame_count=1)
     with pytest.raises(OutputError, match=r"folder must be new or empty, got .*capture with content"):
-        demo_from_images(out, images, demo_environments(), device="cpu", seed=0, progress=no_progress)
+        demo_from_images(out, images, lights, lightings, device="cpu", seed=0, progress=no_progress)
     before = (out / "capture/transforms.json").stat().st_mtime_ns
-    again = demo_from_images(out, options.images, demo_environments(), device="cpu", seed=0, progress=no_progress)
+    again = demo_from_images(out, options.images, lights, lightings, device="cpu", seed=0, progress=no_progress)
     assert (out / "capture/transforms.json").stat().st_mtime_ns == before
     assert again.result.report["resumed_frames"] == 2

@@ -87,8 +87,8 @@ def _print(report: dict[str, Any]) -> None:
         print(f"warning: {warning}")
     seconds = report["seconds"]
     print(
-        f"{seconds['total']:.1f} s on {report['device']['name']}, of which {seconds['build demo']:.1f} s to build and path "
-        f"trace the stand-in, {images['seconds']['capture']:.1f} s the photographs, and "
+        f"{seconds['total']:.1f} s on {report['device']['name']}, of which {seconds['build demo']:.1f} s to build and "
+        f"path trace the stand-in, {images['seconds']['capture']:.1f} s the photographs, and "
         f"{images['seconds']['reconstruct']:.1f} s to reconstruct"
     )
 
