@@ -1,13 +1,12 @@
-"""The embedded demo: a figure whose truth is known, captured as Gaussians, decomposed, relit and scored."""
+"""The embedded demo: a figure whose truth is known, as Gaussians and from images, decomposed, relit and scored."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,18 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
-from beam_warp.contact_sheet import Panel, Relighting, display_exposure, lay_out, over_background
-from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.contact_sheet import Relighting
+from beam_warp.deferred import EnvironmentLighting
 from beam_warp.demo_environments import demo_environments
 from beam_warp.demo_figure import build_figure
+from beam_warp.demo_reconstruction import FromImagesOptions, demo_from_images
+from beam_warp.demo_truth import Truth, comparison, relit_views, score_views
 from beam_warp.environments import EnvironmentMap
-from beam_warp.evaluation import Score, compare, least_squares_scale, mean_scores
-from beam_warp.images import display_image, linear_to_srgb, write_exr, write_png
+from beam_warp.images import linear_to_srgb, write_exr, write_png
 from beam_warp.material_mesh import MaterialMesh
-from beam_warp.mesh_path_tracing import TracedChannels, TracedMesh, outgoing_radiance, trace_channels, trace_radiance
+from beam_warp.mesh_path_tracing import TracedMesh, outgoing_radiance
 from beam_warp.pipeline import OverviewOptions, Progress, RunOptions, RunResult, no_progress, run
 from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import GBuffer, rasterize
 from beam_warp.reporting import write_report
 from beam_warp.spherical_harmonics import sh_basis
 
@@ -53,7 +52,7 @@ SH_RIDGE = 0.03
 VIEWS = ((25.0, 8.0), (-150.0, 14.0))
 """Azimuth and elevation of the cameras with truth [degree]."""
 
-TRUTH_PATHS = 128
+TRUTH_PATHS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,23 +65,15 @@ class DemoOptions:
         image_height: Height of the images with truth [pixel].
         device: Warp device; None takes the first CUDA device, or the CPU.
         seed: Same seed, same device: same result.
+        images: Size of the second half, which starts from photographs.
     """
 
-    frame_count: int = 3
+    frame_count: int = 1
     gaussian_count: int = 45_000
     image_height: int = 360
     device: str | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What a view should show: channels, coverage, and radiance by light."""
-
-    camera: Camera
-    alpha: NDArray[np.float32]
-    channels: TracedChannels
-    radiance: Mapping[str, NDArray[np.float32]]
+    images: FromImagesOptions = field(default_factory=FromImagesOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +128,7 @@ def build_demo(options: DemoOptions, progress: Progress = no_progress) -> DemoSc
                     width=round(options.image_height * 0.8),
                     height=options.image_height,
                 )
-                truth.append(_truth(traced, camera, lights))
+                truth.append(Truth.of(traced, camera, lights, TRUTH_PATHS))
                 progress("path trace truth", len(truth), len(VIEWS))
     sequence = GaussianSequence.from_clouds(clouds, frames_per_second=6.0, metadata={"producer": "beam demo"})
     return DemoScene(sequence, lights, truth, truth_frame)
@@ -237,17 +228,11 @@ def _fit_harmonics(colors: NDArray[np.float64], directions: NDArray[np.float64])
     return np.linalg.solve(normal, right)
 
 
-def _truth(traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap]) -> Truth:
-    images = {name: trace_radiance(traced, camera, light, sample_count=TRUTH_PATHS) for name, light in lights.items()}
-    channels = trace_channels(traced, camera, sample_count=16, visibility_count=16)
-    return Truth(camera, images["studio"].alpha, channels, {name: image.rgb for name, image in images.items()})
-
-
 def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress = no_progress) -> RunResult:
-    """Build the demo, run the main job on it, score the result and draw it.
+    """Build the demo, run the main job on it, score the result and draw it; then do the same from images.
 
-    Writes what `beam_warp.run` writes, ``out/lights/*.exr`` and ``out/relit.png``: ours above, truth below. The scores
-    are in the report, under ``scores``.
+    Writes what `beam_warp.run` writes, ``out/lights/*.exr`` and ``out/relit.png``: ours above, truth below; and what
+    `demo_from_images` writes. The scores are in the report, under ``scores`` and ``from_images``.
 
     Args:
         out: Folder; made if its parent exists.
@@ -275,87 +260,24 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress =
     folder.mkdir(exist_ok=True)
     for name, light in scene.lights.items():
         write_exr(folder / f"{name}.exr", {c: light.radiance[..., i] for i, c in enumerate("RGB")})
-    cloud = result.sequence[scene.truth_frame]
-    # The stand-in was not trained against a widening filter, so the one that keeps energy is the fair one.
-    cameras = [truth.camera for truth in scene.truth]
-    buffers = rasterize(cloud, cameras, options=RasterOptions(antialiased=True), device=options.device)
     lightings = {
         name: EnvironmentLighting.from_environment(light, device=options.device) for name, light in scene.lights.items()
     }
-    relightings = [{name: relight(buffer, lighting) for name, lighting in lightings.items()} for buffer in buffers]
-    result.report["scores"] = score_demo(scene.truth, buffers, relightings)
+    # The stand-in was not trained against a widening filter, so the one that keeps energy is the fair one.
+    relit = relit_views(
+        result.sequence[scene.truth_frame],
+        [truth.camera for truth in scene.truth],
+        lightings,
+        raster=RasterOptions(antialiased=True),
+        device=options.device,
+    )
+    result.report["scores"] = score_views(scene.truth, relit)
+    write_png(out / "relit.png", comparison(scene.truth[0], relit[0], lightings))
+    images = demo_from_images(
+        out, options.images, scene.lights, lightings, device=options.device, seed=options.seed, progress=progress
+    )
+    result.report["from_images"] = images.report
     result.report["seconds"]["build demo"] = built
     result.report["seconds"]["total"] = time.perf_counter() - started
     write_report(out, result.report)
-    write_png(out / "relit.png", _comparison(scene.truth[0], buffers[0], relightings[0], lightings))
     return replace(result, report=result.report)
-
-
-def score_demo(
-    truths: Sequence[Truth],
-    buffers: Sequence[GBuffer],
-    relightings: Sequence[Mapping[str, NDArray[np.float32]]],
-) -> dict[str, Any]:
-    """Return mean scores over views, unscaled, with the scale of base colour that would fit best beside them."""
-    scores: dict[str, list[Score]] = {}
-    scales, normals = [], []
-    for truth, buffer, radiance in zip(truths, buffers, relightings, strict=True):
-        for name, is_color in (("ambient_occlusion", False), ("base_color", True)):
-            scores.setdefault(name, []).append(
-                compare(
-                    buffer.channels[name],
-                    getattr(truth.channels, name),
-                    alpha=buffer.alpha,
-                    truth_alpha=truth.alpha,
-                    is_color=is_color,
-                    premultiplied=False,
-                )
-            )
-        for name, image in radiance.items():
-            scores.setdefault(f"relit_{name}", []).append(
-                compare(
-                    image,
-                    truth.radiance[name],
-                    alpha=buffer.alpha,
-                    truth_alpha=truth.alpha,
-                    is_color=True,
-                    premultiplied=True,
-                )
-            )
-        solid = truth.alpha > 0.999
-        scales.append(least_squares_scale(buffer.channels["base_color"], truth.channels.base_color, solid))
-        cosine = (buffer.channels["normals"] * truth.channels.normals).sum(axis=-1)[solid]
-        normals.append(float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))))
-    return {
-        **mean_scores(scores),
-        "base_color_scale": np.mean(scales, axis=0).tolist(),
-        "normals_median_error_degrees": float(np.mean(normals)),
-    }
-
-
-def _comparison(
-    truth: Truth,
-    buffer: GBuffer,
-    radiance: Mapping[str, NDArray[np.float32]],
-    lightings: Mapping[str, EnvironmentLighting],
-) -> NDArray[np.uint8]:
-    """Ours above, truth below, for ambient occlusion, base colour and every light."""
-
-    def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:
-        return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
-
-    def lit(image: NDArray[np.float32], alpha: NDArray[np.float32], stops: float) -> NDArray[np.floating]:
-        straight = np.divide(image, alpha[..., None], out=np.zeros_like(image), where=alpha[..., None] > 0.0)
-        return display_image(straight, stops) / 255.0
-
-    found, known = buffer.channels, truth.channels
-    pairs = [
-        ("ambient occlusion", gray(found["ambient_occlusion"]), gray(known.ambient_occlusion)),
-        ("base colour", display_image(found["base_color"]) / 255.0, display_image(known.base_color) / 255.0),
-    ]
-    for name, lighting in lightings.items():
-        stops = display_exposure(lighting)
-        pairs.append((name, lit(radiance[name], buffer.alpha, stops), lit(truth.radiance[name], truth.alpha, stops)))
-    ours: list[Panel] = [(f"{title}, ours", over_background(a, buffer.alpha[..., None])) for title, a, _ in pairs]
-    theirs: list[Panel] = [(f"{title}, truth", over_background(b, truth.alpha[..., None])) for title, _, b in pairs]
-    return lay_out([*ours, *theirs], len(pairs))

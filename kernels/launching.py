@@ -8,9 +8,11 @@ share outputs by atomics are launched ``in_order``.
 from __future__ import annotations
 
 import os
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any
 
 import warp as wp
@@ -20,6 +22,9 @@ CHUNKS_PER_THREAD = 8
 
 MIN_CHUNK = 1024
 """Below this many items a launch costs more than it saves."""
+
+WORTH_SPREADING = 2e-4
+"""Work that the first chunk shows to be shorter than this is done at once: waking a thread takes about as long [s]."""
 
 
 def thread_count() -> int:
@@ -111,27 +116,41 @@ def _run_in_chunks(run: Callable[[int, int], None], items: range, device: Any, t
         run(items.start, len(items))
         return
     chunk = max(min_chunk, -(-len(items) // (threads * CHUNKS_PER_THREAD)))
-    starts = range(items.start, items.stop, chunk)
+    started = time.perf_counter()
+    first = min(chunk, len(items))
+    run(items.start, first)  # alone, so that compiling and loading the module is not raced
+    left = items[first:]
+    if not left:
+        return
+    expected = (time.perf_counter() - started) * len(left) / first
+    if threads == 1 or expected < WORTH_SPREADING:
+        run(left.start, len(left))
+        return
+    starts = deque(left[::chunk])
 
-    def run_chunk(start: int) -> None:
-        run(start, min(chunk, items.stop - start))
+    def run_chunks() -> None:
+        while starts:
+            try:
+                start = starts.popleft()
+            except IndexError:  # another thread took the last one
+                return
+            run(start, min(chunk, items.stop - start))
 
-    run_chunk(starts[0])  # alone, so that compiling and loading the module is not raced
-    if threads == 1:
-        for start in starts[1:]:
-            run_chunk(start)
-    elif len(starts) > 1:
-        running = [_pool(threads).submit(run_chunk, start) for start in starts[1:]]
-        wait(running)  # all of them, also if one fails: they write to arrays that the caller may let go
-        for chunk_run in running:
-            chunk_run.result()
+    helpers = [_pool(threads - 1).submit(run_chunks) for _ in range(min(threads, len(starts)) - 1)]
+    try:
+        run_chunks()
+    finally:
+        starts.clear()
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
 
 
-@cache
+@lru_cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return threads that stay: to start them takes longer than most launches."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="beam-warp")
+    """Return threads that stay: starting them for every launch takes longer than most launches."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="beam-launch")
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads are not forked
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,12 +1,20 @@
 """The demo: its figure persists and is closed, and a small run decomposes it close to its truth."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
+from beam_warp.deferred import EnvironmentLighting
 from beam_warp.demo import DemoOptions, run_demo
 from beam_warp.demo_environments import demo_environments
 from beam_warp.demo_figure import build_figure
+from beam_warp.demo_reconstruction import PANEL_HEIGHT, FromImagesOptions, demo_from_images
+from beam_warp.errors import OutputError
+from beam_warp.pipeline import no_progress
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +53,29 @@ def test_lights_are_maps_of_the_same_exposure():
     assert max(brightest) < 1.5 * min(brightest)
 
 
-def test_small_demo_recovers_its_truth(tmp_path):
+@pytest.fixture(scope="module")
+def small_demo(tmp_path_factory):
+    """The whole demo at a twentieth of its size: its folder, its options and its result."""
+    out = tmp_path_factory.mktemp("small") / "demo"
+    images = FromImagesOptions(
+        size=64,
+        frame_count=2,
+        camera_count=8,
+        test_camera_count=1,
+        samples=4,
+        gaussian_count=1500,
+        color_iterations=30,
+        normal_iterations=30,
+        joint_iterations=20,
+        track_iterations=10,
+    )
+    options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu", images=images)
+    return out, options, run_demo(out, options)
+
+
+def test_small_demo_recovers_its_truth(small_demo):
     """Bounds are what 4,000 coarse Gaussians must reach if the chain is sound; wrong axes, light or scale fail them."""
-    options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu")
-    result = run_demo(tmp_path / "demo", options)
+    out, _, result = small_demo
     scores = result.report["scores"]
     assert scores["ambient_occlusion"]["solid_psnr"] > 16.0
     assert scores["base_color"]["solid_psnr"] > 16.0
@@ -59,4 +86,46 @@ def test_small_demo_recovers_its_truth(tmp_path):
     assert result.sequence.topology == "constant"
     assert {"base_color", "roughness", "ids"} <= result.sequence.constant
     for name in ("asset.usda", "report.json", "overview.png", "relit.png", "lights/studio.exr", "lights/sunset.exr"):
-        assert (tmp_path / "demo" / name).stat().st_size > 0
+        assert (out / name).stat().st_size > 0
+
+
+def test_small_demo_from_images_recovers_its_truth(small_demo):
+    """Bounds are what 1,500 Gaussians must reach on images of 64 x 64 if the chain is sound, from images to relighting.
+
+    A pixel is 37 mm wide, so that a surface off by more than one is not found; the subject fills a sixth of its box, so
+    that images which miss it score below 15 dB.
+    """
+    out, _, result = small_demo
+    found = result.report["from_images"]
+    assert json.loads((out / "report.json").read_text())["from_images"] == json.loads(json.dumps(found))
+    assert [entry["kind"] for entry in found["frames"]] == ["key", "tracked"]
+    assert found["warnings"] == []
+    assert found["gaussians"] == [1500, 1500]
+    for entry in found["frames"]:
+        assert entry["psnr"] > 20.0
+        assert entry["surface"]["chamfer_mm"] < 37.0
+        assert entry["normals_median_degrees"] < 25.0
+    assert found["drift"][1]["followed"] == 1.0
+    # The surface moves by 8.6 mm from one frame to the next: what is tracked must drift by less than what is not.
+    assert found["drift"][1]["vertices"]["mean_mm"] < 8.6
+    for name in ("base_color", "relit_studio", "relit_sunset", "relit_stage"):
+        assert found["relightable"][name]["solid_psnr"] > 16.0
+    for name in ("capture/transforms.json", "reconstruction/gaussians.usda", "from_images/asset.usda"):
+        assert (out / name).stat().st_size > 0
+    picture = np.asarray(Image.open(out / "reconstruction.png"))
+    # A row for each frame; photograph, Gaussians, normals, mesh and two lights
+    assert 2 * PANEL_HEIGHT < picture.shape[0] < 3 * PANEL_HEIGHT + 200
+    assert picture.std() > 20.0
+
+
+def test_demo_takes_up_its_capture_and_refuses_another(small_demo):
+    out, options, _ = small_demo
+    lights = {"studio": demo_environments()["studio"]}
+    lightings = {"studio": EnvironmentLighting.from_environment(lights["studio"], device="cpu")}
+    images = replace(options.images, frame_count=1)
+    with pytest.raises(OutputError, match=r"folder must be new or empty, got .*capture with content"):
+        demo_from_images(out, images, lights, lightings, device="cpu", seed=0, progress=no_progress)
+    before = (out / "capture/transforms.json").stat().st_mtime_ns
+    again = demo_from_images(out, options.images, lights, lightings, device="cpu", seed=0, progress=no_progress)
+    assert (out / "capture/transforms.json").stat().st_mtime_ns == before
+    assert again.result.report["resumed_frames"] == 2

@@ -120,7 +120,9 @@ RANKS = {
     "beam_warp.pipeline": 13,
     "beam_warp.reconstruction": 13,
     "beam_warp.reconstruction_steps": 14,
-    "beam_warp.demo": 14,
+    "beam_warp.demo_truth": 11,
+    "beam_warp.demo_reconstruction": 15,
+    "beam_warp.demo": 16,
     "beam_warp.tiled_shapes": 3,
     "beam_warp.charts": 6,
     "beam_warp.chart_image": 7,
@@ -128,8 +130,8 @@ RANKS = {
     "beam_warp.tracing_plan": 11,
     "beam_warp.tracing_references": 12,
     "beam_warp.tracing_study": 13,
-    "beam_warp.cli": 16,
-    "beam_warp": 17,
+    "beam_warp.cli": 17,
+    "beam_warp": 18,
 }
 
 WITHOUT_WARP = (

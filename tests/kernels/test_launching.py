@@ -5,6 +5,8 @@ import os
 import signal
 import time
 from pathlib import Path
+from threading import get_ident
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,50 +50,57 @@ def test_a_scene_is_the_same_with_many_threads(monkeypatch, rng):
     alone = visibility(Scene.from_gaussians(cloud, "cpu"), *rays)
     monkeypatch.setenv("BEAM_WARP_THREADS", "16")
     monkeypatch.setattr(launching, "MIN_CHUNK", 64)
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
     for build in ("quality", "fast"):
         scene = Scene.from_gaussians(cloud, "cpu", build=build)
         assert np.sort(scene._tree.layout.items.numpy()).tolist() == np.flatnonzero(cloud.opacities > 1 / 255).tolist()
     assert np.array_equal(visibility(Scene.from_gaussians(cloud, "cpu"), *rays), alone)
 
 
-class _Cpu:
-    is_cuda = False
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_every_item_is_run_once(threads):
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 9, 10, 11, 20, 401])
+def test_every_item_is_worked_on_once(monkeypatch, threads, count):
+    """Chunks of 10 and more; sizes straddle one and two of them, and are more than all threads take at a time."""
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
     done = []
+    cpu = SimpleNamespace(is_cuda=False)
     launching._run_in_chunks(
-        lambda start, count: done.extend(range(start, start + count)), range(5, 103), _Cpu, threads, 7
+        lambda start, length: done.extend(range(start, start + length)), range(count), cpu, threads, 10
     )
-    assert sorted(done) == list(range(5, 103))
+    assert sorted(done) == list(range(count))
 
 
-def test_a_failure_is_heard_of_after_all_chunks_have_ended():
-    """They write to arrays that the caller may free."""
-    done = []
+def test_work_that_is_short_stays_on_one_thread(monkeypatch):
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 1e9)
+    threads = set()
+    cpu = SimpleNamespace(is_cuda=False)
+    launching._run_in_chunks(lambda start, length: threads.add(get_ident()), range(1000), cpu, 4, 10)
+    assert threads == {get_ident()}
 
-    def run(start, count):
-        if start == 7:
-            raise RuntimeError("no")
-        time.sleep(0.01)
-        done.append(start)
 
-    with pytest.raises(RuntimeError, match="no"):
-        launching._run_in_chunks(run, range(70), _Cpu, 3, 7)
-    assert sorted(done) == [start for start in range(0, 70, 7) if start != 7]
+def test_an_error_in_a_chunk_is_raised(monkeypatch):
+    """Whichever thread it happens on, and no chunk is begun after the call has ended."""
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
+
+    def run(start, length):
+        if start > 100:
+            raise ValueError("chunk")
+
+    with pytest.raises(ValueError, match="chunk"):
+        launching._run_in_chunks(run, range(1000), SimpleNamespace(is_cuda=False), 3, 10)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_process_has_threads_of_its_own():
+def test_a_forked_process_has_threads_of_its_own(monkeypatch):
     """Threads do not survive a fork: work handed to those of the parent would never be done."""
-    done = []
-    launching._run_in_chunks(lambda start, count: done.append(count), range(70), _Cpu, 3, 7)
+    monkeypatch.setattr(launching, "WORTH_SPREADING", 0.0)
+    done, cpu = [], SimpleNamespace(is_cuda=False)
+    launching._run_in_chunks(lambda start, count: done.append(count), range(70), cpu, 3, 7)
     child = os.fork()
     if not child:  # nothing of pytest's may run here
         code = 1
         try:
-            launching._run_in_chunks(lambda start, count: done.append(count), range(70), _Cpu, 3, 7)
+            launching._run_in_chunks(lambda start, count: done.append(count), range(70), cpu, 3, 7)
             code = 0 if sum(done) == 140 else 2
         finally:
             os._exit(code)
