@@ -27,6 +27,7 @@ from beam_warp.device_arrays import float_rows
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.gaussian_parameters import GaussianParameters
+from beam_warp.initialization import DISC_WIDTH
 from beam_warp.kernels.stress import launch_add_stress
 from beam_warp.motion_losses import TemporalLoss
 from beam_warp.raster_records import GaussianGradients, RasterOptions
@@ -41,11 +42,14 @@ FIT_RASTER = RasterOptions(antialiased=True, low_pass=0.1)
 """How splats are drawn while they are fitted, and should be afterwards: the pixel filter's variance is about that of
 a pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
 
-DISC_SPACING = 0.7
-"""Deviation of an initial disc over the distance to its neighbours (`beam_warp.initialization`)."""
+NO_PSNR = 120.0
+"""What is said where there is nothing to meet [dB]."""
 
 PROGRESS_EVERY = 50
 """Steps from one report of progress, and change of the learning rates, to the next."""
+
+RENEW_EVERY = 250
+"""Most steps between looks whether the Gaussians still find room, and the sampling filter fits them."""
 
 LEAST_GAIN = 0.15
 """Gain of twice as many Gaussians below which more of them do not pay [dB]."""
@@ -211,6 +215,12 @@ class Fit:
     report: dict[str, Any] = field(default_factory=dict)
 
 
+def mean_psnr(psnr: NDArray[np.float64]) -> float:
+    """Return the mean over views that show the subject; `NO_PSNR` if none does."""
+    known = psnr[np.isfinite(psnr)]
+    return float(known.mean()) if len(known) else NO_PSNR
+
+
 def no_fit_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
     """Report to nobody."""
 
@@ -305,7 +315,7 @@ class Fitter:
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         center = np.median(start.positions, axis=0)
-        spacing = float(np.median(np.sort(start.scales, axis=1)[:, 1])) / DISC_SPACING
+        spacing = float(np.median(np.sort(start.scales, axis=1)[:, 1])) / DISC_WIDTH
         self.samples = sample_side(views, center, spacing) if options.samples == "auto" else int(options.samples)
         self._targets = TargetSet(views, count, options.raster, self.samples, device)
         self._extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
@@ -336,6 +346,7 @@ class Fitter:
         order = self._order(total)
         facts: dict[str, float] = {"gaussians": float(self.parameters.alive().sum())}
         self._weights = replace(chosen.weights, normal=0.0)
+        self._graphs.clear()
         self._renew()
         for iteration in range(total):
             if iteration == chosen.color_iterations:
@@ -347,9 +358,10 @@ class Fitter:
             view = int(order[iteration])
             self._graphs.run(view, lambda view=view: self._step(view))
             self._taken += 1
-            if chosen.refine_every and self._taken % chosen.refine_every == 0:
-                if self._taken <= chosen.refine_until * total:
-                    self._refine()
+            is_due = bool(chosen.refine_every) and self._taken % chosen.refine_every == 0
+            if is_due and self._taken <= chosen.refine_until * total:
+                self._refine()
+            if is_due or self._taken % RENEW_EVERY == 0:
                 facts = {"gaussians": float(self.parameters.alive().sum()), "psnr": self._renew()}
         facts["psnr"] = self._renew()
         progress(total, total, facts)
@@ -358,8 +370,8 @@ class Fitter:
         """Return what was done and how well it went, JSON-able."""
         psnr = self.psnr()
         return {
-            "psnr": float(psnr.mean()),
-            "view_psnr": float(psnr.min()),
+            "psnr": mean_psnr(psnr),
+            "view_psnr": float(np.nanmin(psnr, initial=NO_PSNR)),
             "gaussians": int(self.parameters.alive().sum()),
             "iterations": self._taken,
             "samples": self.samples,
@@ -417,7 +429,7 @@ class Fitter:
         psnr, is_new = self._targets.make_room(self.parameters.drawn)
         if is_new:
             self._graphs.clear()
-        return float(psnr.mean())
+        return mean_psnr(psnr)
 
     def _step(self, view: int) -> None:
         """Draw a view, compare, and move the Gaussians."""
@@ -451,7 +463,7 @@ class Fitter:
         stress, seen = self._stress.numpy(), self._seen.numpy()
         alive = self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
-        dead = alive & ~((opacity >= chosen.dead_opacity) & (seen > 0))
+        dead = alive & ~(opacity >= chosen.dead_opacity)
         if chosen.hidden_share > 0.0:
             dead |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
         if dead.sum() == alive.sum():  # all of them: nothing to go on from

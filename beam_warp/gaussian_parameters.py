@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beam_warp.adam import Adam, Parameters
 from beam_warp.assets import LINEAR_REC709, MAX_SH_DEGREE, GaussianCloud
-from beam_warp.checks import require_count
+from beam_warp.checks import require_choice, require_count
 from beam_warp.device_arrays import float_rows
 from beam_warp.devices import upload
 from beam_warp.errors import InvalidArrayError
@@ -125,13 +125,18 @@ class GaussianParameters:
 
         Args:
             rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0)
-                and ``bands`` (all others); those left out stay.
+                and ``bands`` (all others, if there are any); those left out stay.
+
+        Raises:
+            InvalidOptionError: There is no such group.
         """
         color, slope = float_rows(self.radiance), float_rows(self._gradients["radiance"])
         groups = {name: (getattr(self, name), self._gradients[name]) for name in self._gradients if name != "radiance"}
         groups["color"] = (color[:, :3], slope[:, :3])
         if color.shape[1] > 3:
             groups["bands"] = (color[:, 3:], slope[:, 3:])
+        for name in rates:
+            require_choice("rates", name, (*groups, "bands"))
         return Adam({name: Parameters(*groups[name], rate) for name, rate in rates.items() if name in groups})
 
     def rows(self) -> dict[str, Any]:

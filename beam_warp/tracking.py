@@ -21,8 +21,18 @@ from beam_warp.captured_views import CapturedView
 from beam_warp.checks import require_count, require_number
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError
-from beam_warp.gaussian_fitting import FIT_RASTER, FitOptions, FitProgress, Fitter, LearningRates, no_fit_progress
+from beam_warp.gaussian_fitting import (
+    FIT_RASTER,
+    NO_PSNR,
+    FitOptions,
+    FitProgress,
+    Fitter,
+    LearningRates,
+    mean_psnr,
+    no_fit_progress,
+)
 from beam_warp.gaussian_parameters import require_scene_linear
+from beam_warp.initialization import DISC_WIDTH
 from beam_warp.joint_graph import JointGraph, stretch
 from beam_warp.joint_selection import select_joints
 from beam_warp.joint_tracking import JointOptions, JointPose, JointTracker
@@ -185,7 +195,7 @@ def begin_track(
         smallest_cosine=SMALLEST_COSINE,
     )
     still = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (len(joints), 1))
-    baseline = np.array([psnr.mean(), targets.gaps(gaussians).max()])
+    baseline = np.array([mean_psnr(psnr), targets.gaps(gaussians).max()])
     local = Rotation.from_quat(cloud.orientations).apply(normals, inverse=True).astype(np.float32)
     return Track(cloud, anchors, graph, local, joints, joints, joints, still, baseline)
 
@@ -241,13 +251,13 @@ def advance_track(
     torn = stretch(track.graph, track.key_joints, pose.positions).torn
     following = replace(track, cloud=cloud, joints=pose.positions, previous_joints=track.joints, turns=pose.rotations)
     report = {
-        "psnr": float(psnr.mean()),
-        "view_psnr": float(psnr.min()),
+        "psnr": mean_psnr(psnr),
+        "view_psnr": float(np.nanmin(psnr, initial=NO_PSNR)),
         "gap": float(gaps.max()),
         "torn": float(torn),
         "gaussians": len(cloud),
         "samples": samples,
-        "lost": _why_lost(track, float(psnr.mean()), gaps, torn, views, options),
+        "lost": _why_lost(track, mean_psnr(psnr), gaps, torn, views, options),
         "seconds": time.perf_counter() - began,
     }
     return following, report
@@ -283,7 +293,7 @@ def _expected(track: Track) -> JointPose:
 
 def _samples(cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
     """Return the samples that a fit of these Gaussians takes."""
-    spacing = float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / 0.7
+    spacing = float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / DISC_WIDTH
     return sample_side(views, np.median(cloud.positions, axis=0), spacing)
 
 

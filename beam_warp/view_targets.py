@@ -135,6 +135,9 @@ class ViewTargets:
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
+        self._subjects = [
+            self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
+        ]
         self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
         size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
@@ -170,7 +173,7 @@ class ViewTargets:
         """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
 
         Returns:
-            The terms, one element each: colour, coverage, normals.
+            The terms that count, one element each: colour, structure, coverage, normals.
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
@@ -223,7 +226,12 @@ class ViewTargets:
         return values.numpy()[:, 0] / np.float32(self._samples**2)
 
     def psnr(self, index: int) -> float:
-        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB]."""
+        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB].
+
+        NaN for a view that shows nothing of the subject: black is easily met, and says nothing.
+        """
+        if self._alphas[index] is not None and not self._subjects[index]:
+            return math.nan
         launch_encode(self._color, self._samples, self._encoded, self.device)
         launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
@@ -236,8 +244,7 @@ class ViewTargets:
 
     def subject_pixels(self, index: int) -> int:
         """Return how many pixels of a view the subject covers; all without alpha."""
-        alpha = self._alphas[index]
-        return self.height * self.width if alpha is None else int((alpha.numpy() > 0.5).sum())
+        return self._subjects[index]
 
     def missed(self, index: int) -> NDArray[np.bool_]:
         """Return which pixels of the subject what was drawn last does not cover, ``(H, W)``; none without alpha."""
@@ -284,14 +291,16 @@ class TargetSet:
         """Draw every view, with as much room as it takes.
 
         Returns:
-            PSNR of each crop, encoded and clipped to [0, 1] [dB], ``(V,)``; and whether room had to be made: then what
-            was recorded with the old arrays must be recorded again.
+            PSNR of each crop, encoded and clipped to [0, 1] [dB], NaN where nothing of the subject is, ``(V,)``; and
+            whether room had to be made: then what was recorded with the old arrays must be recorded again.
         """
         before = [group.rasterizer.pair_capacity for group in self._groups]
         psnr = []
         for group, index in self._places:
             group.draw(index, gaussians)
             psnr.append(group.psnr(index))
+        for group in self._groups:
+            group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
         return np.array(psnr), before != [group.rasterizer.pair_capacity for group in self._groups]
 
     def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
