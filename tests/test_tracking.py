@@ -198,7 +198,7 @@ class TestNormals:
 
     def test_a_key_frame_is_turned_towards_its_cameras(self, device):
         """Whichever way local z points: outside is where it is seen from."""
-        track = rough_track(device)
+        track = key_track(device)
         faces = track.normals().any(axis=1)
         outward = track.cloud.positions[faces] / np.linalg.norm(track.cloud.positions[faces], axis=1, keepdims=True)
         assert faces.mean() > 0.5
@@ -248,8 +248,8 @@ class TestRefusals:
         [
             ({"levels": (1,)}, "levels and iterations must be as many"),
             ({"levels": (), "iterations": ()}, "levels and iterations must be as many"),
-            ({"levels": (4, 0, 1)}, "levels must be an integer"),
-            ({"iterations": (1, -1, 1)}, "iterations must be an integer"),
+            ({"levels": (4, 0, 1), "iterations": (1, 1, 1)}, "levels must be an integer"),
+            ({"levels": (4, 2, 1), "iterations": (1, -1, 1)}, "iterations must be an integer"),
             ({"rigidity": -1.0}, "rigidity must be a number"),
             ({"rotation_rate": np.nan}, "rotation_rate must be a number"),
             ({"position_rate": -1.0}, "position_rate must be a number"),

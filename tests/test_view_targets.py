@@ -285,8 +285,9 @@ class TestMeasure:
         views = [view for pair in zip(ball_views(rig(2)), ball_views(rig(2, 56)), strict=True) for view in pair]
         cloud, target = ball_cloud(60), wp.get_device(device)
         parameters = GaussianParameters(cloud, target)
-        psnr, missed = TargetSet(views, 60, RASTER, 1, target).measure(parameters.drawn)
-        assert psnr.shape == missed.shape == (4,)
+        targets = TargetSet(views, 60, RASTER, 1, target)
+        psnr, _ = targets.make_room(parameters.drawn)
+        assert psnr.shape == targets.gaps(parameters.drawn).shape == (4,)
         for found, part in zip(psnr, crop_views(views), strict=True):
             buffer = rasterize(parameters.cloud(), part.camera, channels=("radiance",), options=RASTER, device=device)
             linear = buffer.channels["radiance"].astype(np.float64) * buffer.alpha[..., None]
@@ -299,26 +300,27 @@ class TestMeasure:
         cloud = ball_cloud(200)
         half = cloud.with_arrays(opacities=np.where(cloud.positions[:, 2] > 0.0, 0.8, 0.0))
         for given, low, high in ((cloud, 0.0, 0.0), (half, 0.2, 0.8)):
-            _, missed = TargetSet(views, 200, RASTER, 1, target).measure(GaussianParameters(given, target).drawn)
-            assert ((low <= missed) & (missed <= high)).all()
+            gaps = TargetSet(views, 200, RASTER, 1, target).gaps(GaussianParameters(given, target).drawn)
+            assert ((low <= gaps) & (gaps <= high)).all()
 
     def test_without_alpha_nothing_is_known_to_be_missing(self, device):
         target = wp.get_device(device)
         views = ball_views(rig(2), with_alpha=False)
         cloud = ball_cloud(20).with_arrays(opacities=np.zeros(20))
-        psnr, missed = TargetSet(views, 20, RASTER, 1, target).measure(GaussianParameters(cloud, target).drawn)
-        assert not missed.any()
-        assert np.isfinite(psnr).all()
+        targets, drawn = TargetSet(views, 20, RASTER, 1, target), GaussianParameters(cloud, target).drawn
+        assert not targets.gaps(drawn).any()
+        assert np.isfinite(targets.make_room(drawn)[0]).all()
 
     def test_a_black_view(self, device):
-        """An empty mask and black pixels: what draws nothing there meets it, to the last digit that is told."""
+        """An empty mask and black pixels are met by nothing at all: they say nothing of what was drawn."""
         target = wp.get_device(device)
         (view,) = ball_views(rig(1))
         black = replace(view, color=0.0 * view.color, alpha=0.0 * view.alpha)
         cloud = ball_cloud(20).with_arrays(opacities=np.zeros(20))
-        psnr, missed = TargetSet([black], 20, RASTER, 1, target).measure(GaussianParameters(cloud, target).drawn)
-        assert psnr.tolist() == [120.0]
-        assert missed.tolist() == [0.0]
+        targets, drawn = TargetSet([black, view], 20, RASTER, 1, target), GaussianParameters(cloud, target).drawn
+        psnr, _ = targets.make_room(drawn)
+        assert np.isnan(psnr).tolist() == [True, False]
+        assert targets.gaps(drawn)[0] == 0.0
 
 
 @pytest.mark.parametrize("samples", [1, 3])
@@ -347,11 +349,11 @@ def test_room_is_made_when_more_is_drawn(device):
     target = wp.get_device(device)
     parameters = GaussianParameters(ball_cloud(60), target)
     targets = TargetSet(ball_views(rig(2)), 60, RASTER, 1, target)
-    assert targets.make_room(parameters.drawn)
-    assert not targets.make_room(parameters.drawn)
+    assert targets.make_room(parameters.drawn)[1]
+    assert not targets.make_room(parameters.drawn)[1]
     parameters.set_rows({"log_scales": parameters.rows()["log_scales"] + np.float32(1.5)})
     parameters.activate()
-    assert targets.make_room(parameters.drawn)
+    assert targets.make_room(parameters.drawn)[1]
 
 
 class TestSampleSide:
