@@ -70,7 +70,7 @@ class DemoOptions:
 
     frame_count: int = 1
     gaussian_count: int = 45_000
-    image_height: int = 360
+    image_height: int = 300
     device: str | None = None
     seed: int = 0
     images: FromImagesOptions = field(default_factory=FromImagesOptions)

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from beam_warp.cli.demo import Demo
 from beam_warp.deferred import EnvironmentLighting
 from beam_warp.demo import DemoOptions, run_demo
 from beam_warp.demo_environments import demo_environments
@@ -71,6 +72,16 @@ def small_demo(tmp_path_factory):
     )
     options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu", images=images)
     return out, options, run_demo(out, options)
+
+
+def test_command_and_function_have_the_same_sizes():
+    command, options = Demo(), DemoOptions()
+    assert (command.frames, command.gaussians, command.height, command.seed) == (
+        options.frame_count,
+        options.gaussian_count,
+        options.image_height,
+        options.seed,
+    )
 
 
 def test_small_demo_recovers_its_truth(small_demo):

@@ -34,7 +34,7 @@ class Demo:
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")] = Path("demo")
     frames: Annotated[int, arg(metavar="N", help="Frames of the stand-in.")] = 1
     gaussians: Annotated[int, arg(metavar="N", help="Gaussians of the stand-in, about.")] = 45_000
-    height: Annotated[int, arg(metavar="PX", help="Height of the stand-in's images with truth.")] = 160
+    height: Annotated[int, arg(metavar="PX", help="Height of the stand-in's images with truth.")] = 300
     seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
     quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
