@@ -176,7 +176,7 @@ def demo_from_images(
         ],
         "drift": [entry.as_dict() for entry in drift],
         "relightable": {"frame": last, **score_views(truths, relit)},
-        "warnings": found.report["warnings"],
+        "warnings": [*found.report["warnings"], *result.report["warnings"]],
     }
     picture = out / "reconstruction.png"
     _write_picture(picture, capture, found.sequence, result.sequence, meshes, lightings, steps.raster, device)

@@ -110,7 +110,7 @@ def test_small_demo_from_images_recovers_its_truth(small_demo):
     found = result.report["from_images"]
     assert json.loads((out / "report.json").read_text())["from_images"] == json.loads(json.dumps(found))
     assert [entry["kind"] for entry in found["frames"]] == ["key", "tracked"]
-    assert found["warnings"] == []
+    assert not any("lost" in warning for warning in found["warnings"])
     assert found["gaussians"] == [1500, 1500]
     for entry in found["frames"]:
         assert entry["psnr"] > 20.0
