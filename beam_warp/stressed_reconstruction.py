@@ -36,6 +36,10 @@ TOLD = {
 """What is done about findings that leave the input as it is."""
 
 
+LEVELS = (4, 2, 1)
+"""Reductions of small images: at the next one, motion is less than a pixel."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class StressEffort:
     """How much is spent on each case.
@@ -47,7 +51,7 @@ class StressEffort:
         samples: Paths per pixel.
         gaussian_count: Most Gaussians.
         fit: Steps of a key frame, without and with normals; None for the defaults.
-        levels: Steps of the joints at each level; None for the defaults.
+        levels: Steps of the joints at each of `LEVELS`; None for the defaults.
         refinement: Steps of a tracked frame's Gaussians; None for the default.
     """
 
@@ -77,7 +81,7 @@ class StressEffort:
         if self.fit is not None:
             fitting = replace(fitting, color_iterations=self.fit[0], normal_iterations=self.fit[1])
         if self.levels is not None:
-            tracking = replace(tracking, joints=replace(tracking.joints, iterations=self.levels))
+            tracking = replace(tracking, joints=replace(tracking.joints, levels=LEVELS, iterations=self.levels))
         if self.refinement is not None:
             tracking = replace(tracking, refinement=replace(tracking.refinement, normal_iterations=self.refinement))
         return FitAndTrack(fitting=fitting, tracking=tracking, device=device)

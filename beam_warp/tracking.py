@@ -18,12 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, GaussianCloud, sh_degree_of
 from beam_warp.captured_views import CapturedView
-from beam_warp.checks import require_count, require_number
+from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.gaussian_fitting import (
     FIT_RASTER,
     NO_PSNR,
+    PRESETS,
     FitOptions,
     FitProgress,
     Fitter,
@@ -85,6 +86,19 @@ class TrackOptions:
     largest_drop: float = 6.0
     largest_gap: float = 0.03
     largest_tear: float = 0.1
+
+    @classmethod
+    def of_preset(cls, preset: str) -> TrackOptions:
+        """Return the options that go with a preset of `FitOptions.of_preset`.
+
+        Raises:
+            InvalidOptionError: There is no such preset.
+        """
+        require_choice("preset", preset, PRESETS)
+        if preset != "draft":
+            return cls()
+        joints = JointOptions(levels=(4, 2, 1), iterations=(40, 40, 60))
+        return cls(joints=joints, refinement=replace(cls().refinement, normal_iterations=80))
 
     def following(self, fitting: FitOptions) -> TrackOptions:
         """Return the options for key frames that were fitted so: drawn in the same way, met by the same terms."""

@@ -102,7 +102,7 @@ class FakeSteps:
         cloud = track.cloud.with_arrays(positions=track.cloud.positions + velocity)
         progress(1, 1, {"psnr": 30.0 - float(age)})
         lost = "too bright" if level > LOST_LEVEL else ""
-        return FakeTrack(cloud, velocity, age), {"psnr": 30.0 - 0.8 * float(age), "lost": lost}
+        return FakeTrack(cloud, velocity, age), {"psnr": 30.0 - 1.2 * float(age), "lost": lost}
 
     def restore(self, arrays):
         velocity, age = arrays.pop("velocity"), arrays.pop("age")

@@ -133,7 +133,7 @@ class TestOutputs:
     def test_drift_is_said(self, tmp_path):
         capture = Capture.read(write_capture(tmp_path / "capture", range(4)))
         warnings = reconstruct(capture, tmp_path / "out", FakeSteps()).report["warnings"]
-        assert next(text for text in warnings if "dB" in text).startswith("frame 3 is 2.4 dB below its key frame")
+        assert next(text for text in warnings if "dB" in text).startswith("frame 3 is 3.6 dB below its key frame")
 
     def test_progress_ends_full(self, capture, tmp_path):
         said = []

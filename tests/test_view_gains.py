@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beam_warp.initialization import initial_gaussians
 from beam_warp.tracking import outward_normals
@@ -47,7 +48,7 @@ def seen(tiny_capture):
     """The views of a moment, and Gaussians on their hull; of some, which side is out is not known."""
     views = [record.view() for record in tiny_capture.select(split="train", frames=[0])]
     cloud = initial_gaussians(views, 1000, device="cpu")
-    normals = outward_normals(cloud, views)
+    normals = outward_normals(cloud, Rotation.from_quat(cloud.orientations).apply([0.0, 0.0, 1.0]))
     normals[::50] = 0.0
     return views, cloud, normals
 

@@ -28,7 +28,8 @@ class Modelling:
         float | None, arg(metavar="DB", help="Stop a fit here, or when more no longer pays, with fewer Gaussians.")
     ] = None
     preset: Annotated[
-        Literal["fast", "paper"], arg(help="Schedule of the fits: ours, or the paper's 7,000 + 5,000 iterations.")
+        Literal["fast", "draft", "paper", "rade"],
+        arg(help="Schedule: ours, few steps (for a CPU), the paper's 7,000 + 5,000, or like RaDe-GS's."),
     ] = "fast"
     segment_length: Annotated[
         int, arg(metavar="K", help="Frames from one key frame to the next, which parts share out; 0 for one segment.")
@@ -114,7 +115,7 @@ def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | No
     asked: dict[str, Any] = {"target_psnr": modelling.target_psnr, "seed": seed}
     if modelling.gaussians is not None:
         asked["gaussian_count"] = modelling.gaussians
-    tracking = TrackOptions()
+    tracking = TrackOptions.of_preset(modelling.preset)
     return FitAndTrack(
         fitting=FitOptions.of_preset(modelling.preset, **asked),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
