@@ -22,7 +22,7 @@ from beam_warp.demo_capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure
 from beam_warp.demo_truth import Truth, display_color, relit_views, score_views
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
-from beam_warp.gaussian_fitting import FitOptions
+from beam_warp.gaussian_fitting import FitOptions, LearningRates
 from beam_warp.images import write_png
 from beam_warp.joint_tracking import JointOptions
 from beam_warp.mesh_path_tracing import TracedMesh
@@ -197,6 +197,7 @@ def demo_steps(options: FromImagesOptions, *, device: str | None, seed: int) -> 
             gaussian_count=options.gaussian_count,
             color_iterations=options.color_iterations,
             normal_iterations=options.normal_iterations,
+            rates=LearningRates(final_others=1.0),  # few steps do not come to rest anyway
             seed=seed,
         ),
         tracking=TrackOptions(

@@ -168,9 +168,10 @@ class FitOptions:
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
         """Return the options of a preset, some of them changed.
 
-        ``fast`` is ours, ``draft`` a seventh of its steps: for a first look, and for a CPU. ``paper`` is BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of
-        0.03, the rates of 3DGS, no term of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass
-        on the image but the 3D filter, normals at 0.05 for the second half; both draw one sample a pixel.
+        ``fast`` is ours, ``draft`` a seventh of its steps: for a first look, and for a CPU. ``paper`` is BEAM's schedule:
+        7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term of coverage.
+        ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter, normals at
+        0.05 for the second half. The latter two draw one sample a pixel.
 
         Raises:
             InvalidOptionError: There is no such preset, or an option is out of range.
@@ -180,7 +181,12 @@ class FitOptions:
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
-            "draft": {"color_iterations": 150, "normal_iterations": 300, "refine_every": 100},
+            "draft": {
+                "color_iterations": 150,
+                "normal_iterations": 300,
+                "refine_every": 100,
+                "rates": LearningRates(final_others=1.0),
+            },
             "paper": {
                 **common,
                 "color_iterations": 7_000,
