@@ -163,7 +163,6 @@ class TestDetection:
 
 def test_the_words_reach_the_optimiser(folder):
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
-    pytest.importorskip("beam_warp.tracking")
     capture = Capture.read(folder)
     steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu")
     asked = json.loads(json.dumps(steps.options()))["fitting"]
