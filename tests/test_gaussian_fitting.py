@@ -321,12 +321,14 @@ class TestOptions:
     def test_presets_and_what_is_changed_of_them(self, preset):
         options = FitOptions.of_preset(preset, gaussian_count=7, seed=3)
         assert (options.gaussian_count, options.seed) == (7, 3)
-        expected = {"fast": (1_000, 2_000), "paper": (7_000, 5_000), "rade": (6_000, 6_000)}[preset]
+        expected = {"fast": (1_000, 2_000), "draft": (150, 300), "paper": (7_000, 5_000), "rade": (6_000, 6_000)}[
+            preset
+        ]
         assert (options.color_iterations, options.normal_iterations) == expected
         assert FitOptions.of_preset("fast") == FitOptions()
 
     def test_an_unknown_preset(self):
-        with pytest.raises(InvalidOptionError, match="preset must be one of fast, paper, rade, got 'best'"):
+        with pytest.raises(InvalidOptionError, match="preset must be one of fast, draft, paper, rade, got 'best'"):
             FitOptions.of_preset("best")
 
 

@@ -237,7 +237,7 @@ class TestResuming:
         )
         paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
         process = subprocess.Popen(
-            [sys.executable, "-c", script], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": paths}
+            [sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": paths}
         )
         try:
             assert process.stdout.readline() == b"working\n"
