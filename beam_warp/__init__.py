@@ -19,21 +19,26 @@ if TYPE_CHECKING:
     from beam_warp.assets import Observability as Observability
     from beam_warp.axes import change_axes as change_axes
     from beam_warp.cameras import Camera as Camera
+    from beam_warp.captured_views import CapturedView as CapturedView
     from beam_warp.captures import Capture as Capture
     from beam_warp.converters import read as read
     from beam_warp.converters import write as write
     from beam_warp.depth_normals import DepthNormals as DepthNormals
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
+    from beam_warp.gaussian_fitting import FitOptions as FitOptions
+    from beam_warp.gaussian_fitting import fit_gaussians as fit_gaussians
     from beam_warp.gradients import visibility_gradients as visibility_gradients
     from beam_warp.image_losses import L1Loss as L1Loss
     from beam_warp.image_losses import NormalLoss as NormalLoss
     from beam_warp.image_losses import SsimLoss as SsimLoss
     from beam_warp.incident_light import Irradiance as Irradiance
     from beam_warp.incident_light import irradiance as irradiance
+    from beam_warp.initialization import initial_gaussians as initial_gaussians
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
     from beam_warp.materials import MaterialOptions as MaterialOptions
+    from beam_warp.meshing import mesh_of_gaussians as mesh_of_gaussians
     from beam_warp.pipeline import RunOptions as RunOptions
     from beam_warp.pipeline import RunResult as RunResult
     from beam_warp.pipeline import run as run
@@ -46,11 +51,13 @@ if TYPE_CHECKING:
     from beam_warp.reconstruction import Reconstruction as Reconstruction
     from beam_warp.reconstruction import ReconstructOptions as ReconstructOptions
     from beam_warp.reconstruction import reconstruct as reconstruct
+    from beam_warp.reconstruction_steps import FitAndTrack as FitAndTrack
     from beam_warp.scene import Scene as Scene
     from beam_warp.schema.validator import validate as validate
     from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
     from beam_warp.surfaces import estimate_normals as estimate_normals
     from beam_warp.tracing import visibility as visibility
+    from beam_warp.tracking import TrackOptions as TrackOptions
 
 _HOMES = {
     "Adam": "adam",
@@ -58,8 +65,11 @@ _HOMES = {
     "BeamError": "errors",
     "Camera": "cameras",
     "Capture": "captures",
+    "CapturedView": "captured_views",
     "DepthNormals": "depth_normals",
     "EnvironmentMap": "environments",
+    "FitAndTrack": "reconstruction_steps",
+    "FitOptions": "gaussian_fitting",
     "GBuffer": "rasterizing",
     "GaussianArrays": "raster_records",
     "GaussianCloud": "assets",
@@ -81,11 +91,15 @@ _HOMES = {
     "SurfaceHits": "surface_tracing",
     "SurfaceNormals": "surfaces",
     "TraceOptions": "tracing",
+    "TrackOptions": "tracking",
     "ambient_occlusion": "lighting",
     "change_axes": "axes",
     "closest_surface": "surface_tracing",
     "estimate_normals": "surfaces",
+    "fit_gaussians": "gaussian_fitting",
+    "initial_gaussians": "initialization",
     "irradiance": "incident_light",
+    "mesh_of_gaussians": "meshing",
     "rasterize": "rasterizing",
     "rasterize_backward": "rasterizing",
     "read": "converters",
