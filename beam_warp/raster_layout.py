@@ -75,12 +75,18 @@ class Rows:
         return self.matrix.shape[1]
 
     @classmethod
-    def zeros(cls, count: int, dtype: Any, device: Any) -> Rows:
-        """Allocate rows of a vector type."""
-        matrix = wp.zeros((count, dtype._length_), dtype=float, device=device)
+    def of(cls, matrix: wp.array) -> Rows:
+        """Read a compact matrix as rows."""
+        count, length = matrix.shape
+        dtype = channel_vector(length)
         if not count:
-            return cls(matrix, wp.zeros(0, dtype=dtype, device=device))
-        return cls(matrix, wp.array(ptr=matrix.ptr, shape=count, dtype=dtype, device=device))
+            return cls(matrix, wp.zeros(0, dtype=dtype, device=matrix.device))
+        return cls(matrix, wp.array(ptr=matrix.ptr, shape=count, dtype=dtype, device=matrix.device))
+
+    @classmethod
+    def zeros(cls, count: int, length: int, device: Any) -> Rows:
+        """Allocate rows."""
+        return cls.of(wp.zeros((count, length), dtype=float, device=device))
 
 
 def pass_lengths(channel_count: int) -> list[int]:
@@ -92,4 +98,4 @@ def pass_lengths(channel_count: int) -> list[int]:
 
 def channel_rows(count: int, channel_count: int, device: Any) -> list[Rows]:
     """Allocate rows for channels, a pass each."""
-    return [Rows.zeros(count, channel_vector(length), device) for length in pass_lengths(channel_count)]
+    return [Rows.zeros(count, length, device) for length in pass_lengths(channel_count)]

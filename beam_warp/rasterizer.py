@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,8 @@ from beam_warp.cameras import Camera
 from beam_warp.checks import require_count
 from beam_warp.devices import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.back_projection_cpu import launch_back_project_cpu
+from beam_warp.kernels.back_projection_cuda import launch_back_project_cuda
 from beam_warp.kernels.bin_tiles import (
     Band,
     TileLists,
@@ -29,13 +31,14 @@ from beam_warp.kernels.channel_rows import (
     launch_scatter_channels,
 )
 from beam_warp.kernels.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
-from beam_warp.kernels.composite_adjoint import MOMENTS, Adjoints, pair_length, pair_vector
+from beam_warp.kernels.composite_adjoint import MOMENTS, Adjoints, pair_length
 from beam_warp.kernels.composite_adjoint_cpu import launch_composite_adjoint_cpu
 from beam_warp.kernels.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.project import Projection, Splats, View, launch_project, launch_project_adjoint
+from beam_warp.kernels.view_sums import launch_sum_views
 from beam_warp.raster_layout import Rows, ViewLayout, channel_rows
 from beam_warp.raster_records import (
     COEFFICIENT_COUNTS,
@@ -64,8 +67,8 @@ class Rasterizer:
     """Draws some number of Gaussians for some cameras, again and again.
 
     All arrays stay on the device and where they are. `draw` waits for the device, to learn how much room the frame
-    takes; `redraw`, and `backward` from its second call on, wait for nothing and allocate nothing, so that they can be
-    captured in a CUDA graph. Capture again after a `draw` that changed `pair_capacity`.
+    takes; `redraw`, and `backward` and `back_project` from their second call on, wait for nothing and allocate nothing,
+    so that they can be captured in a CUDA graph. Capture again after a `draw` that changed `pair_capacity`.
 
     Gaussians that are not finite, or whose quaternion is 0, are not drawn; their own gradients may not be finite.
 
@@ -122,6 +125,7 @@ class Rasterizer:
         cuda = self.device.is_cuda
         self._launch_composite = launch_composite_cuda if cuda else launch_composite_cpu
         self._launch_composite_adjoint = launch_composite_adjoint_cuda if cuda else launch_composite_adjoint_cpu
+        self._launch_back_project = launch_back_project_cuda if cuda else launch_back_project_cpu
         if readable:
             self._launch_composite = launch_composite_pixels
         self._layout = ViewLayout.of(self.cameras)
@@ -308,12 +312,75 @@ class Rasterizer:
             back = self._backward_buffers()
             back.match(gaussians if self.color_channels else None)
             back.zero_()
-            for band in self._bands:
-                if len(self._bands) > 1:
-                    self._count_pairs(band)
-                    self._list_pairs()
+            for _ in self._listed_bands():
                 self._composite_adjoint(back)
             return self._project_adjoint(gaussians, back)
+
+    def back_project(self, pixels: wp.array, out: wp.array) -> None:
+        """Carry what pixels hold back to the Gaussians that they saw in the last frame: drawing values, transposed.
+
+        ``out[v * N + i]`` becomes the sum over the pixels p of view v of w_ip ``pixels[p]``, where w_ip is the weight
+        with which `draw` blends Gaussian i into pixel p; zeros for Gaussians that the view does not see.
+
+        Args:
+            pixels: ``(P, K)`` float, K of 4, 8, 12 or 16, compact, the pixels in the order of `images`; finite where
+                alpha is not 0.
+            out: ``(V * N, K)`` float, compact, view by view; overwritten. `sum_views` adds the views up.
+
+        Raises:
+            InvalidArrayError: An array has another shape, type or place.
+            InvalidOptionError: Nothing was drawn.
+        """
+        self._drawn_gaussians("back_project")
+        self._require_matrix("pixels", pixels, self.first_pixels[-1], CHANNEL_COUNTS)
+        length = pixels.shape[1]
+        self._require_matrix("out", out, self._count * len(self.cameras), (length,))
+        with wp.ScopedDevice(self.device):
+            held = Rows.of(pixels).vectors
+            out.zero_()
+            for _ in self._listed_bands():
+                if self.pair_capacity:
+                    pairs = self._rows_of_pairs(length)
+                    self._launch_back_project(self._frame, self._drawn, held, pairs.vectors, self.device)
+                    self._sum_pairs(pairs, out)
+
+    def sum_views(self, rows: wp.array, out: wp.array) -> None:
+        """Sum the rows of every Gaussian over the views, in their order.
+
+        Args:
+            rows: ``(V * N, K)`` float, compact, view by view, as of `back_project`.
+            out: ``(N, K)`` float, compact; overwritten.
+
+        Raises:
+            InvalidArrayError: An array has another shape, type or place.
+        """
+        self._require_matrix("rows", rows, self._count * len(self.cameras))
+        self._require_matrix("out", out, self._count, (rows.shape[1],))
+        launch_sum_views(rows, out, self.device)
+
+    def _require_matrix(self, name: str, array: Any, count: int, lengths: tuple[int, ...] = ()) -> None:
+        """Refuse what is not a compact matrix of floats on the device: of so many rows, of one of some lengths."""
+        if not isinstance(array, wp.array):
+            got = type(array).__name__
+        elif not array.is_contiguous:
+            got = f"{_described(array)}, a part of another array"
+        else:
+            fits = array.ndim == 2 and array.shape[0] == count and (not lengths or array.shape[1] in lengths)
+            if fits and array.dtype is wp.float32 and array.device == self.device:
+                return
+            got = _described(array)
+        size = f"{count} x {' or '.join(map(str, lengths)) or 'K'}"
+        raise InvalidArrayError(
+            f"{name} must be a compact warp array of float32, {size}, on {self.device}, got {got}. Convert it."
+        )
+
+    def _listed_bands(self) -> Iterator[tuple[int, int]]:
+        """List the pairs of one band after the other, as they were drawn; a single one is listed since."""
+        for band in self._bands:
+            if len(self._bands) > 1:
+                self._count_pairs(band)
+                self._list_pairs()
+            yield band
 
     def _drawn_gaussians(self, caller: str) -> GaussianArrays:
         """Return what was drawn last."""
@@ -342,7 +409,7 @@ class Rasterizer:
             elif array.dtype is dtype and array.device == self.device and _fits(array.shape, sides):
                 continue
             else:
-                got = f"{array.dtype.__name__} {array.shape} on {array.device}"
+                got = _described(array)
             size = " x ".join(" or ".join(map(str, lengths)) for lengths in sides)
             raise InvalidArrayError(
                 f"{name} must be a warp array of {dtype.__name__}, {size}, on {self.device}, got {got}. Convert it."
@@ -432,12 +499,18 @@ class Rasterizer:
             self._back = _BackwardBuffers.of(self)
         return self._back
 
-    def _rows_of_pairs(self, channel_count: int) -> Rows:
-        """Return where the moments and channels of pairs go, allocated when first asked for."""
-        if channel_count not in self._pair_rows:
-            dtype = pair_vector(channel_count, self._exact)
-            self._pair_rows[channel_count] = Rows.zeros(self.pair_capacity, dtype, self.device)
-        return self._pair_rows[channel_count]
+    def _rows_of_pairs(self, length: int) -> Rows:
+        """Return where rows of pairs go, allocated when first asked for; they are for whoever uses them next."""
+        if length not in self._pair_rows:
+            self._pair_rows[length] = Rows.zeros(self.pair_capacity, length, self.device)
+        return self._pair_rows[length]
+
+    def _sum_pairs(self, pairs: Rows, sums: wp.array) -> None:
+        """Add the rows of the band's pairs to those of their splats."""
+        summed = Pairs()
+        summed.rows = pairs.matrix
+        summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
+        launch_sum_pairs(summed, sums, self.device)
 
     def _composite_adjoint(self, back: _BackwardBuffers) -> None:
         """Add what the band at hand says to the gradients of splats and of their rows."""
@@ -447,14 +520,11 @@ class Rasterizer:
         upstream.alpha, upstream.depth = back.images.alpha, back.images.depth
         upstream.median_depth = back.images.median_depth
         for rows, adjoint, sums in zip(self._rows, back.channel_adjoints, back.sums, strict=True):
-            pairs = self._rows_of_pairs(rows.length)
+            pairs = self._rows_of_pairs(pair_length(rows.length, self._exact))
             arguments = (self._frame, rows.vectors, self._exact, self._drawn, adjoint.vectors, upstream)
             self._launch_composite_adjoint(*arguments, pairs.vectors, self.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
-            summed = Pairs()
-            summed.rows = pairs.matrix
-            summed.order, summed.counts, summed.ends = self._order, self._counts, self._ends
-            launch_sum_pairs(summed, sums, self.device)
+            self._sum_pairs(pairs, sums)
 
     def _project_adjoint(self, gaussians: GaussianArrays, back: _BackwardBuffers) -> GaussianGradients:
         """Turn sums over pairs into the gradients of Gaussians."""
@@ -576,6 +646,11 @@ def require_cameras(cameras: Any) -> None:
 def _fits(shape: tuple[int, ...], sides: tuple[tuple[int, ...], ...]) -> bool:
     """Tell whether each side of a shape has one of the lengths that it may have."""
     return len(shape) == len(sides) and all(n in lengths for n, lengths in zip(shape, sides, strict=True))
+
+
+def _described(array: wp.array) -> str:
+    """Say what an array is, for an error."""
+    return f"{array.dtype.__name__} {array.shape} on {array.device}"
 
 
 def _zero_splats(count: int) -> Splats:

@@ -134,8 +134,8 @@ _HALVE = """
         }
 """
 
-_ADD_LAST = """
-        held[0] += __shfl_xor_sync(0xffffffffu, held[0], 1);
+_ADD_WHOLE = """
+        held[0] += __shfl_xor_sync(0xffffffffu, held[0], STEP);
 """
 
 _SUM_BLOCK = """
@@ -155,7 +155,7 @@ _SUM_BLOCK = """
         for (int i = 0; i < WIDTH; ++i)
             held[i] = i < LENGTH ? numbers[i] : 0.0f;
         int place = 0;
-HALVINGS        if ((WIDTH == 32 || (lane & 1) == 0) && place < LENGTH)
+HALVINGS        if (lane % (32 / WIDTH) == 0 && place < LENGTH)
             parts[(pair * WARPS + warp) * LENGTH + place] = held[0];
         if (lane == 0)
             present[pair * WARPS + warp] = 1;
@@ -213,17 +213,18 @@ def sum_block_function(length: int, warps: int):
 
     - `BEGIN_SUMS`: every lane of the first warp names the slot of its pair, -1 for none.
     - `ADD_TO_SUMS`: the lanes of a warp bring their numbers for a pair. They halve what they hold in each of five
-      steps, as in a transpose: 16 numbers take 16 exchanges, where one sum after the other would take five each.
+      steps, as in a transpose, until it is one: 16 numbers take 16 exchanges and 4 take 6, where one sum after the
+      other would take five each.
     - `END_SUMS`: the sums of the warps that brought some, in their order, go to the rows of the slots; zeros for none.
 
     All threads must wait for each other between the three. The order of additions is fixed.
     """
     Numbers = wp.types.vector(length=length, dtype=float)
-    width = 16 if length <= 16 else 32
+    width = next(n for n in (4, 8, 16, 32) if length <= n)
     # Written out step by step: NVRTC keeps an array that is indexed by a loop it does not unroll in slow local memory.
     steps = [(16 >> i, width >> (i + 1)) for i in range(5)]
     halvings = [
-        _HALVE.replace("STEP", str(step)).replace("HALF", str(half)) if half else _ADD_LAST for step, half in steps
+        (_HALVE if half else _ADD_WHOLE).replace("STEP", str(step)).replace("HALF", str(half)) for step, half in steps
     ]
     snippet = _SUM_BLOCK.replace("HALVINGS", "".join(halvings)).replace("LENGTH", str(length))
     snippet = snippet.replace("WARPS", str(warps)).replace("WIDTH", str(width))

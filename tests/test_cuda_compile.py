@@ -22,12 +22,15 @@ TRACING = {"closest_surface", "residues", "surface_rays", "trace", "trace_counts
 """Some of the modules that must have been compiled for every structure of occluders."""
 
 
+COMPOSITES = ((4, False), (16, True))
+
 RASTER = {
-    "composite": "composite_kernel",
-    "composite_cuda": "composite_cuda_kernel",
-    "composite_adjoint_cuda": "composite_adjoint_cuda_kernel",
+    "composite": ("composite_kernel", COMPOSITES),
+    "composite_cuda": ("composite_cuda_kernel", COMPOSITES),
+    "composite_adjoint_cuda": ("composite_adjoint_cuda_kernel", COMPOSITES),
+    "back_projection_cuda": ("back_project_cuda_kernel", ((4,), (8,), (12,), (16,))),
 }
-"""Modules that make a kernel for each number of channels and mode of depth, by function."""
+"""Modules that make a kernel for each number of channels and mode of depth: by which function, some of them."""
 
 
 def compile_all(folder, share):
@@ -37,14 +40,14 @@ def compile_all(folder, share):
     from beam_warp.kernels.occluders import OCCLUDERS
 
     found = {}
-    for name, function in list(RASTER.items())[1 - share :: 2]:
+    for name, (function, choices) in list(RASTER.items())[1 - share :: 2]:
         maker = getattr(importlib.import_module(f"beam_warp.kernels.{name}"), function)
         try:
             local = 0
-            for arguments in ((4, False), (16, True)):
+            for arguments in choices:
                 (path,) = wp.compile_aot_module(maker(*arguments).module, arch=90, use_ptx=True, module_dir=folder)
                 local += Path(path).read_text(encoding="utf-8", errors="ignore").count("__local_depot")
-            found[name] = [2, f"{local} uses of local memory" if local else ""]
+            found[name] = [len(choices), f"{local} uses of local memory" if local else ""]
         except Exception as error:  # reported by the module's own test
             found[name] = [0, f"{type(error).__name__}: {error}"]
     for name in MODULES[share::2]:
@@ -89,7 +92,7 @@ def test_the_rasterizer_keeps_its_sums_in_registers(compiled, name):
     """An array that is indexed by a loop which NVRTC does not unroll lies in local memory: 1.7 times as slow, once."""
     count, error = compiled[name]
     assert not error
-    assert count == 2
+    assert count == len(RASTER[name][1])
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
