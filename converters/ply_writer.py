@@ -60,7 +60,7 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
             if options.target is not None:
                 comments.append(f"beam_meters_per_unit {1.0 / TARGETS[options.target][1]:g}")
             if raster is not None:
-                comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])}")
+                comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])!s}")
             _write_cloud(cloud, staging.path_for(final), options, comments)
     return paths
 
