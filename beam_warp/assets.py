@@ -49,6 +49,7 @@ class Observability(IntFlag):
     SATURATED = 4  #: its captured colour is at the top of its range
     UNCERTAIN_NORMAL = 8  #: its neighbourhood does not determine a surface
     FILLED = 16  #: its value was taken from neighbours
+    GRAZING = 32  #: it is only seen, or only lit, at grazing angles
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ ATTRIBUTES: Mapping[str, Attribute] = {
         Attribute("normal_confidence", (), low=0.0, high=1.0),
         Attribute("ambient_occlusion_error", (), low=0.0),
         Attribute("base_color_error", (3,), low=0.0),
+        Attribute("roughness_error", (), low=0.0),
         Attribute("observability", (), low=0, high=255, dtype="uint8"),
         Attribute("ids", (), dtype="int64"),
     )
@@ -135,6 +137,7 @@ class GaussianCloud:
         normal_confidence: 1 where the neighbourhood determines the normal, ``(N,)`` float32.
         ambient_occlusion_error: Standard error of ``ambient_occlusion``, ``(N,)`` float32.
         base_color_error: Standard error of ``base_color``, ``(N, 3)`` float32.
+        roughness_error: Standard error of ``roughness``, ``(N,)`` float32.
         observability: `Observability` flags, ``(N,)`` uint8.
         ids: Persistent identities across frames, ``(N,)`` int64.
         axes: Which way x, y and z point, e.g. ``"rfu"`` (see `beam_warp.axes`).
@@ -157,6 +160,7 @@ class GaussianCloud:
     normal_confidence: NDArray[np.float32] | None = None
     ambient_occlusion_error: NDArray[np.float32] | None = None
     base_color_error: NDArray[np.float32] | None = None
+    roughness_error: NDArray[np.float32] | None = None
     observability: NDArray[np.uint8] | None = None
     ids: NDArray[np.int64] | None = None
     axes: str = WORLD_AXES
@@ -286,7 +290,8 @@ class GaussianSequence:
         frames_per_second: Playback rate [1/s].
         constant: Names of the arrays that are the same in every frame; they are stored once.
         topology: ``constant`` if row i is the same Gaussian in every frame, else ``perFrame``.
-        metadata: Provenance as text: producer, roughness source, illuminant, …
+        metadata: Provenance as text: producer, roughness source, illuminant, …; and how the Gaussians are to be drawn
+            and which frames of a capture they show (see `beam_warp.asset_metadata`).
     """
 
     frame_count: int

@@ -15,6 +15,7 @@ from beam_warp.cameras import Camera
 from beam_warp.deferred import EnvironmentLighting, relight
 from beam_warp.environments import EnvironmentMap
 from beam_warp.images import display_image
+from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize
 
 BACKGROUND = 0.13
@@ -50,6 +51,7 @@ def contact_sheet(
     camera: Camera,
     relightings: Sequence[Relighting],
     *,
+    options: RasterOptions | None = None,
     device: str | None = None,
 ) -> NDArray[np.uint8]:
     """Draw the captured colour, ambient occlusion, base colour, roughness, normals, and the relightings.
@@ -58,13 +60,14 @@ def contact_sheet(
         cloud: Relightable, with captured radiance, axes "rfu".
         camera: Sees each panel.
         relightings: One panel each.
+        options: How splats are drawn: as they were when the Gaussians were fitted.
         device: Warp device.
 
     Returns:
         8-bit sRGB, ``(H, W, 3)``.
     """
     names = ("base_color", "roughness", "ambient_occlusion", "normals")
-    buffer = rasterize(cloud, camera, channels=("radiance", *names), device=device)
+    buffer = rasterize(cloud, camera, channels=("radiance", *names), options=options, device=device)
     alpha = buffer.alpha[..., None]
     captured = buffer.channels["radiance"]
     if cloud.radiance_color_space != DISPLAY_SRGB:

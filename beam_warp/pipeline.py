@@ -36,6 +36,7 @@ from beam_warp.materials import (
     measure_materials,
     solve_base_color,
 )
+from beam_warp.raster_records import RasterOptions
 from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_report
 from beam_warp.roughness import constant_roughness, textured_roughness
 from beam_warp.scene import Scene
@@ -189,7 +190,8 @@ def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: O
         Relighting("relit by the light of the capture", job.lit),
         options.second_light or Relighting("relit by that light turned by 180°", job.lit.rotated(180.0)),
     ]
-    write_png(path, contact_sheet(cloud, camera, lights, device=str(job.device)))
+    raster = RasterOptions.from_metadata(sequence.metadata)
+    write_png(path, contact_sheet(cloud, camera, lights, options=raster, device=str(job.device)))
 
 
 class _Timer:

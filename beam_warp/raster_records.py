@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import warp as wp
 
+from beam_warp.asset_metadata import LOW_PASS_RANGE, UNSTATED_RASTER, raster_metadata, stated_raster
 from beam_warp.checks import require_choice, require_number
 
 COEFFICIENT_COUNTS = (1, 4, 9, 16, 25)
@@ -33,16 +35,33 @@ class RasterOptions:
         InvalidOptionError: An option is out of range.
     """
 
-    antialiased: bool = False
-    low_pass: float = 0.3
+    antialiased: bool = UNSTATED_RASTER[0]
+    low_pass: float = UNSTATED_RASTER[1]
     near: float = 0.01
     depth: DepthMode = "plane"
 
     def __post_init__(self) -> None:
         """Check every option once."""
-        require_number("low_pass", self.low_pass, 1e-6, 1e6)
+        require_number("low_pass", self.low_pass, *LOW_PASS_RANGE)
         require_number("near", self.near, 1e-9, 1e9)
         require_choice("depth", self.depth, DEPTH_MODES)
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> RasterOptions:
+        """Return how a sequence says that its Gaussians are to be drawn; the defaults where it says nothing.
+
+        Args:
+            metadata: Of a `beam_warp.assets.GaussianSequence`.
+
+        Raises:
+            InvalidOptionError: It says something else than a filter.
+        """
+        antialiased, low_pass = stated_raster(metadata) or UNSTATED_RASTER
+        return cls(antialiased=antialiased, low_pass=low_pass)
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return what states that Gaussians were fitted so; near and depth are whoever draws them's to choose."""
+        return raster_metadata(self.antialiased, self.low_pass)
 
 
 class GaussianArrays(NamedTuple):

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp._version import __version__
+from beam_warp.asset_metadata import capture_frames_metadata
 from beam_warp.assets import ATTRIBUTES, LINEAR_REC709, WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.capture_digests import CaptureDigests, require_files
 from beam_warp.capture_inspection import SPLIT, require_reconstructable
@@ -215,7 +216,11 @@ def reconstruct(
     job.reconstruct(job.segments)
     progress("write asset", 0, 1)
     _remove_leftovers(Path(out))
-    sequence = stored_sequence([job.path(frame) for frame in job.frames], capture.frames_per_second or 30.0)
+    sequence = stored_sequence(
+        [job.path(frame) for frame in job.frames],
+        capture.frames_per_second or 30.0,
+        {**(steps.raster or RasterOptions()).as_metadata(), **capture_frames_metadata(job.frames)},
+    )
     asset = Path(out) / ASSET_NAME
     converters.write(sequence, asset)
     progress("write asset", 1, 1)
@@ -271,10 +276,18 @@ def plan_segments(frames: Sequence[int], length: int) -> tuple[tuple[int, ...], 
     return tuple(tuple(frames[start : start + step]) for start in range(0, len(frames), step))
 
 
-def stored_sequence(paths: Sequence[Path], frames_per_second: float) -> GaussianSequence:
+def stored_sequence(
+    paths: Sequence[Path], frames_per_second: float, stated: Mapping[str, str] = MappingProxyType({})
+) -> GaussianSequence:
     """Return frames of the store as a sequence; they are read when they are asked for.
 
     Its topology is constant where every frame has the same identities, in the same rows.
+
+    Args:
+        paths: The frames' files, in order.
+        frames_per_second: Playback rate [1/s].
+        stated: What its metadata say besides: how the Gaussians were drawn, which frames of the capture they show
+            (see `beam_warp.asset_metadata`).
     """
     ids = read_frame(paths[0], ("ids",))["ids"]
     constant = all(np.array_equal(read_frame(path, ("ids",))["ids"], ids) for path in paths[1:])
@@ -288,6 +301,7 @@ def stored_sequence(paths: Sequence[Path], frames_per_second: float) -> Gaussian
             "generator": f"beam-warp {__version__}",
             "radiance_meaning": "captured",
             "source_axes": WORLD_AXES,
+            **stated,
         },
     )
 

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.asset_metadata import LOW_PASS_RANGE, raster_metadata
 from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, GaussianCloud, GaussianSequence, sh_degree_of
 from beam_warp.axes import AXIS_CODES
-from beam_warp.checks import require_number
+from beam_warp.checks import require_choice, require_number
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.options import ReadOptions
 from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types, rows_at
-from beam_warp.converters.ply_container import PlyHeader, Table, malformed, read_header, read_table
+from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, Table, malformed, read_header, read_table
 from beam_warp.converters.producers import (
     LAYOUTS,
     NORMAL_NAMES,
@@ -112,7 +113,11 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
         raise AssetFormatError(f"{header.path.name}: {error}") from error
     if not len(cloud):
         notes.append("holds no Gaussians")
-    provenance = {"source_axes": axes, "source_units": "m" if units == 1.0 else f"{units:g} m"}
+    provenance = {
+        "source_axes": axes,
+        "source_units": "m" if units == 1.0 else f"{units:g} m",
+        **({} if statements.raster is None else raster_metadata(*statements.raster)),
+    }
     if cloud.radiance is not None:
         provenance["radiance_meaning"] = statements.radiance_meaning or CAPTURED
     return PlyFrame(cloud, statements.frames_per_second, provenance, tuple(notes))
@@ -128,6 +133,7 @@ class _Statements:
     material_linear: bool
     radiance_meaning: str | None
     radiance_color_space: str
+    raster: tuple[bool, float] | None
 
     @classmethod
     def of(cls, header: PlyHeader) -> _Statements:
@@ -151,6 +157,7 @@ class _Statements:
             units = require_number("beam_meters_per_unit", said.get("beam_meters_per_unit", 1.0), 1e-6, 1e6)  # type: ignore[arg-type]
             rate = said.get("beam_frame", "0 30").split()[-1]
             frames_per_second = require_number("beam_frame's rate", rate, 1e-3, 1e6)  # type: ignore[arg-type]
+            raster = _raster(said["beam_raster"]) if "beam_raster" in said else None
         except BeamError as error:
             raise AssetFormatError(f"{header.path.name}: {error}") from error
         return cls(
@@ -160,7 +167,15 @@ class _Statements:
             material_linear="beam_material" in said,
             radiance_meaning=said.get("beam_radiance_meaning"),
             radiance_color_space=said.get("beam_radiance_color_space", DISPLAY_SRGB),
+            raster=raster,
         )
+
+
+def _raster(text: str) -> tuple[bool, float]:
+    """Read ``antialiased 0.1``: how splats are to be drawn."""
+    word, _, low_pass = text.partition(" ")
+    require_choice("beam_raster", word, tuple(RASTER_WORDS.values()))
+    return word == RASTER_WORDS[True], require_number("beam_raster's low-pass", low_pass, *LOW_PASS_RANGE)  # type: ignore[arg-type]
 
 
 def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:

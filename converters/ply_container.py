@@ -42,6 +42,9 @@ SCALAR_TYPES = {
 }
 """Type words, old and new, by NumPy code."""
 
+RASTER_WORDS = {False: "classic", True: "antialiased"}
+"""First word of the comment ``beam_raster``: whether splats are drawn antialiased."""
+
 
 _CONTROL_CHARACTERS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n\r"}
 """What a header must not smuggle into the terminal that its names and comments are shown on."""

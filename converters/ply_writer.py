@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp._version import __version__
+from beam_warp.asset_metadata import stated_raster
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709, GaussianCloud, GaussianSequence
 from beam_warp.axes import TARGETS, change_axes
 from beam_warp.converters.activations import log_scale, logit
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, display_radiance, resize_bands
 from beam_warp.converters.numbering import numbered_path
 from beam_warp.converters.options import WriteOptions
+from beam_warp.converters.ply_container import RASTER_WORDS
 from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import InvalidOptionError, OutputError
-
-SCHEMA_VERSION = "1.0"
+from beam_warp.schema import SCHEMA_VERSION
 
 MAX_FILE_BYTES = 2**31 - 1
 """Importers index with signed 32-bit integers."""
@@ -43,10 +44,12 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     """Write one file, or one for each frame numbered from the given name.
 
     Raises:
-        InvalidOptionError: The beam profile is asked for and there are no materials.
+        InvalidOptionError: The beam profile is asked for and there are no materials, or the metadata state how the
+            Gaussians are to be drawn in other words than those of `beam_warp.asset_metadata`.
         OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
     """
     paths = output_paths(sequence, path)
+    raster = stated_raster(sequence.metadata)
     with staged_outputs() as staging:
         for frame, final in enumerate(paths):
             cloud = sequence[frame]
@@ -56,6 +59,8 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
             comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
             if options.target is not None:
                 comments.append(f"beam_meters_per_unit {1.0 / TARGETS[options.target][1]:g}")
+            if raster is not None:
+                comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])!s}")
             _write_cloud(cloud, staging.path_for(final), options, comments)
     return paths
 

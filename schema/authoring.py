@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Vt
 
 from beam_warp._version import __version__
+from beam_warp.asset_metadata import stated_capture_frames, stated_raster
 from beam_warp.assets import LINEAR_REC709, GaussianCloud, GaussianSequence
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
 from beam_warp.schema.layout import (
@@ -141,6 +142,9 @@ def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
         ("generator", "string", f"beam-warp {__version__}"),
     ):
         _uniform(prim, f"beam:sequence:{name}", type_name, value)
+    frames = stated_capture_frames(metadata, len(sequence))
+    if frames is not None:
+        _uniform(prim, "beam:sequence:captureFrames", "int[]", Vt.IntArray(frames))
 
 
 def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
@@ -166,6 +170,10 @@ def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
         ("beam:radianceColorSpace", "token", survey.color_space),
     ):
         _uniform(prim, name, type_name, value)
+    raster = stated_raster(metadata)
+    if raster is not None:
+        _uniform(prim, "beam:rasterAntialiased", "bool", raster[0])
+        _uniform(prim, "beam:rasterLowPass", "float", raster[1])
     first = contents.sequence[0]
     color = Sdf.AttributeSpec(prim, "primvars:displayColor", Sdf.ValueTypeNames.Color3fArray)
     color.SetInfo("interpolation", "constant")

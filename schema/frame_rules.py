@@ -161,7 +161,7 @@ def _confidence(frame: Frame) -> Iterator[Fault]:
 @entering(FRAME_RULES, "BEAM-MAT-016", "error")
 def _standard_errors(frame: Frame) -> Iterator[Fault]:
     """Standard errors are not negative."""
-    return _range(frame, 0.0, np.inf, "ambient_occlusion_error", "base_color_error")
+    return _range(frame, 0.0, np.inf, "ambient_occlusion_error", "base_color_error", "roughness_error")
 
 
 @entering(FRAME_RULES, "BEAM-MAT-017", "warning")

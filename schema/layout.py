@@ -89,6 +89,7 @@ CHANNELS: Mapping[str, Channel] = {
         Channel("normal_confidence", "beam:normalConfidence", "float[]", "half[]"),
         Channel("ambient_occlusion_error", "beam:ambientOcclusionError", "float[]", "half[]"),
         Channel("base_color_error", "beam:baseColorError", "float3[]", "half3[]", 3),
+        Channel("roughness_error", "beam:roughnessError", "float[]", "half[]"),
         Channel("observability", "beam:observability", "uchar[]", None),
         Channel("ids", "beam:ids", "int64[]", None),
     )

@@ -12,6 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom
 
+from beam_warp.asset_metadata import (
+    UNSTATED_RASTER,
+    capture_frames_metadata,
+    raster_metadata,
+)
 from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence, Topology
 from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
@@ -252,6 +257,9 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
             word = authored(playing, name)
             if word:
                 said[key] = str(word)
+        frames = authored(playing, "beam:sequence:captureFrames")
+        if frames is not None:
+            said.update(capture_frames_metadata(frames))
     if not has_material_api(prim):
         return said
     version = str(authored(prim, "beam:schemaVersion") or "")
@@ -269,6 +277,14 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
         word = authored(prim, name)
         if word is not None:
             said[key] = str(word)
+    antialiased, low_pass = authored(prim, "beam:rasterAntialiased"), authored(prim, "beam:rasterLowPass")
+    if antialiased is not None or low_pass is not None:
+        said.update(
+            raster_metadata(
+                UNSTATED_RASTER[0] if antialiased is None else antialiased,
+                UNSTATED_RASTER[1] if low_pass is None else low_pass,
+            )
+        )
     if array_attribute(prim, CHANNELS["metallic"]) is not None:
         notes.append("the asset has a metallic channel, which is not read")
     return said

@@ -231,6 +231,14 @@ def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"the colour space must be {wanted}, got {space!r}. Author it.", "beam:radianceColorSpace")
 
 
+@entering(PRIM_RULES, "BEAM-RASTER-001", "error")
+def _low_pass(prim: Usd.Prim) -> Iterator[Fault]:
+    """The variance of the low-pass that splats are drawn with is positive, where it is authored."""
+    low_pass = authored(prim, "beam:rasterLowPass")
+    if low_pass is not None and not 0.0 < low_pass < np.inf:
+        yield Fault(f"the low-pass must be positive, got {low_pass:g}. Author that of the fit.", "beam:rasterLowPass")
+
+
 @entering(PRIM_RULES, "BEAM-TOKEN-001", "error")
 def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
     """brdf, aoMeaning, normalSource and radianceMeaning are authored: fallbacks are invisible without the plug-in."""
@@ -326,6 +334,20 @@ def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
     if union != wanted:
         strange = min(set(union) ^ set(wanted))
         yield Fault(f"samples must be every whole time code of the range, got a difference at {strange:g}. Mend them.")
+
+
+@entering(PRIM_RULES, "BEAM-SEQ-009", "error")
+def _capture_frames(prim: Usd.Prim) -> Iterator[Fault]:
+    """captureFrames, where it is authored, holds a number for each frame, none of them negative."""
+    playing = sequence_prim(prim)
+    numbers = authored(playing, "beam:sequence:captureFrames") if playing is not None else None
+    if playing is None or numbers is None:
+        return
+    count = authored(playing, "beam:sequence:frameCount")
+    if count is not None and len(numbers) != count:
+        yield Fault(f"captureFrames must hold a number for each of {count} frames, got {len(numbers)}. Mend it.")
+    elif any(number < 0 for number in numbers):
+        yield Fault(f"captureFrames must not be negative, got {min(numbers)}. Number the frames from 0.")
 
 
 @entering(FIRST_RULES, "BEAM-CLIP-001", "error")

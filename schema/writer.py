@@ -53,9 +53,9 @@ def write_asset(
 
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
-            ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units`` set
-            the attributes of these names; all keys but
-            ``notes`` are kept in ``customData`` of ``/Asset``.
+            ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units``, and
+            those of `beam_warp.asset_metadata`, set the attributes of these names; all keys but ``notes`` are kept in
+            ``customData`` of ``/Asset``.
         path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
             ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
         full_float: Write every array in float.
@@ -65,7 +65,8 @@ def write_asset(
         The files written, the one to open last.
 
     Raises:
-        InvalidOptionError: Axes, file name or options break their contract.
+        InvalidOptionError: Axes, file name or options break their contract, or the metadata that of
+            `beam_warp.asset_metadata`.
         InvalidArrayError: The frames do not hold the same arrays.
         OutputError: The files cannot be written, or a package would reach 4 GiB. Nothing is left behind.
     """

@@ -8,11 +8,14 @@ from shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, MaterialOptions, RunOptions, read, run, validate
 from beam_warp.assets import DISPLAY_SRGB
+from beam_warp.cameras import Camera
+from beam_warp.contact_sheet import MARGIN, TITLE_HEIGHT, contact_sheet
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError, OutputError
 from beam_warp.frame_store import frame_key, read_frame, write_frame
 from beam_warp.images import read_image
 from beam_warp.pipeline import OverviewOptions, RoughnessTexture
+from beam_warp.raster_records import RasterOptions
 
 FAST = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
 SMALL = OverviewOptions(height=48)
@@ -51,6 +54,27 @@ def test_everything_is_written_valid_and_readable(tmp_path, light):
     assert report["materials"]["gaussians"] == 400
     assert report["device"]["kind"] == "cpu"
     assert read_image(result.overview).width > 48
+
+
+def test_it_is_drawn_as_its_metadata_say(tmp_path, light):
+    stated = {"raster_antialiased": "true", "raster_low_pass": "4.0", "capture_frames": "7"}
+    said = run(GaussianSequence.from_clouds([frame()], metadata=stated), light, tmp_path / "a", FAST, overview=SMALL)
+    silent = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "b", FAST, overview=SMALL)
+    assert read(said.asset).metadata.items() >= stated.items()
+    assert not [key for key in read(silent.asset).metadata if key.startswith("raster")]
+    for result, options in ((said, RasterOptions(antialiased=True, low_pass=4.0)), (silent, RasterOptions())):
+        cloud = result.sequence[0]
+        extent = np.ptp(cloud.positions, axis=0)
+        width = round(SMALL.height * float(np.hypot(extent[0], extent[1]) / extent[2]))  # panels are that wide
+        camera = Camera.frame_cloud(
+            cloud.positions, cloud.opacities, elevation=SMALL.elevation, width=width, height=SMALL.height
+        )
+        expected = contact_sheet(cloud, camera, [], options=options, device="cpu")
+        # Captured colour is the first panel, whatever follows.
+        top = MARGIN + TITLE_HEIGHT
+        panel = np.s_[top : top + SMALL.height, MARGIN : MARGIN + width]
+        drawn = np.rint(read_image(result.overview).rgb() * 255.0)
+        np.testing.assert_array_equal(drawn[panel], expected[panel])
 
 
 def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatch):

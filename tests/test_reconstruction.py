@@ -130,6 +130,12 @@ class TestOutputs:
             assert read_image(out / "previews" / f"frame_{frame:06d}.png").width > 300
         assert not [path for path in out.rglob("*") if path.name.startswith(".")]
 
+    def test_how_it_was_drawn_and_which_frames_it_shows_are_stated(self, capture, tmp_path):
+        stated = {"raster_antialiased": "true", "raster_low_pass": "0.3", "capture_frames": "1 3"}
+        found = reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(frames=(1, 3)))
+        assert found.sequence.metadata.items() >= stated.items()
+        assert read(found.asset).metadata.items() >= stated.items()
+
     def test_drift_is_said(self, tmp_path):
         capture = Capture.read(write_capture(tmp_path / "capture", range(4)))
         warnings = reconstruct(capture, tmp_path / "out", FakeSteps()).report["warnings"]

@@ -22,6 +22,7 @@ from beam_warp.cameras import Camera
 from beam_warp.captures import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.images import write_png
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from beam_warp.depth_images import DepthImages
+    from beam_warp.raster_records import RasterOptions
 
 UNWRAP_FACES = 50_000
 """Triangles of the mesh that is unwrapped, about; cutting charts takes half a minute for so many."""
@@ -75,7 +77,8 @@ class Mesh:
         bool, arg(help="Also write canonical.glb and .obj: the first of the frames with texture coordinates.")
     ] = False
     preview: Annotated[bool, arg(help="Also draw every mesh, as .png.")] = False
-    antialiased: Annotated[bool, arg(help="For Gaussians trained with the 2D anti-aliasing filter.")] = False
+    antialiased: Antialiased = None
+    low_pass: LowPass = None
     source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
     drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
@@ -93,6 +96,7 @@ def mesh(args: Mesh) -> int:
     capture = None if args.capture is None else Capture.read(args.capture)
     sequence = converters.read(args.sequence, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     frames = _frames(args, len(sequence))
+    options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     cameras_of = {frame: _capture_cameras(args, capture, frame) for frame in frames} if capture is not None else {}
     try:
@@ -105,7 +109,8 @@ def mesh(args: Mesh) -> int:
     with progress(args.quiet or args.json) as report:
         for done, frame in enumerate(frames, start=1):
             cloud = change_axes(sequence[frame], WORLD_AXES)
-            reports.append(_mesh_frame(args, frame, cloud, cameras_of.get(frame), args.unwrap and done == 1))
+            canonical = args.unwrap and done == 1
+            reports.append(_mesh_frame(args, options, frame, cloud, cameras_of.get(frame), canonical))
             report("mesh", done, len(frames))
     seconds = time.perf_counter() - started
     if args.json:
@@ -139,7 +144,12 @@ def _capture_cameras(args: Mesh, capture: Capture, frame: int) -> tuple[Camera, 
 
 
 def _mesh_frame(
-    args: Mesh, frame: int, cloud: GaussianCloud, cameras: Sequence[Camera] | None, canonical: bool
+    args: Mesh,
+    options: RasterOptions,
+    frame: int,
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera] | None,
+    canonical: bool,
 ) -> dict[str, Any]:
     """Write the files of a frame unless they are there, and return its report."""
     from beam_warp.meshing import surrounding_cameras
@@ -148,13 +158,13 @@ def _mesh_frame(
     path = converters.numbered_path(args.out / f"mesh.{args.format}", frame)
     wanted = [path, *([path.with_suffix(".png")] if args.preview else [])]
     wanted += [args.out / "canonical.glb", args.out / "canonical.obj"] if canonical else []
-    key = _key(args, cloud, seen_from, canonical)
+    key = _key(args, options, cloud, seen_from, canonical)
     known = _read_report(path.with_suffix(".json"))
     if known.get("key") == key and all(file.is_file() for file in wanted):
         return {**known, "kept": True}
     started = time.perf_counter()
     report = {"frame": frame, "output": path.name, "key": key, "cameras": len(seen_from)}
-    report |= _write_meshes(args, cloud, seen_from, path, canonical)
+    report |= _write_meshes(args, options, cloud, seen_from, path, canonical)
     report["seconds"] = round(time.perf_counter() - started, 3)
     # Last of all: with it the frame is done.
     _write_text(path.with_suffix(".json"), json.dumps(report, indent=2, sort_keys=True) + "\n")
@@ -162,7 +172,7 @@ def _mesh_frame(
 
 
 def _write_meshes(
-    args: Mesh, cloud: GaussianCloud, cameras: Sequence[Camera], path: Path, canonical: bool
+    args: Mesh, options: RasterOptions, cloud: GaussianCloud, cameras: Sequence[Camera], path: Path, canonical: bool
 ) -> dict[str, Any]:
     """Fuse a frame, write what was asked for, and return what was found."""
     from beam_warp.depth_consistency import depth_consistency
@@ -171,12 +181,10 @@ def _write_meshes(
     from beam_warp.mesh_preview import shaded_image
     from beam_warp.mesh_topology import mesh_report
     from beam_warp.meshing import draw_depths
-    from beam_warp.raster_records import RasterOptions
 
     color = args.color
     if color is None:
         color = "base_color" if cloud.base_color is not None else "radiance" if cloud.radiance is not None else "none"
-    options = RasterOptions(antialiased=args.antialiased)
     images = draw_depths(cloud, cameras, depth=args.depth, color=color, options=options, device=args.device)
     consistency = depth_consistency(images)
     if len(cameras) > 1:
@@ -209,11 +217,11 @@ def _write_canonical(args: Mesh, images: DepthImages, surface: trimesh.Trimesh) 
     return {"faces": len(flat.faces), "vertices": len(flat.vertices), "voxel": surface.metadata["voxel"]}
 
 
-def _key(args: Mesh, cloud: GaussianCloud, cameras: Sequence[Camera], canonical: bool) -> str:
+def _key(args: Mesh, options: RasterOptions, cloud: GaussianCloud, cameras: Sequence[Camera], canonical: bool) -> str:
     """Return what a frame's files are made of, as a digest."""
     digest = hashlib.sha256()
-    options = (args.format, args.voxel, args.depth, args.color, args.confirmations, args.antialiased, canonical)
-    digest.update(repr((__version__, options)).encode())
+    asked = (args.format, args.voxel, args.depth, args.color, args.confirmations, options, canonical)
+    digest.update(repr((__version__, asked)).encode())
     for name, array in cloud.arrays().items():
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(array).tobytes())

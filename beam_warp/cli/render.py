@@ -20,12 +20,14 @@ from beam_warp.cameras import MAX_SIDE, Camera, bulk
 from beam_warp.captures import Capture
 from beam_warp.checks import require_count, require_range
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.images import display_image, srgb_to_linear, write_exr, write_png
 
 if TYPE_CHECKING:
     from beam_warp.deferred import EnvironmentLighting
+    from beam_warp.raster_records import RasterOptions
 
 DEFAULT_SIDE = 1024
 """Width and height where none is given [pixel]."""
@@ -72,7 +74,8 @@ class Render:
         arg(metavar="R G B", help="Display colour behind the asset, 0 to 1; transparent by default."),
     ] = "transparent"
     aov: Annotated[bool, arg(help="Also write base colour, roughness, occlusion, normal and depth (.exr).")] = False
-    antialiased: Annotated[bool, arg(help="For an asset trained with the 2D anti-aliasing filter.")] = False
+    antialiased: Antialiased = None
+    low_pass: LowPass = None
     source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
     drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
     device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
@@ -104,6 +107,7 @@ def render(args: Render) -> int:
     environment = EnvironmentMap.read(environment_path).rotated(args.rotate).exposed(args.exposure)
     sequence = converters.read(args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     _require_frame(args, len(sequence))
+    options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     if capture is not None:
         views = _capture_views(args, capture, len(sequence), notes)
@@ -117,7 +121,7 @@ def render(args: Render) -> int:
     gaussian_count = 0
     with progress(args.quiet or args.json) as report:
         for done, (view, cloud) in enumerate(_with_clouds(args, views, sequence), start=1):
-            _draw(args, view, cloud, lighting)
+            _draw(args, view, cloud, lighting, options)
             gaussian_count = max(gaussian_count, len(cloud))
             report("render", done, len(views))
     seconds = time.perf_counter() - started
@@ -258,13 +262,13 @@ def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianClou
     return change_axes(cloud, WORLD_AXES)
 
 
-def _draw(args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting) -> None:
+def _draw(
+    args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting, options: RasterOptions
+) -> None:
     """Draw one image and write it."""
     from beam_warp.deferred import relight
-    from beam_warp.raster_records import RasterOptions
     from beam_warp.rasterizing import rasterize
 
-    options = RasterOptions(antialiased=args.antialiased)
     buffer = rasterize(cloud, view.camera, options=options, device=args.device)
     radiance = relight(buffer, lighting)
     alpha = buffer.alpha

@@ -142,7 +142,7 @@ def test_options_out_of_range(person, capsys, option):
 def test_inspect(person, capsys):
     code, out, _ = run("inspect", person / "person.ply", capsys=capsys)
     assert code == 0
-    assert "producer    beam-warp (beam_schema 1.0)\n" in out
+    assert "producer    beam-warp (beam_schema 1.1)\n" in out
     assert "materials   base_color\n" in out
     code, out, _ = run("inspect", person / "take", "--json", capsys=capsys)
     assert json.loads(out)["frame_count"] == 3

@@ -10,6 +10,7 @@ from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cameras import Camera
 from beam_warp.cli.main import main
 from beam_warp.mesh_files import read_mesh
+from beam_warp.raster_records import RasterOptions
 
 FAST = ("--size", "48", "--voxel", "0.05", "--device", "cpu")
 
@@ -96,6 +97,24 @@ def test_finished_frames_are_kept(sequence, tmp_path, capsys):
     assert run(sequence, "--out", out, *FAST, "--json", "--frames", "1", "--color", "none") == 0
     assert not json.loads(capsys.readouterr().out)["frames"][0]["kept"]
     assert (out / "mesh000001.ply").read_bytes() != content
+
+
+def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(tmp_path, capsys):
+    """What a mesh is made of is in its key, how its depth was drawn included."""
+    stated = RasterOptions(antialiased=True, low_pass=0.1).as_metadata()
+    for name, metadata in (("said", stated), ("silent", {})):
+        balls = GaussianSequence.from_clouds([ball((0.0, 0.0, 0.0))], metadata=metadata)
+        converters.write(balls, tmp_path / f"{name}.ply", converters.WriteOptions(profile="beam"))
+
+    def kept(name, *more):
+        assert run(tmp_path / f"{name}.ply", "--out", tmp_path / "out", *FAST, "--json", *more) == 0
+        return json.loads(capsys.readouterr().out)["frames"][0]["kept"]
+
+    assert not kept("said")
+    assert kept("silent", "--antialiased", "yes", "--low-pass", 0.1)
+    assert kept("said", "--low-pass", 0.1)
+    assert not kept("silent")
+    assert kept("said", "--antialiased", "no", "--low-pass", 0.3)
 
 
 def test_cameras_of_a_capture(sequence, tmp_path, capsys):

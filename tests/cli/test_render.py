@@ -8,12 +8,15 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from beam_warp import converters
-from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.axes import change_axes
 from beam_warp.cameras import Camera
 from beam_warp.captures import Capture
 from beam_warp.cli.console import run_command
 from beam_warp.cli.render import Render, render
 from beam_warp.images import linear_to_srgb, read_image, write_exr
+from beam_warp.raster_records import RasterOptions
+from beam_warp.rasterizing import rasterize
 
 SIDE = ["--width", "48"]
 
@@ -168,6 +171,31 @@ def test_usd_shows_the_same_picture(ball, sided_light, tmp_path):
         assert np.abs(ply.channels[part] - usd.channels[part]).mean() < 1 / 255
 
 
+def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(white_light, tmp_path):
+    stated = {"raster_antialiased": "true", "raster_low_pass": "2.0"}
+    ball = GaussianSequence.from_clouds([sphere()], metadata=stated)
+    for name, options in (("ball.ply", {"profile": "beam"}), ("ball.usdc", {"full_float": True})):
+        converters.write(ball, tmp_path / name, converters.WriteOptions(**options))
+
+    def alpha(*more, asset="ball.ply"):
+        words = [tmp_path / asset, "--environment", white_light, *SIDE, "--device", "cpu", *more]
+        assert run(*words, "--out", tmp_path / "x.exr") == 0
+        return read_image(tmp_path / "x.exr").channels["A"]
+
+    def expected(antialiased, low_pass, asset="ball.ply"):
+        cloud = change_axes(converters.read(tmp_path / asset)[0], WORLD_AXES)
+        camera = Camera.frame_cloud(cloud.positions, cloud.opacities, width=48, height=48)
+        options = RasterOptions(antialiased=antialiased, low_pass=low_pass)
+        return rasterize(cloud, camera, channels=(), options=options, device="cpu").alpha
+
+    for asset in ("ball.ply", "ball.usdc"):
+        np.testing.assert_array_equal(alpha(asset=asset), expected(True, 2.0, asset))
+    np.testing.assert_array_equal(alpha("--antialiased", "no"), expected(False, 2.0))
+    np.testing.assert_array_equal(alpha("--low-pass", 0.1), expected(True, 0.1))
+    np.testing.assert_array_equal(alpha("--low-pass", 0.3, "--antialiased", "no"), expected(False, 0.3))
+    assert np.abs(expected(True, 2.0) - expected(False, 0.3)).max() > 0.1
+
+
 def test_look_at_and_size(ball, white_light, tmp_path):
     out = tmp_path / "x.exr"
     look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, "--aov"]
@@ -253,6 +281,7 @@ def test_the_capture_brings_its_light(ball, white_light, tmp_path):
         (["--out", "x.png", "--fov", "nan"], "vertical_fov must be a number in"),
         (["--out", "x.png", "--device", "cuda:9"], "device must be one of cpu"),
         (["--out", "x.png", "--exposure", "nan"], "must be a number in"),
+        (["--out", "x.png", "--low-pass", "0"], "low_pass must be a number in [1e-06, 1e+06], got 0.0"),
     ],
 )
 def test_refusals_are_one_line(ball, white_light, tmp_path, capsys, monkeypatch, words, message):

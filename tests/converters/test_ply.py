@@ -93,7 +93,7 @@ def test_the_file_obeys_the_rules_of_importers(make_cloud, tmp_path):
         assert len(body) == 50 * 4 * len(properties)
         assert np.isfinite(np.frombuffer(body, "<f4")).all()
         assert "comment beam_axes rfu" in lines
-        assert "comment beam_schema 1.0" in lines
+        assert "comment beam_schema 1.1" in lines
         assert "comment beam_frame 0 30" in lines
         assert ("comment beam_material linear" in lines) == (name == "beam")
         assert ("comment beam_base_color_space lin_rec709_scene" in lines) == (name == "beam")
@@ -110,7 +110,7 @@ def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
         assert np.array_equal(getattr(back, name), getattr(cloud, name)), name
     assert back.is_relightable
     assert back.radiance_color_space == LINEAR_REC709
-    assert sequence.metadata["producer"] == "beam-warp (beam_schema 1.0)"
+    assert sequence.metadata["producer"] == "beam-warp (beam_schema 1.1)"
 
 
 finite = st.floats(-(2.0**100), 2.0**100, width=32)
@@ -266,6 +266,34 @@ def test_linear_radiance_is_encoded_in_a_standard_file(make_cloud, tmp_path):
     bright = light > 0.2
     assert bright.any()
     assert np.abs(sh_color(back.radiance, direction) - encoded)[bright].max() <= 0.5 * 0.4 / 0.2**1.6 * 3e-3**2
+
+
+@pytest.mark.parametrize("antialiased", ["true", "false"])
+@pytest.mark.parametrize("frames", [1, 2])
+def test_how_it_is_drawn_survives(make_cloud, tmp_path, antialiased, frames):
+    stated = {"raster_antialiased": antialiased, "raster_low_pass": "0.1"}
+    sequence = GaussianSequence.from_clouds([make_cloud(seed=seed) for seed in range(frames)], metadata=stated)
+    files = converters.write(sequence, tmp_path / "a.ply", WriteOptions(target="unreal"))
+    word = "antialiased" if antialiased == "true" else "classic"
+    for file in files:
+        assert f"comment beam_raster {word} 0.1\n".encode() in file.read_bytes()
+    found = converters.read(files[0] if frames == 1 else tmp_path)
+    assert found.metadata.items() >= stated.items()
+
+
+def test_nothing_is_said_of_drawing_without_a_word(make_cloud, columns, ply_bytes, tmp_path):
+    write(make_cloud(), tmp_path / "ours.ply")
+    assert b"beam_raster" not in (tmp_path / "ours.ply").read_bytes()
+    (tmp_path / "other.ply").write_bytes(ply_bytes(columns))
+    for name in ("ours", "other"):
+        assert not [key for key in converters.read(tmp_path / f"{name}.ply").metadata if key.startswith("raster")]
+
+
+@pytest.mark.parametrize("text", ["sharp 0.1", "antialiased", "antialiased 0", "classic nan", "classic 0.1 0.2"])
+def test_a_filter_that_is_none_is_refused(columns, ply_bytes, tmp_path, text):
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=[f"beam_raster {text}"]))
+    with pytest.raises(AssetFormatError, match=r"a\.ply: beam_raster('s low-pass)? must be"):
+        converters.read(tmp_path / "a.ply")
 
 
 def test_linear_files_are_read_when_told(columns, ply_bytes, tmp_path):

@@ -31,8 +31,9 @@ def make_cloud(seed=0, count=6, *, degree=1, relightable=True, axes="rub", **cha
             "normal_confidence": fixed.random(count),
             "ambient_occlusion_error": fixed.random(count),
             "base_color_error": 2.0 * fixed.random((count, 3)),
-            "observability": fixed.integers(0, 32, count),
+            "observability": fixed.integers(0, 64, count),
             "ids": np.arange(count) * 10**12,
+            "roughness_error": 0.5 * fixed.random(count),
         }
     return GaussianCloud(**(arrays | changes), axes=axes)
 

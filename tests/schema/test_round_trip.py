@@ -4,9 +4,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Sdf, Usd, Vt
 
+from beam_warp.asset_metadata import stated_raster
 from beam_warp.assets import GaussianSequence
+from beam_warp.errors import InvalidOptionError
 from beam_warp.schema.layout import HALF_ABSOLUTE, HALF_EPSILON
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
@@ -40,6 +42,69 @@ def test_every_channel_survives(tmp_path, sequence, name, frames, full_float):
     assert found.metadata.items() >= source.metadata.items()
     for frame in (*range(min(frames, 3)), frames // 2, frames - 1):
         assert_same(found[frame], source[frame], full_float)
+
+
+RASTER = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
+
+
+@pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usdz"])
+@pytest.mark.parametrize("frames", [1, 3, 65])
+def test_how_it_is_drawn_and_which_frames_it_shows_survive(tmp_path, sequence, name, frames):
+    numbers = " ".join(str(7 + 2 * frame) for frame in range(frames))
+    write_asset(sequence(frames, metadata={**RASTER, "capture_frames": numbers}), tmp_path / name)
+    stage = Usd.Stage.Open(str(tmp_path / name))
+    splats, root = stage.GetPrimAtPath("/Asset/Splats"), stage.GetPrimAtPath("/Asset")
+    assert splats.GetAttribute("beam:rasterAntialiased").Get() is True
+    assert splats.GetAttribute("beam:rasterLowPass").Get() == np.float32(0.1)
+    assert list(root.GetAttribute("beam:sequence:captureFrames").Get()) == [7 + 2 * frame for frame in range(frames)]
+    found = read_asset(tmp_path / name, trusted=True).metadata
+    assert found.items() >= RASTER.items()
+    assert found["capture_frames"] == numbers
+
+
+def test_attributes_go_before_what_was_noted(tmp_path, sequence):
+    """Another program changes attributes, not the text of our customData."""
+    write_asset(sequence(2, metadata={**RASTER, "capture_frames": "0 1"}), tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage.GetPrimAtPath("/Asset/Splats").GetAttribute("beam:rasterLowPass").Set(0.25)
+    stage.GetPrimAtPath("/Asset").GetAttribute("beam:sequence:captureFrames").Set(Vt.IntArray([4, 6]))
+    stage.GetRootLayer().Save()
+    found = read_asset(tmp_path / "a.usda").metadata
+    assert (found["raster_antialiased"], found["raster_low_pass"]) == ("true", "0.25")
+    assert found["capture_frames"] == "4 6"
+
+
+@pytest.mark.parametrize(
+    ("name", "type_name", "value", "raster"),
+    [
+        ("beam:rasterAntialiased", Sdf.ValueTypeNames.Bool, True, (True, 0.3)),
+        ("beam:rasterLowPass", Sdf.ValueTypeNames.Float, 0.1, (False, 0.1)),
+    ],
+)
+def test_what_is_not_said_of_drawing_is_the_fallback(tmp_path, sequence, name, type_name, value, raster):
+    write_asset(sequence(1), tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    splats = stage.GetPrimAtPath("/Asset/Splats")
+    assert not splats.GetAttribute("beam:rasterLowPass").HasAuthoredValue()
+    assert stated_raster(read_asset(tmp_path / "a.usda").metadata) is None
+    splats.CreateAttribute(name, type_name).Set(value)
+    stage.GetRootLayer().Save()
+    assert stated_raster(read_asset(tmp_path / "a.usda").metadata) == raster
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"raster_antialiased": "True"}, r"raster_antialiased must be one of true, false, got 'True'"),
+        ({"raster_low_pass": "nan"}, r"raster_low_pass must be a number in \[1e-06, 1e\+06\], got 'nan'"),
+        ({"capture_frames": "0 1 2"}, r"capture_frames must be a number for each of 2 frames, got 3 in '0 1 2'"),
+        ({"capture_frames": "0 -1"}, r"capture_frames must be a number for each of 2 frames, got '0 -1'\. State"),
+    ],
+)
+def test_metadata_that_say_nothing_clear_are_refused(tmp_path, sequence, stated, message):
+    with pytest.raises(InvalidOptionError, match=message):
+        write_asset(sequence(2, metadata=stated), tmp_path / "a.usda")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_z_up_is_the_internal_world(tmp_path, cloud, sequence):

@@ -128,6 +128,15 @@ def lost_reference(asset):
     asset.root.GetReferences().AddReference("./nowhere.usdc")
 
 
+def no_low_pass(asset):
+    asset.splats.CreateAttribute("beam:rasterLowPass", Sdf.ValueTypeNames.Float).Set(0.0)
+
+
+def numbered(asset, frames):
+    name = "beam:sequence:captureFrames"
+    asset.root.CreateAttribute(name, Sdf.ValueTypeNames.IntArray).Set(Vt.IntArray(frames))
+
+
 BREAKERS = {
     "BEAM-STAGE-001": lambda asset: asset.stage.ClearDefaultPrim(),
     "BEAM-STAGE-002": lambda asset: asset.stage.ClearMetadata("metersPerUnit"),
@@ -162,6 +171,7 @@ BREAKERS = {
     "BEAM-MAT-017": lambda asset: asset.change("beam:observability", 2, 64),
     "BEAM-COLOR-001": clear_color_space,
     "BEAM-COLOR-002": lambda asset: asset.set("beam:radianceColorSpace", "acescg"),
+    "BEAM-RASTER-001": no_low_pass,
     "BEAM-TOKEN-001": lambda asset: asset.splats.RemoveProperty("beam:brdf"),
     "BEAM-TOKEN-002": lambda asset: asset.set("beam:brdf", "lambert"),
     "BEAM-VERSION-001": lambda asset: asset.set("beam:schemaVersion", "one"),
@@ -175,6 +185,7 @@ BREAKERS = {
     "BEAM-SEQ-006": lambda asset: asset.change("beam:ids", 2, 0),
     "BEAM-SEQ-007": other_ids,
     "BEAM-SEQ-008": flipped_quaternions,
+    "BEAM-SEQ-009": lambda asset: numbered(asset, [3, 4]),
     "BEAM-CLIP-001": cut_segment,
     "BEAM-CLIP-002": undeclared,
     "BEAM-CLIP-003": gap_in_clip,
@@ -201,6 +212,39 @@ def test_our_output_is_clean_for_us_and_for_every_validator_of_usd(tmp_path, seq
     report = validate_stage(Usd.Stage.Open(str(tmp_path / name)))
     assert report.findings == ()
     assert (report.frames, report.gaussians, report.is_valid) == (frames, 6, True)
+
+
+@pytest.mark.parametrize("low_pass", [-0.1, np.nan, np.inf])
+def test_a_low_pass_must_be_positive_and_finite(asset, low_pass):
+    no_low_pass(asset)
+    asset.set("beam:rasterLowPass", low_pass)
+    assert asset.rules() == ["BEAM-RASTER-001"]
+    asset.set("beam:rasterLowPass", 0.1)
+    assert asset.rules() == []
+
+
+def test_capture_frames_must_not_be_negative(asset):
+    numbered(asset, [3, -4, 5])
+    (finding,) = check_rules(asset.stage).findings
+    assert finding.rule == "BEAM-SEQ-009"
+    assert finding.message == "captureFrames must not be negative, got -4. Number the frames from 0."
+    numbered(asset, [3, 4, 5])
+    assert asset.rules() == []
+
+
+@pytest.mark.parametrize("precision", ["", "h"])
+def test_errors_of_the_roughness_must_not_be_negative(tmp_path, asset, sequence, precision):
+    write_asset(sequence(1), tmp_path / "float.usdc", full_float=not precision)
+    asset.stage = Usd.Stage.Open(str(tmp_path / "float.usdc"))
+    asset.splats = asset.stage.GetPrimAtPath("/Asset/Splats")
+    assert asset.rules() == []
+    asset.change(f"beam:roughnessError{precision}", 2, -0.25)
+    assert asset.rules() == ["BEAM-MAT-016"]
+
+
+def test_grazing_is_a_known_flag(asset):
+    asset.change("beam:observability", 2, 63)
+    assert asset.rules() == []
 
 
 def test_the_validators_of_usd_run_beside_ours(asset):

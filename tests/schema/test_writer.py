@@ -68,6 +68,7 @@ def test_one_precision_and_constants_once(tmp_path, sequence, open_splats):
         "beam:normalConfidenceh": 0,
         "beam:normalsh": 0,
         "beam:observability": 0,
+        "beam:roughnessErrorh": 0,
         "beam:roughnessh": 0,
         "extent": 3,
         "opacitiesh": 0,
