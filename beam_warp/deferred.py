@@ -100,6 +100,16 @@ class EnvironmentLighting:
         light.albedo_terms = wp.array(specular_albedo_table(), dtype=wp.vec2, device=target)
         return cls(environment, str(target), light)
 
+    def scaled(self, factor: float) -> EnvironmentLighting:
+        """Return the same light times a factor; cheaper than preparing it again."""
+        light = EnvironmentLight()
+        for name in EnvironmentLight.vars:
+            setattr(light, name, getattr(self.light, name))
+        for name in ("irradiance", "texels"):
+            array = getattr(self.light, name)
+            setattr(light, name, wp.array(array.numpy() * np.float32(factor), dtype=wp.vec3, device=self.device))
+        return EnvironmentLighting(self.environment.scaled(factor), self.device, light)
+
     def blurred_level(self, level: int) -> NDArray[np.float32]:
         """Return one level of blurred radiance as a lat-long image, ``(H, 2 H, 3)``, to look at or to test."""
         height = int(self.light.heights.numpy()[level])

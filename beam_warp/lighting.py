@@ -40,7 +40,7 @@ def ambient_occlusion(
     normals: Any,
     *,
     sample_count: int = 64,
-    offset: float | Literal["auto"] = "auto",
+    offset: float | Literal["auto"] | wp.array = "auto",
     options: TraceOptions = EXACT,
     seed: int = 0,
     frame: int = 0,
@@ -58,7 +58,8 @@ def ambient_occlusion(
         normals: Unit outward normals, like ``points``.
         sample_count: Rays per point; a power of two gives the full benefit of the sample set and a tighter error.
         offset: Distance [m] from point to ray origin along the normal, or ``"auto"``: onto the local surface and
-            off it by `LIFT_IN_THICKNESSES` times its thickness. The paper's absolute value is 0.02.
+            off it by `LIFT_IN_THICKNESSES` times its thickness; or a warp array of a distance for each point. The
+            paper's absolute value is 0.02.
         options: What counts as a hit, and whether transmittances multiply or are sampled.
         seed: Same seed, same device, same bits.
         frame: Number of the frame; frames have independent noise, the same frame always the same.

@@ -1,57 +1,59 @@
-"""From captured radiance and known light to base colour and ambient occlusion: measure each frame, then solve.
+"""What the light of a capture says of each Gaussian in one frame: how open it is, and evidence on its base colour.
 
-The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays;
-base colour is the weighted least-squares fit of the captured radiance over views, and over frames where Gaussians
-persist. Nothing is divided by a small number: what was hardly lit or never seen is flagged and filled from neighbours.
+The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
+What views show comes from their images (`beam_warp.view_evidence`), or, of Gaussians without images, from their own
+captured radiance around the normal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, Observability
-from beam_warp.checks import require_count
+from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
+from beam_warp.checks import require_choice, require_count
 from beam_warp.devices import upload
-from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.errors import InvalidArrayError
-from beam_warp.ggx import specular_albedo_table
 from beam_warp.images import srgb_to_linear
-from beam_warp.kernels.incident_light import launch_sum_unshadowed
+from beam_warp.incident_light import DENSITIES, Density, techniques
+from beam_warp.kernels.incident_light import PRODUCT, launch_draw_light, launch_sum_unshadowed
 from beam_warp.kernels.product_sampling import launch_accumulate_block_weights
 from beam_warp.kernels.residues import (
-    CapturedSurface,
+    ALBEDO_SCALING,
+    FRESNEL_HV,
     ColorFit,
     LightRays,
-    launch_draw_light,
+    Observations,
+    PointLight,
+    Surface,
     launch_fit_color,
+    launch_gather_light,
+    launch_sample_radiance,
     launch_trace_bounce,
+    launch_view_residues,
 )
-from beam_warp.kernels.sampling import SampleSet
 from beam_warp.kernels.surface_rays import RayBatch
 from beam_warp.lighting import Progress, ambient_occlusion
-from beam_warp.sampling import sample_set
+from beam_warp.material_light import MaterialLight
+from beam_warp.sampling import SAMPLERS, Sampler
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surface_rays import points_for_weights, ray_batches, room_for_rays
-from beam_warp.surfaces import SurfaceNormals
+from beam_warp.surfaces import SurfacePoints
 from beam_warp.tracing import EXACT, trace_rays
+from beam_warp.view_evidence import ViewEvidence
 
 BOUNCE_PART = 4
 """The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
 
 VIEW_COUNT = 8
 SMALLEST_VIEW_COSINE = 0.2
-"""Views below this n.v count for nothing: there the shading normal and the lobe's edge dominate the residue."""
-
-UNLIT_PART = 0.01
-"""A Gaussian is unlit below this part of the environment's mean unshadowed irradiance."""
+"""Where there are no images: views below this n.v count for nothing, there the normal and the lobe's edge dominate."""
 
 BURIED_VISIBILITY = 0.02
 """Below this visibility no view shows the Gaussian: its captured colour was never constrained."""
@@ -59,10 +61,9 @@ BURIED_VISIBILITY = 0.02
 SATURATION = 0.995
 """Captured display colour above which the sensor's or the training's ceiling may have cut it."""
 
-UNCERTAIN_NORMAL = 0.2
-"""Confidence below which a normal counts as uncertain: fog has a median of 0.1, closed surfaces are above 0.5."""
+DiffuseWeight = Literal["albedo_scaling", "fresnel_hv"]
 
-FILL_NEIGHBORS = 8
+DIFFUSE_WEIGHTS: dict[str, int] = {"albedo_scaling": int(ALBEDO_SCALING), "fresnel_hv": int(FRESNEL_HV)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,19 +72,36 @@ class MaterialOptions:
 
     Attributes:
         sample_count: Rays per Gaussian and frame for visibility, and as many for light; a power of two is best.
-        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.ambient_occlusion`.
+        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.surface_rays`.
         bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
+        diffuse_weight: What the specular lobe leaves for diffusion: ``"albedo_scaling"`` 1 - E_s(n.v), which keeps
+            energy, or ``"fresnel_hv"`` 1 - F(h.v), the paper's.
+        sampler: Sample sets; see `beam_warp.irradiance`.
+        density: What light rays are drawn by; see there.
+        ratio: Whether rays only say which share of the unshadowed light arrives; see there.
+        robust: Count views little that disagree with the others.
         seed: Same seed, same device, same bits.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
     """
 
     sample_count: int = 64
     offset: float | Literal["auto"] = "auto"
     bounce: bool = True
+    diffuse_weight: DiffuseWeight = "albedo_scaling"
+    sampler: Sampler = "owen"
+    density: Density = "product"
+    ratio: bool = True
+    robust: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        require_count("sample_count", self.sample_count, 2, 4096)
+        """Check every option once."""
+        require_count("sample_count", self.sample_count, 4, 4096)
+        require_choice("diffuse_weight", self.diffuse_weight, tuple(DIFFUSE_WEIGHTS))
+        require_choice("sampler", self.sampler, SAMPLERS)
+        require_choice("density", self.density, DENSITIES)
         require_count("seed", self.seed, 0, 2**32 - 1)
 
 
@@ -95,9 +113,13 @@ class ColorEvidence:
         numerator: Sum of w L_D (L_o - L_S), ``(N, 3)``.
         denominator: Sum of w L_D^2, ``(N, 3)``.
         observed: Sum of w (L_o - L_S)^2, ``(N, 3)``.
-        irradiance: Sum over frames of the environment's shadowed irradiance, ``(N, 3)``.
+        irradiance: Sum over frames of the irradiance that arrives from the environment, ``(N, 3)``.
         openness: Sum over frames of the hemispherical visibility, ``(N,)``.
-        noise: Sum over frames of the squared relative standard error of the irradiance, ``(N,)``.
+        noise: Sum over frames of the squared relative standard error of the arriving light, ``(N,)``.
+        views: How many equally good views the weights are worth, ``(N,)``.
+        facing: Sum over frames of the part of what was seen that was not seen grazing, ``(N,)``.
+        saturated: Sum over frames of the part of what was seen that was cut at a ceiling, ``(N,)``.
+        unseen: Sum over frames of 1 where no view shows the Gaussian, ``(N,)``.
         frames: Number of frames.
     """
 
@@ -107,6 +129,10 @@ class ColorEvidence:
     irradiance: NDArray[Any]
     openness: NDArray[Any]
     noise: NDArray[Any]
+    views: NDArray[Any]
+    facing: NDArray[Any]
+    saturated: NDArray[Any]
+    unseen: NDArray[Any]
     frames: int = 1
 
     ARRAYS: ClassVar[tuple[str, ...]] = (
@@ -116,6 +142,10 @@ class ColorEvidence:
         "irradiance",
         "openness",
         "noise",
+        "views",
+        "facing",
+        "saturated",
+        "unseen",
     )
 
     @classmethod
@@ -140,6 +170,31 @@ class MaterialMeasurement:
     evidence: ColorEvidence
 
 
+@dataclass(frozen=True, eq=False)
+class LitBatch:
+    """Some points, the rays that were traced from them, and their rows among those that are measured."""
+
+    batch: RayBatch
+    rays: LightRays
+
+
+@dataclass(frozen=True, eq=False)
+class LitPoints:
+    """Points whose light is known; all arrays are on the device and by row.
+
+    Attributes:
+        light: The light at each point; filled batch by batch while `batches` are gone through.
+        surface: Their normals and roughness.
+        views: What views show of them.
+        rows: Which Gaussians they are, ``(M,)``.
+    """
+
+    light: PointLight
+    surface: Surface
+    views: Observations
+    rows: NDArray[np.int64]
+
+
 def view_set() -> NDArray[np.float32]:
     """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
     index = np.arange(VIEW_COUNT) + 0.5
@@ -152,11 +207,12 @@ def view_set() -> NDArray[np.float32]:
 def measure_materials(
     cloud: GaussianCloud,
     scene: Scene,
-    surface: SurfaceNormals,
+    points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: SampledEnvironment,
+    light: MaterialLight,
     *,
     options: MaterialOptions,
+    views: ViewEvidence | None = None,
     frame: int = 0,
     rows: NDArray[np.integer[Any]] | None = None,
     progress: Progress | None = None,
@@ -166,10 +222,11 @@ def measure_materials(
     Args:
         cloud: Gaussians with captured radiance, axes "rfu".
         scene: The same Gaussians, uploaded.
-        surface: Their normals.
+        points: Where their light is gathered.
         roughness: Their perceptual roughness, ``(N,)``.
         light: The light of the capture, prepared on the scene's device.
         options: Rays, offset, bounce, seed.
+        views: What views with images show; None takes the captured radiance around each normal.
         frame: Number of the frame. Light rays differ from frame to frame, so that fits over frames average their
             noise; occlusion rays do not, so that ambient occlusion does not flicker.
         rows: Gaussians to measure; all of them if None.
@@ -180,183 +237,210 @@ def measure_materials(
 
     Source: BEAM Eqs. 3 to 6; the ratio estimator, Heitz et al. 2018.
     """
+    _require_radiance(cloud)
+    device = scene.device
+    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
+    count = len(chosen)
+    shown = chosen[points.seen[chosen]]
+    at = upload(shown.astype(np.int32), int, device)
+    occlusion = ambient_occlusion(
+        scene,
+        points.positions[at].contiguous(),
+        points.normals[at].contiguous(),
+        sample_count=options.sample_count,
+        offset=points.offsets[at].contiguous(),
+        sampler=options.sampler,
+        seed=options.seed,
+        # Occlusion and light are about as much work, so each is half of the way.
+        progress=None if progress is None else lambda done, _: progress(done // 2, count),
+    )
+    visibility = occlusion.visibility.numpy()
+    # What is buried is filled from neighbours anyway: its light is not traced.
+    lit = shown[visibility > BURIED_VISIBILITY]
+
+    def report(done: int, total: int) -> None:
+        if progress is not None:
+            progress(count - (total - done) // 2, count)
+
+    measured = lit_points(cloud, scene, points, roughness, light, lit, views)
+    for _ in light_batches(cloud, scene, points, light, measured, options, views, frame, report):
+        pass
+    fit = _empty(ColorFit, len(lit), device)
+    launch_fit_color(measured.views, measured.light, measured.surface, options.robust, fit, device)
+
+    def by_row(values: NDArray[Any], at_rows: NDArray[np.integer[Any]], otherwise: float = 0.0) -> NDArray[np.float32]:
+        """Spread what was measured over all rows that were asked for."""
+        whole = np.full((len(cloud), *values.shape[1:]), otherwise, np.float32)
+        whole[at_rows] = values
+        return whole[chosen]
+
+    tilt = measured.light.tilt.numpy() * points.normal_error[lit]
+    evidence = ColorEvidence(
+        numerator=by_row(fit.numerator.numpy(), lit),
+        denominator=by_row(fit.denominator.numpy(), lit),
+        observed=by_row(fit.observed.numpy(), lit),
+        irradiance=by_row(np.pi * measured.light.arriving.numpy(), lit),
+        openness=by_row(visibility, shown),
+        noise=by_row(measured.light.noise.numpy() ** 2 + tilt**2, lit),
+        views=by_row(fit.views.numpy(), lit),
+        facing=by_row(fit.facing.numpy(), lit),
+        saturated=(_cut_radiance(cloud) if views is None else views.saturated)[chosen],
+        unseen=by_row(np.zeros(len(lit)), lit, 1.0),
+    )
+    return MaterialMeasurement(
+        by_row(visibility, shown, 1.0), by_row(occlusion.standard_error.numpy(), shown, 1.0), evidence
+    )
+
+
+def lit_points(
+    cloud: GaussianCloud,
+    scene: Scene,
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: MaterialLight,
+    rows: NDArray[np.integer[Any]],
+    views: ViewEvidence | None,
+) -> LitPoints:
+    """Make room for the light of some Gaussians, and collect what views show of them.
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+    """
+    _require_radiance(cloud)
+    device, count = scene.device, len(rows)
+    at = upload(np.asarray(rows, np.int32), int, device)
+    surface = Surface()
+    surface.normals = points.normals[at].contiguous()
+    surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
+    observed = Observations()
+    if views is None:
+        around = upload(view_set(), wp.vec3, device)
+        observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
+        observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
+        launch_sample_radiance(
+            upload(cloud.radiance, wp.vec3, device),
+            at,
+            int(cloud.radiance_color_space == DISPLAY_SRGB),
+            surface.normals,
+            around,
+            observed.colors,
+            observed.directions,
+            device,
+        )
+    else:
+        observed.colors = views.colors[:, at].contiguous()
+        observed.directions = views.directions[:, at].contiguous()
+    observed.specular = wp.zeros(observed.directions.shape, dtype=wp.vec3, device=device)
+    observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
+    arriving = _empty(PointLight, count, device)
+    launch_sum_unshadowed(light.sampled.moments, surface.normals, arriving.unshadowed, device)
+    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64))
+
+
+def light_batches(
+    cloud: GaussianCloud,
+    scene: Scene,
+    points: SurfacePoints,
+    light: MaterialLight,
+    measured: LitPoints,
+    options: MaterialOptions,
+    views: ViewEvidence | None,
+    frame: int,
+    progress: Progress,
+) -> Iterator[LitBatch]:
+    """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
+
+    A batch's rays are gone when the next one is asked for.
+    """
+    device = scene.device
+    if not len(measured.rows):
+        return
+    at = upload(measured.rows.astype(np.int32), int, device)
+    hit_radiance = upload(_hit_radiance(cloud, views), wp.vec3, device)
+    parts = techniques(options.density, options.sampler, options.sample_count)
+    is_product = parts[0].density == int(PRODUCT)
+    stream = (options.seed, frame)
+    done = 0
+    for batch in ray_batches(
+        scene,
+        points.positions[at].contiguous(),
+        measured.surface.normals,
+        points.offsets[at].contiguous(),
+        options.sample_count,
+        points_at_once=points_for_weights(device) if is_product else None,
+    ):
+        cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
+        if is_product:
+            launch_accumulate_block_weights(light.sampled.blocks, batch.normals, cumulative, device)
+        rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
+        found = LightRays()
+        found.directions = rays.directions
+        found.weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
+        found.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
+        found.paired = int(all(part.samples.columns > 0 for part in parts))
+        for part in parts:
+            launch_draw_light(part, light.sampled, cumulative, batch, stream, rays, found.weights, device)
+        trace_rays(scene, EXACT, rays, found.visibility)
+        if options.bounce:
+            launch_trace_bounce(
+                scene,
+                EXACT.settings(scene),
+                batch,
+                hit_radiance,
+                stream,
+                max(options.sample_count // BOUNCE_PART, 2),
+                measured.light.bounce,
+            )
+        launch_gather_light(batch, found, options.ratio, measured.light, device)
+        launch_view_residues(
+            batch,
+            found,
+            measured.light,
+            light.blurred.light,
+            measured.surface,
+            DIFFUSE_WEIGHTS[options.diffuse_weight],
+            measured.views,
+            device,
+        )
+        yield LitBatch(batch, found)
+        done += len(batch.rows)
+        progress(done, len(measured.rows))
+
+
+def _require_radiance(cloud: GaussianCloud) -> None:
     if cloud.radiance is None:
         raise InvalidArrayError(
             "radiance must be given to decompose materials, got None. Import Gaussians with captured colour."
         )
-    device = scene.device
-    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
-    count = len(chosen)
-    occlusion = ambient_occlusion(
-        scene,
-        cloud.positions[chosen],
-        surface.normals[chosen],
-        sample_count=options.sample_count,
-        offset=options.offset,
-        seed=options.seed,
-        # Occlusion and light are about as much work, so each is half of the way.
-        progress=None if progress is None else lambda done, total: progress(done // 2, total),
-    )
-    table = upload(specular_albedo_table(), wp.vec2, device)
-    views = upload(view_set(), wp.vec3, device)
-    is_display = cloud.radiance_color_space == DISPLAY_SRGB
-    # Hits are taken as diffuse: the band of degree 0 is their mean colour over views.
-    mean_color = 0.5 + SH_C0 * cloud.radiance[:, 0]
-    if is_display:
-        mean_color = srgb_to_linear(np.clip(mean_color, 0.0, 1.0))
-    hit_radiance = upload(np.maximum(mean_color, 0.0).astype(np.float32), wp.vec3, device)
-    samples = sample_set("owen", options.sample_count)
-    stream = (options.seed, frame)
-    # What is buried is filled from neighbours anyway: its light is not traced.
-    seen = np.flatnonzero(occlusion.visibility > BURIED_VISIBILITY)
-    points = upload(cloud.positions[chosen[seen]], wp.vec3, device)
-    normals = upload(surface.normals[chosen[seen]], wp.vec3, device)
-    captured = CapturedSurface()
-    captured.radiance = upload(cloud.radiance, wp.vec3, device)
-    captured.gaussians = upload(chosen[seen].astype(np.int32), int, device)
-    captured.display_srgb = int(is_display)
-    captured.roughness = upload(roughness[chosen[seen]].astype(np.float32), float, device)
-    unshadowed, bounce, irradiance = (wp.zeros(len(seen), dtype=wp.vec3, device=device) for _ in range(3))
-    launch_sum_unshadowed(light.moments, normals, unshadowed, device)
-    fit = ColorFit()
-    for name in ("numerator", "denominator", "observed"):
-        setattr(fit, name, wp.empty(len(seen), dtype=wp.vec3, device=device))
-    fit.relative_error = wp.empty(len(seen), dtype=float, device=device)
-    done = count - len(seen)
-    for batch in ray_batches(
-        scene,
-        points,
-        normals,
-        options.offset,
-        samples.count,
-        points_at_once=points_for_weights(device),
-    ):
-        light_rays = _trace_light(scene, light, batch, samples, stream)
-        if options.bounce:
-            bounce_samples = max(samples.count // BOUNCE_PART, 2)
-            launch_trace_bounce(scene, EXACT.settings(scene), batch, hit_radiance, stream, bounce_samples, bounce)
-        launch_fit_color(batch, light_rays, unshadowed, bounce, table, views, captured, irradiance, fit, device)
-        done += len(batch.rows)
-        if progress is not None:
-            progress(count - (count - done) // 2, count)
-
-    def by_row(array: wp.array) -> NDArray[np.float32]:
-        """Zeros for what is buried."""
-        result = np.zeros((count, *array.numpy().shape[1:]), np.float32)
-        result[seen] = array.numpy()
-        return result
-
-    evidence = ColorEvidence(
-        numerator=by_row(fit.numerator),
-        denominator=by_row(fit.denominator),
-        observed=by_row(fit.observed),
-        irradiance=by_row(irradiance),
-        openness=occlusion.visibility,
-        noise=by_row(fit.relative_error) ** 2,
-    )
-    return MaterialMeasurement(occlusion.visibility, occlusion.standard_error, evidence)
 
 
-def _trace_light(
-    scene: Scene, light: SampledEnvironment, batch: RayBatch, samples: SampleSet, stream: tuple[int, int]
-) -> LightRays:
-    """Draw a batch's rays towards the environment and trace them."""
-    device = scene.device
-    cumulative = wp.empty((len(batch.rows), 512), dtype=float, device=device)
-    launch_accumulate_block_weights(light.blocks, batch.normals, cumulative, device)
-    rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
-    result = LightRays()
-    result.directions = rays.directions
-    result.radiance_over_pdf = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
-    result.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
-    launch_draw_light(light.blocks, cumulative, batch, samples, stream, rays, result.radiance_over_pdf, device)
-    trace_rays(scene, EXACT, rays, result.visibility)
-    return result
+def _hit_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
+    """Return what a ray that hits a Gaussian sees: hits are taken as diffuse, so its mean colour.
 
-
-@dataclass(frozen=True, eq=False)
-class BaseColor:
-    """Solved base colour.
-
-    Attributes:
-        base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
-        standard_error: ``(N, 3)`` float32.
-        observability: `Observability` flags, ``(N,)`` uint8.
-        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
-    """
-
-    base_color: NDArray[np.float32]
-    standard_error: NDArray[np.float32]
-    observability: NDArray[np.uint8]
-    clipped_part: float
-
-
-def solve_base_color(
-    cloud: GaussianCloud,
-    evidence: ColorEvidence,
-    mean_irradiance: float,
-) -> BaseColor:
-    """Solve the least-squares problem that the frames add up to.
-
-    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
-    badly one rho explains all views and frames, and the noise of the irradiance, averaged over frames.
-
-    Args:
-        cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
-        evidence: Of one frame, or the sum over frames of the same Gaussians.
-        mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
-
-    Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
+    Over the views that show it; the band of degree 0 is the mean over all directions, seen or not.
     """
     assert cloud.radiance is not None
-    assert cloud.normal_confidence is not None
-    numerator, denominator, observed = (
-        np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
-    )
-    irradiance = evidence.irradiance.mean(axis=1) / evidence.frames
-    openness = evidence.openness / evidence.frames
-
-    flags = np.zeros(len(cloud), np.uint8)
-    flags[~(irradiance > UNLIT_PART * mean_irradiance) | ~(denominator > 0.0).all(axis=1)] |= np.uint8(
-        Observability.UNLIT
-    )
-    flags[~(openness > BURIED_VISIBILITY)] |= np.uint8(Observability.UNSEEN)
-    flags[(0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)] |= np.uint8(Observability.SATURATED)
-    flags[~(cloud.normal_confidence > UNCERTAIN_NORMAL)] |= np.uint8(Observability.UNCERTAIN_NORMAL)
-    missing = (flags & np.uint8(Observability.UNLIT | Observability.UNSEEN)) != 0
-
-    safe = np.where(denominator > 0.0, denominator, 1.0)
-    raw = np.where(denominator > 0.0, numerator / safe, 0.0)
-    base_color = np.clip(raw, 0.0, 1.0)
-    residual = np.maximum(observed - 2.0 * base_color * numerator + base_color**2 * denominator, 0.0)
-    degrees = max(VIEW_COUNT * evidence.frames - 1, 1)
-    noise = np.sqrt(evidence.noise) / evidence.frames
-    error = np.sqrt(residual / safe / degrees + (base_color * noise[:, None]) ** 2)
-    weight = np.where(missing, 0.0, cloud.opacities)
-    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
-    base_color, error = _fill_from_neighbors(cloud.positions, base_color, error, missing)
-    flags[missing] |= np.uint8(Observability.FILLED)
-    return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
+    mean = 0.5 + SH_C0 * cloud.radiance[:, 0]
+    if cloud.radiance_color_space == DISPLAY_SRGB:
+        mean = srgb_to_linear(np.clip(mean, 0.0, 1.0))
+    if views is not None and views.colors.shape[0]:
+        colors = views.colors.numpy()
+        weight = colors[..., 3].sum(axis=0)
+        shown = np.einsum("vn,vnc->nc", colors[..., 3], colors[..., :3])
+        mean = np.where((weight > 0.0)[:, None], shown / np.maximum(weight, 1e-12)[:, None], mean)
+    return np.maximum(mean, 0.0).astype(np.float32)
 
 
-def _fill_from_neighbors(
-    positions: NDArray[np.float32],
-    values: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    missing: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give what was not observed the mean of its nearest observed neighbours; its error is their spread."""
-    known = np.flatnonzero(~missing)
-    if not missing.any() or len(known) == 0:
-        return values, errors
-    k = min(FILL_NEIGHBORS, len(known))
-    distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    weight = 1.0 / np.maximum(distance, 1e-9)
-    weight /= weight.sum(axis=1, keepdims=True)
-    near = values[known[index]]
-    mean = np.einsum("nk,nkc->nc", weight, near)
-    filled, spread = values.copy(), errors.copy()
-    filled[missing] = mean
-    spread[missing] = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2)) + errors[known].mean(axis=0)
-    return filled, spread
+def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return 1 where the captured colour itself is at the top of its range."""
+    assert cloud.radiance is not None
+    cut = (0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)
+    return cut.astype(np.float32)
+
+
+def _empty(structure: Any, count: int, device: Any) -> Any:
+    """Return an instance of a structure of arrays, all zeros."""
+    result = structure()
+    for name, variable in structure.vars.items():
+        setattr(result, name, wp.zeros(count, dtype=variable.type.dtype, device=device))
+    return result

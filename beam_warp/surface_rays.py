@@ -53,7 +53,7 @@ def ray_batches(
     scene: Scene,
     points: wp.array,
     normals: wp.array,
-    offset: float | Literal["auto"],
+    offset: float | Literal["auto"] | wp.array,
     sample_count: int,
     *,
     points_at_once: int | None = None,
@@ -67,7 +67,7 @@ def ray_batches(
         scene: What the rays will be traced through.
         points: World-space points [m], ``(N,)`` vec3 on the scene's device.
         normals: Unit normals, like ``points``.
-        offset: As for `ray_offsets`.
+        offset: As for `ray_offsets`, or an offset for each point.
         sample_count: Rays a point.
         points_at_once: At most so many points a batch.
     """
@@ -76,7 +76,10 @@ def ray_batches(
         return []
     rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
-    offsets = ray_offsets(scene, positions, directions, offset)
+    if isinstance(offset, wp.array):
+        offsets = offset[rows].contiguous()
+    else:
+        offsets = ray_offsets(scene, positions, directions, offset)
     rays_at_once = RAYS_AT_ONCE_ON_CUDA if device.is_cuda else RAYS_AT_ONCE
     step = min(max(1, rays_at_once // sample_count), points_at_once or count)
     batches = []

@@ -163,9 +163,7 @@ def launch_write_pixels(view, drawn, captured, origin, out_pixels, device):
 
 def launch_add_rows(rows, view_count, columns, out_sums, device):
     """Add the first columns of some views' rows to the Gaussians' sums."""
-    launch(
-        add_rows_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device
-    )
+    launch(add_rows_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device)
 
 
 def launch_observe(rows, positions, radiance, display_srgb, views, first_view, out_colors, out_directions, device):
@@ -179,9 +177,7 @@ def launch_observe(rows, positions, radiance, display_srgb, views, first_view, o
     )
 
 
-def launch_finish_surface(
-    sums, positions, origin, least_weight, out_positions, out_normals, out_agreement, device
-):
+def launch_finish_surface(sums, positions, origin, least_weight, out_positions, out_normals, out_agreement, device):
     """Turn sums into a surface."""
     launch(
         finish_surface_kernel,

@@ -1,0 +1,142 @@
+"""From evidence to base colour: solve the least-squares problem, say how sure it is, flag and fill what it leaves out.
+
+Nothing is divided by a small number: what was hardly lit or never seen is flagged and filled from neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from beam_warp.assets import GaussianCloud, Observability
+from beam_warp.materials import BURIED_VISIBILITY, ColorEvidence
+
+UNLIT_PART = 0.01
+"""A Gaussian is unlit below this part of the environment's mean unshadowed irradiance."""
+
+SATURATED_PART = 0.5
+"""Part of what was seen that was cut at a ceiling from which on a Gaussian counts as saturated."""
+
+FACING_PART = 0.02
+"""Part of what was seen that must not have been seen grazing."""
+
+UNCERTAIN_NORMAL = 0.2
+"""Confidence below which a normal counts as uncertain: fog has a median of 0.1, closed surfaces are above 0.5."""
+
+FILL_NEIGHBORS = 8
+
+MISSING = Observability.UNLIT | Observability.UNSEEN
+"""What base colour cannot be measured of."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseColor:
+    """Solved base colour.
+
+    Attributes:
+        base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
+        standard_error: ``(N, 3)`` float32.
+        observability: `Observability` flags, ``(N,)`` uint8.
+        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
+    """
+
+    base_color: NDArray[np.float32]
+    standard_error: NDArray[np.float32]
+    observability: NDArray[np.uint8]
+    clipped_part: float
+
+
+def solve_base_color(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float) -> BaseColor:
+    """Solve the least-squares problem that the frames add up to.
+
+    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
+    badly one rho explains all views and frames, and the error of the light: its noise and that of the normal it
+    falls on, averaged over frames.
+
+    Args:
+        cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
+        evidence: Of one frame, or the sum over frames of the same Gaussians.
+        mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
+
+    Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
+    """
+    flags = observability(cloud, evidence, mean_irradiance)
+    missing = (flags & np.uint8(MISSING)) != 0
+    raw, error = least_squares(evidence)
+    base_color = np.clip(raw, 0.0, 1.0)
+    weight = np.where(missing, 0.0, cloud.opacities)
+    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
+    base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)
+    flags[missing] |= np.uint8(Observability.FILLED)
+    return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
+
+
+def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the unbounded solution and its standard error, ``(N, 3)`` each; 0 where there is no evidence."""
+    numerator, denominator, observed = (
+        np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
+    )
+    safe = np.where(denominator > 0.0, denominator, 1.0)
+    raw = np.where(denominator > 0.0, numerator / safe, 0.0)
+    bounded = np.clip(raw, 0.0, 1.0)
+    residual = np.maximum(observed - 2.0 * bounded * numerator + bounded**2 * denominator, 0.0)
+    degrees = np.maximum(np.asarray(evidence.views, np.float64) - 1.0, 1.0)[:, None]
+    noise = np.sqrt(np.asarray(evidence.noise, np.float64))[:, None] / evidence.frames
+    return raw, np.sqrt(residual / safe / degrees + (bounded * noise) ** 2)
+
+
+def observability(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float) -> NDArray[np.uint8]:
+    """Return why Gaussians are less than measured: `Observability` flags, ``(N,)``."""
+    assert cloud.normal_confidence is not None
+    frames = evidence.frames
+    irradiance = np.asarray(evidence.irradiance).mean(axis=1) / frames
+    openness = np.asarray(evidence.openness) / frames
+    unseen = ~(openness > BURIED_VISIBILITY) | ~(np.asarray(evidence.unseen) < frames)
+    grazing = ~unseen & ~(np.asarray(evidence.facing) / frames > FACING_PART)
+    flags = np.zeros(len(irradiance), np.uint8)
+    for mask, flag in (
+        (
+            ~(irradiance > UNLIT_PART * mean_irradiance) | ~(np.asarray(evidence.denominator) > 0.0).all(axis=1),
+            Observability.UNLIT,
+        ),
+        (unseen, Observability.UNSEEN),
+        (np.asarray(evidence.saturated) / frames > SATURATED_PART, Observability.SATURATED),
+        (~(cloud.normal_confidence > UNCERTAIN_NORMAL), Observability.UNCERTAIN_NORMAL),
+        (grazing, Observability.GRAZING),
+    ):
+        flags[mask] |= np.uint8(flag)
+    return flags
+
+
+def fill_from_neighbors(
+    positions: NDArray[np.float32],
+    values: NDArray[Any],
+    errors: NDArray[Any],
+    missing: NDArray[np.bool_],
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Give what was not observed the mean of its nearest observed neighbours; its error is their spread.
+
+    Args:
+        positions: Centres [m], ``(N, 3)``.
+        values: ``(N, C)``.
+        errors: ``(N, C)``.
+        missing: Which rows are to be filled, ``(N,)``.
+    """
+    known = np.flatnonzero(~missing)
+    if not missing.any() or len(known) == 0:
+        return values, errors
+    k = min(FILL_NEIGHBORS, len(known))
+    distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    weight = 1.0 / np.maximum(distance, 1e-9)
+    weight /= weight.sum(axis=1, keepdims=True)
+    near = values[known[index]]
+    mean = np.einsum("nk,nkc->nc", weight, near)
+    filled, spread = values.copy(), errors.copy()
+    filled[missing] = mean
+    spread[missing] = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2)) + errors[known].mean(axis=0)
+    return filled, spread
