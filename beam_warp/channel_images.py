@@ -43,7 +43,7 @@ VIRIDIS = (
 )
 """Matplotlib's viridis at every sixteenth, sRGB: equal steps look equal, in grey and to the colour-blind too."""
 
-MOST_GAUSSIANS = 0.98
+MOST_GAUSSIANS = 0.95
 """A range without an upper end of its own ends where that of this part of the Gaussians does, rounded up."""
 
 TEXT_COLOR = (225, 225, 225)
@@ -171,11 +171,11 @@ def channel_range(cloud: GaussianCloud, name: str) -> tuple[float, float]:
 
 
 def _rounded_up(value: float) -> float:
-    """Return the next of 1, 2 and 5 times a power of ten; 1 for 0."""
+    """Return the next of 1, 2 and 5 times a power of ten, which rounding to half precision does not pass; 1 for 0."""
     if not value > 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1.0 + 1e-9)))
+    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1.0 + 2.0**-11)))
 
 
 def _rgb(color: str) -> NDArray[np.float64]:

@@ -214,8 +214,8 @@ def _require_channel(args: Render) -> None:
     superfluous = [name for name, default in lit.items() if getattr(args, name) != default]
     if superfluous:
         raise InvalidOptionError(
-            f"{superfluous[0]} must be left out with --channel, got {getattr(args, superfluous[0])}: a channel is drawn "
-            "on grey, and without light. Leave it out."
+            f"{superfluous[0]} must be left out with --channel, got {getattr(args, superfluous[0])}: a channel is "
+            "drawn on grey, and without light. Leave it out."
         )
     if args.range is not None and not args.range[0] < args.range[1]:
         raise InvalidOptionError(f"range must be two numbers, the lower one first, got {args.range}. Swap them.")
