@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from beam_warp import converters
+from beam_warp.asset_metadata import numbers_of_frames
 from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.axes import change_axes
 from beam_warp.cameras import MAX_SIDE, Camera, bulk
@@ -124,7 +125,7 @@ def render(args: Render) -> int:
     options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     if capture is not None:
-        views = _capture_views(args, capture, len(sequence), notes)
+        views = _capture_views(args, capture, numbers_of_frames(sequence.metadata, len(sequence)), notes)
     else:
         views = _numbered_views(args, sequence)
 
@@ -227,25 +228,26 @@ def _require_frame(args: Render, frame_count: int) -> None:
         require_count("frame", args.frame, 0, frame_count - 1)
 
 
-def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list[str]) -> list[View]:
+def _capture_views(args: Render, capture: Capture, numbers: tuple[int, ...], notes: list[str]) -> list[View]:
     """Plan one image for each record of the split whose frame the asset has; say what is left out."""
-    records = capture.select(split=args.split, frames=None if args.frame is None else (args.frame,))
+    records = capture.select(split=args.split, frames=None if args.frame is None else (numbers[args.frame],))
     if not records:
-        frame = "" if args.frame is None else f" of frame {args.frame}"
+        frame = "" if args.frame is None else f" of frame {numbers[args.frame]}"
         raise InvalidOptionError(
             f"split must name records of the capture{frame}, got {args.split!r} "
             f"(it has {', '.join(capture.splits)}). Choose one of them."
         )
-    within = [record for record in records if record.frame < frame_count]
+    place = {number: frame for frame, number in enumerate(numbers)}
+    within = [record for record in records if record.frame in place]
     if len(within) < len(records):
-        beyond = sorted({record.frame for record in records if record.frame >= frame_count})
+        beyond = sorted({record.frame for record in records} - place.keys())
         notes.append(
             f"{len(records) - len(within)} records are of frames that the asset lacks "
             f"({', '.join(map(str, beyond[:5]))}{', …' if len(beyond) > 5 else ''}): not drawn"
         )
     if not within:
         raise InvalidOptionError(
-            f"asset must have a frame that the records of split {args.split!r} show, got {frame_count} frames in "
+            f"asset must have a frame that the records of split {args.split!r} show, got {len(numbers)} frames in "
             f"{args.asset}. Choose another split."
         )
     bent = sum(record.is_distorted for record in within)
@@ -258,7 +260,7 @@ def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list
             f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
         ) from error
     suffix = "exr" if args.channel is None else "png"
-    return [View(record.frame, record.camera, args.out / f"{record.name}.{suffix}") for record in within]
+    return [View(place[record.frame], record.camera, args.out / f"{record.name}.{suffix}") for record in within]
 
 
 def _numbered_views(args: Render, sequence: GaussianSequence) -> list[View]:

@@ -359,6 +359,32 @@ def test_capture_gives_a_file_for_each_record(ball, white_light, tmp_path, capsy
     assert set(read_image(out / "a_0000.exr").channels) == set("RGBA")
 
 
+def test_records_are_those_that_the_asset_says_it_shows(white_light, tmp_path, capsys):
+    """An asset of the frames 3 and 7 of a capture: its frame 1 is the capture's frame 7."""
+    clouds = [sphere((x, 0.0, 0.0)) for x in (-0.4, 0.4)]
+    sequence = GaussianSequence.from_clouds(clouds, metadata={"capture_frames": "3 7"})
+    converters.write(sequence, tmp_path / "a.usda")
+    write_capture(tmp_path / "capture", [("b", frame, "test") for frame in (0, 1, 3, 7)])
+    common = [tmp_path / "a.usda", "--channel", "base_color", "--capture", tmp_path / "capture", "--out"]
+    assert run(*common, tmp_path / "x") == 0
+    assert "2 records are of frames that the asset lacks (0, 1): not drawn" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "x").iterdir()) == ["b_0003.png", "b_0007.png"]
+    assert run(*common, tmp_path / "y", "--frame", 1, "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["frames"] == [1]
+    assert said["outputs"] == [str(tmp_path / "y" / "b_0007.png")]
+    first, second, same = (
+        read_image(tmp_path / name).rgb() for name in ("x/b_0003.png", "x/b_0007.png", "y/b_0007.png")
+    )
+    np.testing.assert_array_equal(second, same)
+    camera = Capture.read(tmp_path / "capture").records[0].camera
+    for image, cloud in ((first, clouds[0]), (second, clouds[1])):
+        alpha = rasterize(cloud, camera, channels=(), device="cpu").alpha
+        there = image[..., 0] > 0.4  # red of the ball, not the grey behind
+        assert (there[alpha > 0.9]).all()
+        assert not there[alpha < 0.1].any()
+
+
 def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_light, tmp_path, capsys):
     write_capture(tmp_path / "bent", [("b", 0, "test")], k1=0.1)
     pinhole = Capture.read(tmp_path / "bent").records[0].camera
