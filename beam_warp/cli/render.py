@@ -50,9 +50,9 @@ class Render:
     colour map whose range is printed, observability as the gravest flag of what each pixel sees, counted in the legend;
     an .exr holds the values. With --capture these are .png.
 
-    Examples: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
+    Example: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
 
-    beam render person.usdz --channel base_color_error --out error.png
+    Example: beam render person.usdz --channel base_color_error --out error.png
     """
 
     asset: Annotated[Positional[Path], arg(metavar="ASSET", help="PLY or USD file, or a folder of numbered PLY files.")]
