@@ -85,3 +85,13 @@ def stated_capture_frames(metadata: Mapping[str, str], frame_count: int) -> tupl
             "numbers in the order of the sequence, or leave them out."
         )
     return tuple(int(word) for word in words)
+
+
+def numbers_of_frames(metadata: Mapping[str, str], frame_count: int) -> tuple[int, ...]:
+    """Return by which number a capture knows every frame of a sequence: as stated, else counted from 0.
+
+    Raises:
+        InvalidOptionError: As `stated_capture_frames`.
+    """
+    stated = stated_capture_frames(metadata, frame_count)
+    return tuple(range(frame_count)) if stated is None else stated

@@ -36,6 +36,9 @@ CHANNELS = (
 )
 """Every channel that `rasterize` knows; a cloud may lack some."""
 
+ERROR_CHANNELS = tuple(name for name in CHANNELS if name.endswith("_error"))
+"""The channels of standard errors: their mean over what a pixel sees, as if all of it were wrong the same way."""
+
 UNIT_CHANNELS = ("normals", SURFACE_NORMALS)
 """Channels of directions: their mean is brought to unit length."""
 
@@ -75,21 +78,26 @@ class GBuffer:
     def layers(self) -> dict[str, NDArray[np.float32]]:
         """Return alpha, depth and the material channels as the layers of an image file, ``(H, W)`` each.
 
-        Names: ``A``, ``depth``, ``roughness``, ``ambient_occlusion``, ``base_color.R`` …, ``normal.X`` …; values as
-        they are here, not multiplied by alpha.
+        Names: ``A``, ``depth``, ``roughness``, ``ambient_occlusion``, ``base_color.R`` …, ``normal.X`` …, and what else
+        was drawn by its own name: ``roughness_error``, ``base_color_error.R`` …; values as they are here, not
+        multiplied by alpha.
         """
         layers = {"A": self.alpha, "depth": self.depth}
         for name, array in self.channels.items():
-            prefix, parts = _LAYER_PARTS.get(name, (name, "RGB"))
-            if array.ndim == 2:
-                layers[prefix] = array
-            else:
-                layers.update({f"{prefix}.{part}": array[..., i] for i, part in enumerate(parts)})
+            layers.update(channel_layers(name, array))
         return layers
 
 
-_LAYER_PARTS = {"normals": ("normal", "XYZ")}
+_LAYER_PARTS = {"normals": ("normal", "XYZ"), SURFACE_NORMALS: ("surface_normal", "XYZ")}
 """Channels whose layers are named otherwise than NAME.R, NAME.G and NAME.B."""
+
+
+def channel_layers(name: str, array: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    """Return an image of a channel, ``(H, W)`` or ``(H, W, 3)``, as the layers of an image file."""
+    prefix, parts = _LAYER_PARTS.get(name, (name, "RGB"))
+    if array.ndim == 2:
+        return {prefix: array}
+    return {f"{prefix}.{part}": array[..., i] for i, part in enumerate(parts)}
 
 
 class ValueImages(NamedTuple):

@@ -5,6 +5,7 @@ import pytest
 from beam_warp.asset_metadata import (
     UNSTATED_RASTER,
     capture_frames_metadata,
+    numbers_of_frames,
     stated_capture_frames,
     stated_raster,
 )
@@ -59,6 +60,8 @@ def test_frames_survive(frames):
 
 def test_frames_may_be_unstated():
     assert stated_capture_frames({}, 3) is None
+    assert numbers_of_frames({}, 3) == (0, 1, 2)
+    assert numbers_of_frames({"capture_frames": "4 7 9"}, 3) == (4, 7, 9)
 
 
 @pytest.mark.parametrize("text", ["", "0", "0 1 2", "0 x", "0 -1", "0 1.0", "0 ²"])

@@ -105,6 +105,7 @@ RANKS = {
     "beam_warp.materials": 11,
     "beam_warp.evaluation": 9,
     "beam_warp.contact_sheet": 10,
+    "beam_warp.channel_images": 11,
     "beam_warp.demo_shape": 3,
     "beam_warp.demo_paint": 4,
     "beam_warp.demo_figure": 5,

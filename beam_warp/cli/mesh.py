@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp._version import __version__
+from beam_warp.asset_metadata import numbers_of_frames
 from beam_warp.assets import WORLD_AXES, GaussianCloud
 from beam_warp.axes import change_axes
 from beam_warp.cameras import Camera
@@ -98,7 +99,8 @@ def mesh(args: Mesh) -> int:
     frames = _frames(args, len(sequence))
     options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
-    cameras_of = {frame: _capture_cameras(args, capture, frame) for frame in frames} if capture is not None else {}
+    numbers = numbers_of_frames(sequence.metadata, len(sequence))
+    cameras_of = {} if capture is None else {n: _capture_cameras(args, capture, numbers[n]) for n in frames}
     try:
         args.out.mkdir(exist_ok=True)
     except OSError as error:
@@ -132,7 +134,7 @@ def _frames(args: Mesh, frame_count: int) -> list[int]:
 
 
 def _capture_cameras(args: Mesh, capture: Capture, frame: int) -> tuple[Camera, ...]:
-    """Return the cameras of a frame."""
+    """Return the cameras of a frame of the capture."""
     records = capture.select(split=args.split, frames=(frame,))
     if not records:
         raise InvalidOptionError(

@@ -1,24 +1,25 @@
-"""``beam render``: a relightable asset under a given light, from one camera or from those of a capture."""
+"""``beam render``: an asset under a given light, or one of its channels, from one camera or from those of a capture."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from beam_warp import converters
+from beam_warp.asset_metadata import numbers_of_frames
 from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.axes import change_axes
 from beam_warp.cameras import MAX_SIDE, Camera, bulk
 from beam_warp.captures import Capture
-from beam_warp.checks import require_count, require_range
+from beam_warp.checks import require_choice, require_count, require_range
 from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
 from beam_warp.environments import EnvironmentMap
@@ -26,11 +27,13 @@ from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.images import display_image, srgb_to_linear, write_exr, write_png
 
 if TYPE_CHECKING:
-    from beam_warp.deferred import EnvironmentLighting
     from beam_warp.raster_records import RasterOptions
 
 DEFAULT_SIDE = 1024
 """Width and height where none is given [pixel]."""
+
+_LIT = ("environment", "rotate", "exposure", "background", "aov")
+"""Options of what is lit."""
 
 FRAMING_FRAMES = 3
 """A camera that frames a moving subject looks at this many of its frames: first, last and between."""
@@ -38,12 +41,18 @@ FRAMING_FRAMES = 3
 
 @dataclass(frozen=True)
 class Render:
-    """Light a relightable asset and draw it.
+    """Light a relightable asset and draw it, or draw one of its channels.
 
     Without a camera, the asset is framed from the front. With --capture, every test record of the capture is drawn
     into the folder --out as CAMERA_FRAME.exr: with --aov, in the layers and units of the capture's ground truth.
 
+    With --channel, one array is drawn and no light: a .png shows colours as they are, numbers and standard errors by a
+    colour map whose range is printed, observability as the gravest flag of what each pixel sees, counted in the legend;
+    an .exr holds the values. With --capture these are .png.
+
     Example: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
+
+    Example: beam render person.usdz --channel base_color_error --out error.png
     """
 
     asset: Annotated[Positional[Path], arg(metavar="ASSET", help="PLY or USD file, or a folder of numbered PLY files.")]
@@ -52,6 +61,16 @@ class Render:
     ]
     environment: Annotated[
         Path | None, arg(metavar="FILE", help="Lat-long light, .exr or .hdr; by default the capture's own.")
+    ] = None
+    channel: Annotated[
+        str | None, arg(metavar="NAME", help="Draw this array instead: roughness_error, observability, normals, ….")
+    ] = None
+    range: Annotated[
+        tuple[float, float] | None,
+        arg(
+            metavar="LOW HIGH",
+            help="Ends of the colour map of --channel; by default 0 and what most Gaussians are below.",
+        ),
     ] = None
     orbit: Annotated[
         tuple[float, float] | None,
@@ -73,7 +92,10 @@ class Render:
         tuple[float, float, float] | Literal["transparent"],
         arg(metavar="R G B", help="Display colour behind the asset, 0 to 1; transparent by default."),
     ] = "transparent"
-    aov: Annotated[bool, arg(help="Also write base colour, roughness, occlusion, normal and depth (.exr).")] = False
+    aov: Annotated[
+        bool,
+        arg(help="Also write base colour, roughness, occlusion, what errors there are of them, normal, depth (.exr)."),
+    ] = False
     antialiased: Antialiased = None
     low_pass: LowPass = None
     source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
@@ -96,32 +118,25 @@ def render(args: Render) -> int:
     """Draw what was asked for, and say what was written."""
     started = time.perf_counter()
     _require_consistent(args)
-    environment_path, capture = args.environment, None
-    if args.capture is not None:
-        capture = Capture.read(args.capture)
-        environment_path = environment_path or capture.environment_path
-    if environment_path is None:
-        raise InvalidOptionError(
-            "environment must be given, got none. Pass --environment with a lat-long .exr or .hdr image."
-        )
-    environment = EnvironmentMap.read(environment_path).rotated(args.rotate).exposed(args.exposure)
+    capture = None if args.capture is None else Capture.read(args.capture)
+    environment = None if args.channel is not None else _environment(args, capture)
     sequence = converters.read(args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     _require_frame(args, len(sequence))
     options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     if capture is not None:
-        views = _capture_views(args, capture, len(sequence), notes)
+        views = _capture_views(args, capture, numbers_of_frames(sequence.metadata, len(sequence)), notes)
     else:
         views = _numbered_views(args, sequence)
 
-    from beam_warp.deferred import EnvironmentLighting
     from beam_warp.devices import resolve_device
 
-    lighting = EnvironmentLighting.from_environment(environment, device=str(resolve_device(args.device)))
+    device = str(resolve_device(args.device))
+    drawing = _Channel(args, options) if environment is None else _Relit(args, options, environment, device)
     gaussian_count = 0
     with progress(args.quiet or args.json) as report:
         for done, (view, cloud) in enumerate(_with_clouds(args, views, sequence), start=1):
-            _draw(args, view, cloud, lighting, options)
+            drawing.draw(view, cloud)
             gaussian_count = max(gaussian_count, len(cloud))
             report("render", done, len(views))
     seconds = time.perf_counter() - started
@@ -131,8 +146,9 @@ def render(args: Render) -> int:
                 "outputs": [str(view.path) for view in views],
                 "frames": sorted({view.frame for view in views}),
                 "gaussian_count": gaussian_count,
-                "device": lighting.device,
+                "device": device,
                 "notes": notes,
+                **drawing.facts(),
                 "seconds": round(seconds, 3),
             }
         )
@@ -142,7 +158,19 @@ def render(args: Render) -> int:
         last = f" … {views[-1].path.name}" if len(views) > 1 else ""
         images = f"{len(views)} images, " if len(views) > 1 else ""
         print(f"wrote {views[0].path}{last}: {images}{gaussian_count:,} Gaussians, {seconds:.2f} s")
+        for line in drawing.lines():
+            print(line)
     return 0
+
+
+def _environment(args: Render, capture: Capture | None) -> EnvironmentMap:
+    """Read the light, as it is to be used."""
+    path = args.environment or (None if capture is None else capture.environment_path)
+    if path is None:
+        raise InvalidOptionError(
+            "environment must be given, got none. Pass --environment with a lat-long .exr or .hdr image."
+        )
+    return EnvironmentMap.read(path).rotated(args.rotate).exposed(args.exposure)
 
 
 def _require_consistent(args: Render) -> None:
@@ -154,6 +182,10 @@ def _require_consistent(args: Render) -> None:
     ]
     if len(given) > 1:
         raise InvalidOptionError(f"camera must be given once, got --{' and --'.join(given)}. Leave one out.")
+    if args.channel is None and args.range is not None:
+        raise InvalidOptionError(f"range must come with --channel, got {args.range} without. Leave it out.")
+    if args.channel is not None:
+        _require_channel(args)
     if args.background != "transparent":
         require_range("background", np.asarray(args.background), 0.0, 1.0, "Use display values from 0 to 1.")
     if args.capture is not None:
@@ -174,31 +206,48 @@ def _require_consistent(args: Render) -> None:
         raise OutputError(f"out must be in a folder that exists, got {args.out.parent}. Create it first.")
 
 
+def _require_channel(args: Render) -> None:
+    """Refuse a channel that is none, and what a channel has no use for."""
+    from beam_warp.channel_images import DRAWABLE
+
+    require_choice("channel", args.channel or "", DRAWABLE)
+    lit = {field.name: field.default for field in fields(args) if field.name in _LIT}
+    superfluous = [name for name, default in lit.items() if getattr(args, name) != default]
+    if superfluous:
+        raise InvalidOptionError(
+            f"{superfluous[0]} must be left out with --channel, got {getattr(args, superfluous[0])}: a channel is "
+            "drawn on grey, and without light. Leave it out."
+        )
+    if args.range is not None and not args.range[0] < args.range[1]:
+        raise InvalidOptionError(f"range must be two numbers, the lower one first, got {args.range}. Swap them.")
+
+
 def _require_frame(args: Render, frame_count: int) -> None:
     """Refuse a frame that the asset lacks."""
     if args.frame is not None:
         require_count("frame", args.frame, 0, frame_count - 1)
 
 
-def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list[str]) -> list[View]:
+def _capture_views(args: Render, capture: Capture, numbers: tuple[int, ...], notes: list[str]) -> list[View]:
     """Plan one image for each record of the split whose frame the asset has; say what is left out."""
-    records = capture.select(split=args.split, frames=None if args.frame is None else (args.frame,))
+    records = capture.select(split=args.split, frames=None if args.frame is None else (numbers[args.frame],))
     if not records:
-        frame = "" if args.frame is None else f" of frame {args.frame}"
+        frame = "" if args.frame is None else f" of frame {numbers[args.frame]}"
         raise InvalidOptionError(
             f"split must name records of the capture{frame}, got {args.split!r} "
             f"(it has {', '.join(capture.splits)}). Choose one of them."
         )
-    within = [record for record in records if record.frame < frame_count]
+    place = {number: frame for frame, number in enumerate(numbers)}
+    within = [record for record in records if record.frame in place]
     if len(within) < len(records):
-        beyond = sorted({record.frame for record in records if record.frame >= frame_count})
+        beyond = sorted({record.frame for record in records} - place.keys())
         notes.append(
             f"{len(records) - len(within)} records are of frames that the asset lacks "
             f"({', '.join(map(str, beyond[:5]))}{', …' if len(beyond) > 5 else ''}): not drawn"
         )
     if not within:
         raise InvalidOptionError(
-            f"asset must have a frame that the records of split {args.split!r} show, got {frame_count} frames in "
+            f"asset must have a frame that the records of split {args.split!r} show, got {len(numbers)} frames in "
             f"{args.asset}. Choose another split."
         )
     bent = sum(record.is_distorted for record in within)
@@ -210,7 +259,8 @@ def _capture_views(args: Render, capture: Capture, frame_count: int, notes: list
         raise OutputError(
             f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
         ) from error
-    return [View(record.frame, record.camera, args.out / f"{record.name}.exr") for record in within]
+    suffix = "exr" if args.channel is None else "png"
+    return [View(place[record.frame], record.camera, args.out / f"{record.name}.{suffix}") for record in within]
 
 
 def _numbered_views(args: Render, sequence: GaussianSequence) -> list[View]:
@@ -249,9 +299,9 @@ def _with_clouds(args: Render, views: list[View], sequence: GaussianSequence) ->
 
 
 def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianCloud:
-    """Read a frame into the internal world; it must be relightable."""
+    """Read a frame into the internal world; it must be relightable to be lit."""
     cloud = sequence[frame]
-    if not cloud.is_relightable:
+    if args.channel is None and not cloud.is_relightable:
         missing = [
             name for name in ("base_color", "roughness", "ambient_occlusion", "normals") if getattr(cloud, name) is None
         ]
@@ -262,26 +312,88 @@ def _cloud(args: Render, sequence: GaussianSequence, frame: int) -> GaussianClou
     return change_axes(cloud, WORLD_AXES)
 
 
-def _draw(
-    args: Render, view: View, cloud: GaussianCloud, lighting: EnvironmentLighting, options: RasterOptions
-) -> None:
-    """Draw one image and write it."""
-    from beam_warp.deferred import relight
-    from beam_warp.rasterizing import rasterize
+class _Relit:
+    """Draws the asset under a light."""
 
-    buffer = rasterize(cloud, view.camera, options=options, device=args.device)
-    radiance = relight(buffer, lighting)
-    alpha = buffer.alpha
-    if args.background != "transparent":
-        behind = srgb_to_linear(np.asarray(args.background, np.float32))
-        radiance = (radiance + (1.0 - alpha[..., None]) * behind).astype(np.float32)
-        alpha = np.ones_like(alpha)
-    if view.path.suffix.lower() == ".png":
-        write_png(view.path, _display(radiance, alpha))
-        return
-    layers: dict[str, NDArray[np.float32]] = dict(buffer.layers()) if args.aov else {}
-    layers.update({"R": radiance[..., 0], "G": radiance[..., 1], "B": radiance[..., 2], "A": alpha})
-    write_exr(view.path, layers)
+    def __init__(self, args: Render, options: RasterOptions, environment: EnvironmentMap, device: str) -> None:
+        from beam_warp.deferred import EnvironmentLighting
+
+        self._args = args
+        self._options = options
+        self._lighting = EnvironmentLighting.from_environment(environment, device=device)
+
+    def draw(self, view: View, cloud: GaussianCloud) -> None:
+        """Draw one image and write it."""
+        from beam_warp.deferred import relight
+        from beam_warp.rasterizing import ERROR_CHANNELS, MATERIAL_CHANNELS, rasterize
+
+        args = self._args
+        errors = [name for name in ERROR_CHANNELS if args.aov and getattr(cloud, name) is not None]
+        channels = (*MATERIAL_CHANNELS, *errors)
+        buffer = rasterize(cloud, view.camera, channels=channels, options=self._options, device=args.device)
+        radiance = relight(buffer, self._lighting)
+        alpha = buffer.alpha
+        if args.background != "transparent":
+            behind = srgb_to_linear(np.asarray(args.background, np.float32))
+            radiance = (radiance + (1.0 - alpha[..., None]) * behind).astype(np.float32)
+            alpha = np.ones_like(alpha)
+        if view.path.suffix.lower() == ".png":
+            write_png(view.path, _display(radiance, alpha))
+            return
+        layers: dict[str, NDArray[np.float32]] = dict(buffer.layers()) if args.aov else {}
+        layers.update({"R": radiance[..., 0], "G": radiance[..., 1], "B": radiance[..., 2], "A": alpha})
+        write_exr(view.path, layers)
+
+    def facts(self) -> dict[str, Any]:
+        """Return what JSON says of it besides."""
+        return {}
+
+    def lines(self) -> list[str]:
+        """Return what is said of it besides."""
+        return []
+
+
+class _Channel:
+    """Draws one channel of the asset; all images have one range, that of the first."""
+
+    def __init__(self, args: Render, options: RasterOptions) -> None:
+        self._args = args
+        self._options = options
+        self._name = args.channel or ""
+        self._range = args.range
+        self._is_mapped = False
+        self._shares: list[dict[str, float]] = []
+
+    def draw(self, view: View, cloud: GaussianCloud) -> None:
+        """Draw one image and write it."""
+        from beam_warp.channel_images import OBSERVABILITY, channel_range, see_channel
+
+        seen = see_channel(cloud, view.camera, self._name, options=self._options, device=self._args.device)
+        self._is_mapped = seen.is_mapped
+        if self._range is None:
+            self._range = channel_range(cloud, self._name)
+        if self._name == OBSERVABILITY:
+            self._shares.append(seen.flag_shares())
+        if view.path.suffix.lower() == ".png":
+            write_png(view.path, seen.picture(self._range))
+        else:
+            write_exr(view.path, seen.layers())
+
+    def facts(self) -> dict[str, Any]:
+        """Return what JSON says of it besides: the range of numbers, or the flags' shares of what is seen."""
+        said: dict[str, Any] = {"channel": self._name}
+        if self._shares:
+            said["flags"] = {word: float(np.mean([image[word] for image in self._shares])) for word in self._shares[0]}
+        elif self._is_mapped and self._range is not None:
+            said["range"] = list(self._range)
+        return said
+
+    def lines(self) -> list[str]:
+        """Return the same in words."""
+        said = self.facts()
+        if "flags" in said:
+            return [f"{self._name}: " + ", ".join(f"{word} {share:.1%}" for word, share in said["flags"].items())]
+        return [f"{self._name}: {said['range'][0]:g} (dark) to {said['range'][1]:g}"] if "range" in said else []
 
 
 def _display(radiance: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -130,6 +130,19 @@ def test_cameras_of_a_capture(sequence, tmp_path, capsys):
     assert "split must name records of frame 1 of the capture, got 'train'" in capsys.readouterr().err
 
 
+def test_cameras_are_of_the_frame_that_the_asset_says_it_shows(tmp_path, capsys):
+    """Without a word, frame 0 of an asset is frame 0 of a capture, which this one has not."""
+    write_capture(tmp_path / "capture", [5])
+    words = ("--capture", tmp_path / "capture", "--voxel", "0.05", "--device", "cpu", "--json")
+    for name, metadata, code in (("said", {"capture_frames": "5"}, 0), ("silent", {}, 2)):
+        cloud = ball((0.0, 0.0, 0.0))
+        converters.write(GaussianSequence.from_clouds([cloud], metadata=metadata), tmp_path / f"{name}.usdc")
+        assert run(tmp_path / f"{name}.usdc", "--out", tmp_path / name, *words) == code
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["frames"][0]["cameras"] == 8
+    assert "split must name records of frame 0 of the capture, got 'train'" in captured.err
+
+
 def test_unwrap(sequence, tmp_path, capsys):
     pytest.importorskip("xatlas")
     assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", "--unwrap", "--json") == 0
