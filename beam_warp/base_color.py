@@ -50,7 +50,9 @@ class BaseColor:
     clipped_part: float
 
 
-def solve_base_color(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float) -> BaseColor:
+def solve_base_color(
+    cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float, *, dispersion: float = 1.0
+) -> BaseColor:
     """Solve the least-squares problem that the frames add up to.
 
     rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
@@ -61,13 +63,15 @@ def solve_base_color(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradia
         cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
         evidence: Of one frame, or the sum over frames of the same Gaussians.
         mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
+        dispersion: By how much variances are larger than evidence states, as frames have shown; see
+            `beam_warp.temporal_color`.
 
     Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
     """
     flags = observability(cloud, evidence, mean_irradiance)
     missing = (flags & np.uint8(MISSING)) != 0
     raw, error = least_squares(evidence)
-    base_color = np.clip(raw, 0.0, 1.0)
+    base_color, error = np.clip(raw, 0.0, 1.0), error * np.sqrt(dispersion)
     weight = np.where(missing, 0.0, cloud.opacities)
     clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
-from beam_warp.environment_sampling import SampledEnvironment
+from beam_warp.material_light import MaterialLight
 from beam_warp.materials import MaterialOptions, measure_materials
 from beam_warp.scene import Scene
-from beam_warp.surfaces import SurfaceNormals
+from beam_warp.surfaces import SurfacePoints
 
 BRIGHTEST = (0.95, 0.8)
 """Quantile of the largest channel, and the base colour it is given where the bounds leave a choice: white cloth."""
@@ -29,9 +29,9 @@ EXPOSURE_FACTORS = np.exp2(np.arange(-10.0, 10.0 + 1e-9, 1.0 / 16.0))
 def estimate_exposure(
     cloud: GaussianCloud,
     scene: Scene,
-    surface: SurfaceNormals,
+    points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: SampledEnvironment,
+    light: MaterialLight,
     *,
     options: MaterialOptions,
     subset: int = 4096,
@@ -50,7 +50,7 @@ def estimate_exposure(
     Args:
         cloud: Gaussians with captured radiance.
         scene: The same, uploaded.
-        surface: Their normals.
+        points: Where their light is gathered.
         roughness: Their roughness.
         light: The light of the capture up to a factor.
         options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
@@ -65,7 +65,7 @@ def estimate_exposure(
         measure_materials(
             cloud,
             scene,
-            surface,
+            points,
             roughness,
             light.scaled(factor),
             options=direct,

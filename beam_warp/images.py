@@ -138,6 +138,10 @@ class Image:
         return np.concatenate([rgb * weight, alpha[..., None]], axis=-1)
 
 
+SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
+"""Formats whose values are not cut at white, unless their colour space says otherwise."""
+
+
 def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) -> Image:
     """Read an .exr, .hdr, .png, .jpg or .jpeg file.
 

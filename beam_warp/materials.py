@@ -432,10 +432,11 @@ def _hit_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[n
 
 
 def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return 1 where the captured colour itself is at the top of its range."""
+    """Return 1 where captured display colour is at the top of its range."""
     assert cloud.radiance is not None
-    cut = (0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1)
-    return cut.astype(np.float32)
+    if cloud.radiance_color_space != DISPLAY_SRGB:
+        return np.zeros(len(cloud), np.float32)  # scene-linear colour has no top
+    return (0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1).astype(np.float32)
 
 
 def _empty(structure: Any, count: int, device: Any) -> Any:

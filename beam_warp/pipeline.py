@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,28 +18,23 @@ from numpy.typing import NDArray
 from beam_warp import converters
 from beam_warp._version import __version__
 from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence
-from beam_warp.axes import change_axes
+from beam_warp.base_color import BaseColor, solve_base_color
 from beam_warp.cameras import Camera, bulk
+from beam_warp.capture_digests import CaptureDigests
+from beam_warp.captures import Capture
 from beam_warp.checks import require_number
 from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
-from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import InvalidArrayError
 from beam_warp.exposure import estimate_exposure
+from beam_warp.frame_inputs import CaptureImages, FrameInputs, RoughnessTexture, filled_occlusion
 from beam_warp.frame_store import frame_key, make_folders, read_frame, write_frame
 from beam_warp.images import write_png
-from beam_warp.materials import (
-    ColorEvidence,
-    MaterialOptions,
-    measure_materials,
-    solve_base_color,
-)
+from beam_warp.material_light import MaterialLight
+from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
 from beam_warp.raster_records import RasterOptions
 from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_report
-from beam_warp.roughness import constant_roughness, textured_roughness
-from beam_warp.scene import Scene
-from beam_warp.surfaces import SurfaceNormals, estimate_normals
+from beam_warp.temporal_color import ChangeTest, with_changes
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
@@ -51,14 +45,6 @@ EVIDENCE = "evidence_"
 
 def no_progress(stage: str, done: int, total: int) -> None:
     """Report to nobody."""
-
-
-@dataclass(frozen=True)
-class RoughnessTexture:
-    """A roughness texture and the mesh whose texture coordinates it follows, in the axes and units of the input."""
-
-    texture: Path
-    mesh: Path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +110,7 @@ def run(
     out: str | Path,
     options: RunOptions | None = None,
     *,
+    capture: Capture | None = None,
     overview: OverviewOptions | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
@@ -137,11 +124,14 @@ def run(
         environment: The light of the capture, in the world "rfu".
         out: Folder; made if its parent exists.
         options: See `RunOptions`.
+        capture: The images that the Gaussians were reconstructed from: light is gathered where they show the surface,
+            and base colour explains what they show. None takes the Gaussians' own colour for it.
         overview: See `OverviewOptions`.
         progress: Called with (stage, done, total).
 
     Raises:
         InvalidArrayError: A frame has no captured radiance.
+        InvalidOptionError: The capture lacks a frame of the sequence.
         OutputError: The folder cannot be made or written.
         BeamError: An input or option breaks its contract.
 
@@ -151,8 +141,9 @@ def run(
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
     folder = Path(out)
-    (frames,) = make_folders(folder, "frames")
-    job = _Job(sequence, environment, frames, chosen, progress)
+    frames, digests = make_folders(folder, "frames", "digests")
+    images = None if capture is None else CaptureImages(capture, sequence)
+    job = _Job(sequence, environment, frames, chosen, images, CaptureDigests(digests), progress)
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
@@ -209,48 +200,6 @@ class _Timer:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-class _Frame:
-    """One frame on its way through: each step is done when it is first asked for, and once."""
-
-    def __init__(self, number: int, original: GaussianCloud, job: _Job) -> None:
-        self.number = number
-        self._original = original
-        self._job = job
-        self.cloud = change_axes(original, WORLD_AXES)
-        if len(self.cloud) == 0:
-            raise InvalidArrayError(
-                f"a frame must hold at least one Gaussian, got none at frame {number}. Leave empty frames out."
-            )
-        if self.cloud.radiance is None:
-            raise InvalidArrayError(
-                f"radiance must be given to decompose materials, got none at frame {number}. "
-                "Import Gaussians with captured colour."
-            )
-
-    @cached_property
-    def scene(self) -> Scene:
-        with self._job.timer("upload and build"):
-            return Scene.from_gaussians(self.cloud, str(self._job.device))
-
-    @cached_property
-    def surface(self) -> SurfaceNormals:
-        scene = self.scene
-        with self._job.timer("normals"):
-            return estimate_normals(
-                self.cloud,
-                scene,
-                seed=self._job.options.materials.seed,
-                progress=self._job.within("normals", self.number),
-            )
-
-    @cached_property
-    def roughness(self) -> NDArray[np.float32]:
-        source = self._job.options.roughness
-        if isinstance(source, RoughnessTexture):
-            return textured_roughness(self._original, source.texture, source.mesh)
-        return constant_roughness(self.cloud, source)
-
-
 class _Job:
     """One call of `run`: what it was given, where its store is, and what it has found out so far."""
 
@@ -260,9 +209,13 @@ class _Job:
         environment: EnvironmentMap,
         folder: Path,
         options: RunOptions,
+        images: CaptureImages | None,
+        digests: CaptureDigests,
         progress: Progress,
     ) -> None:
         self._progress = progress
+        self._images = images
+        self._digests = digests
         self.sequence = sequence
         self.folder = folder
         self.options = options
@@ -270,14 +223,27 @@ class _Job:
         self.timer = _Timer(self.device)
         self.persistent = options.persistent or sequence.topology == "constant"
         self.resumed = 0
-        self.first = _Frame(0, sequence[0], self)
+        self.first = self._inputs(0)
         with self.timer("prepare light"):
-            given = SampledEnvironment.from_environment(environment, self.device)
+            given = MaterialLight.from_environment(environment, self.device)
         self.exposure = self._find_exposure(environment, given)
         self.lit = environment.scaled(2.0**self.exposure)
         self.light = given.scaled(2.0**self.exposure)
         self.key = _digest(self._described(), self.lit.radiance)
         self._statistics: dict[str, Any] = {}
+
+    def _inputs(self, number: int) -> FrameInputs:
+        """Return what a frame brings."""
+        return FrameInputs(
+            number,
+            self.sequence[number],
+            self._images,
+            device=str(self.device),
+            offset=self.options.materials.offset,
+            seed=self.options.materials.seed,
+            timer=self.timer,
+            progress=lambda stage, done, total: self.within(stage, number)(done, total),
+        )
 
     def _described(self) -> str:
         """Everything but the input and the light that a stored measurement depends on."""
@@ -293,7 +259,7 @@ class _Job:
             sort_keys=True,
         )
 
-    def _find_exposure(self, environment: EnvironmentMap, light: SampledEnvironment) -> float:
+    def _find_exposure(self, environment: EnvironmentMap, light: MaterialLight) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
             return require_number("exposure", self.options.exposure, -32.0, 32.0)
@@ -303,11 +269,9 @@ class _Job:
         key = _digest(self._described(), environment.radiance, *self.first.cloud.arrays().values())
         if frame_key(path) != key:
             first = self.first
-            scene, surface, roughness = first.scene, first.surface, first.roughness
+            scene, points, roughness = first.scene, first.points, self._roughness(first)
             with self.timer("exposure"):
-                factor = estimate_exposure(
-                    first.cloud, scene, surface, roughness, light, options=self.options.materials
-                )
+                factor = estimate_exposure(first.cloud, scene, points, roughness, light, options=self.options.materials)
             write_frame(path, key, {"stops": np.array([np.log2(factor)])})
         return float(read_frame(path)["stops"][0])
 
@@ -319,32 +283,43 @@ class _Job:
     def path(self, frame: int) -> Path:
         return self.folder / f"frame_{frame:06d}.h5"
 
+    def _roughness(self, inputs: FrameInputs) -> NDArray[np.float32]:
+        """Return the roughness of a frame's Gaussians, ``(N,)``."""
+        return inputs.roughness(self.options.roughness)
+
     def measure(self, number: int) -> None:
         """Measure a frame into the store, unless it is there already."""
-        frame = self.first if number == 0 else _Frame(number, self.sequence[number], self)
-        key = _digest(f"{self.key} {number} {frame.cloud.radiance_color_space}", *frame.cloud.arrays().values())
+        frame = self.first if number == 0 else self._inputs(number)
+        seen = "" if self._images is None else self._images.digest(number, self._digests)
+        key = _digest(f"{self.key} {number} {frame.cloud.radiance_color_space} {seen}", *frame.cloud.arrays().values())
         if frame_key(self.path(number)) == key:
             self.resumed += 1
             return
-        scene, surface = frame.scene, frame.surface
+        scene, points, surface, views = frame.scene, frame.points, frame.surface, frame.views
+        roughness = self._roughness(frame)
         with self.timer("materials"):
             measured = measure_materials(
                 frame.cloud,
                 scene,
-                surface,
-                frame.roughness,
+                points,
+                roughness,
                 self.light,
                 options=self.options.materials,
+                views=views,
                 frame=number,
                 progress=self.within("materials", number),
             )
+        with self.timer("fill"):
+            occlusion, occlusion_error = filled_occlusion(
+                frame, measured.ambient_occlusion, measured.ambient_occlusion_error
+            )
         arrays = {
             **frame.cloud.arrays(),
-            "ambient_occlusion": measured.ambient_occlusion,
-            "ambient_occlusion_error": measured.ambient_occlusion_error,
+            "ambient_occlusion": occlusion,
+            "ambient_occlusion_error": occlusion_error,
             "normals": surface.normals,
             "normal_confidence": surface.confidence,
-            "roughness": frame.roughness,
+            "roughness": roughness,
             **{EVIDENCE + name: getattr(measured.evidence, name) for name in ColorEvidence.ARRAYS},
             "from_shape": surface.from_shape,
             "report": np.array([scene.report.traced, scene.report.dropped, scene.report.raised_scales]),
@@ -370,30 +345,32 @@ class _Job:
         """Solve base colour, over all frames at once or each by itself, and return the relightable sequence."""
         total = len(self.sequence)
         tally = Tally()
+        varying = not self.persistent
         if self.persistent:
-            joint = self.evidence(0)
+            joint, test = self.evidence(0), ChangeTest()
+            test.add(joint)
             for frame in range(1, total):
-                joint = joint + self.evidence(frame)
-            groups = {0: joint}
+                evidence = self.evidence(frame)
+                test.add(evidence)
+                joint = joint + evidence
+            change = test.result()
+            cloud = self.stored_cloud(0)
+            constant = solve_base_color(cloud, joint, self.light.mean_irradiance, dispersion=change.dispersion)
+            tally.add(constant, cloud, read_frame(self.path(0), ("from_shape", "report")))
+            varying = bool(change.changing.any())
+            for frame in range(total if varying else 1):
+                self._store_solution(frame, with_changes(constant, change, self.evidence(frame)))
+            tally.count_changes(change)
         else:
-            groups = dict.fromkeys(range(total))
-        for frame, evidence in groups.items():
-            cloud = self.stored_cloud(frame)
-            solved = solve_base_color(cloud, evidence or self.evidence(frame), self.light.mean_irradiance)
-            write_frame(
-                self.folder / f"solution_{frame:06d}.h5",
-                self.key,
-                {
-                    "base_color": solved.base_color,
-                    "base_color_error": solved.standard_error,
-                    "observability": solved.observability,
-                },
-            )
-            tally.add(solved, cloud, read_frame(self.path(frame), ("from_shape", "report")))
+            for frame in range(total):
+                cloud = self.stored_cloud(frame)
+                solved = solve_base_color(cloud, self.evidence(frame), self.light.mean_irradiance)
+                self._store_solution(frame, solved)
+                tally.add(solved, cloud, read_frame(self.path(frame), ("from_shape", "report")))
         self._statistics = tally.summary()
 
         def read(frame: int) -> GaussianCloud:
-            solution = read_frame(self.folder / f"solution_{0 if self.persistent else frame:06d}.h5")
+            solution = read_frame(self.folder / f"solution_{frame if varying else 0:06d}.h5")
             return self.stored_cloud(frame).with_arrays(**solution)
 
         solution_names = {"base_color", "base_color_error", "observability"}
@@ -403,7 +380,7 @@ class _Job:
             read_frame=read,
             frames_per_second=self.sequence.frames_per_second,
             constant=frozenset(self.sequence.constant & set(ATTRIBUTES)) - {"normals"}
-            | (solution_names if self.persistent else set())
+            | (set() if varying else solution_names)
             | constant_roughness_names,
             topology="constant" if self.persistent else "perFrame",
             metadata={
@@ -412,8 +389,19 @@ class _Job:
                 "normal_source": "shortestAxis" if self._statistics["normals_from_shape"] > 0.5 else "authored",
                 "roughness_source": "texture" if isinstance(self.options.roughness, RoughnessTexture) else "constant",
                 "radiance_meaning": "captured",
-                "source_axes": self.first._original.axes,
+                "source_axes": self.first.original.axes,
                 "exposure_stops": f"{self.exposure:.4f}",
+            },
+        )
+
+    def _store_solution(self, frame: int, solved: BaseColor) -> None:
+        write_frame(
+            self.folder / f"solution_{frame:06d}.h5",
+            self.key,
+            {
+                "base_color": solved.base_color,
+                "base_color_error": solved.standard_error,
+                "observability": solved.observability,
             },
         )
 

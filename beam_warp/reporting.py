@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from beam_warp._version import __version__
 from beam_warp.assets import GaussianCloud, Observability
+from beam_warp.base_color import BaseColor
 from beam_warp.errors import OutputError
 from beam_warp.kernels.launching import thread_count
-from beam_warp.materials import BaseColor
+from beam_warp.temporal_color import ColorChange
 
 CLIPPED_WARNING = 0.05
 """Part of the opacity with base colour cut at 1 above which the stated light is called too dim."""
@@ -67,6 +68,7 @@ class Tally:
         """Start with nothing counted."""
         self._rows = 0
         self._sums: dict[str, float] = {}
+        self._changes: dict[str, float] = {}
         self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
     def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:
@@ -91,6 +93,10 @@ class Tally:
             if flag and flag.name:
                 self._flags[flag.name] += int(((solved.observability & np.uint8(flag)) != 0).sum())
 
+    def count_changes(self, change: ColorChange) -> None:
+        """Keep what a test of frames against each other found."""
+        self._changes = {"changing_part": change.changing_part, "error_dispersion": change.dispersion}
+
     def summary(self) -> dict[str, Any]:
         """Return parts, means and counts over all frames, JSON-able."""
         rows = max(self._rows, 1)
@@ -104,6 +110,7 @@ class Tally:
             "dropped_transparent": int(self._sums["dropped"]),
             "raised_scales": int(self._sums["raised"]),
             "flags": self._flags,
+            **self._changes,
         }
 
 

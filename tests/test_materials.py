@@ -6,19 +6,15 @@ from shapes import cloud_of, disc_points, sphere_points, tiles
 
 from beam_warp import GaussianCloud, Observability, Scene, irradiance
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
-from beam_warp.environment_sampling import SampledEnvironment
+from beam_warp.base_color import solve_base_color
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidArrayError
 from beam_warp.exposure import estimate_exposure
 from beam_warp.images import linear_to_srgb
-from beam_warp.materials import (
-    MaterialOptions,
-    measure_materials,
-    solve_base_color,
-    view_set,
-)
+from beam_warp.material_light import MaterialLight
+from beam_warp.materials import MaterialOptions, measure_materials, view_set
 from beam_warp.spherical_harmonics import SH_C0
-from beam_warp.surfaces import SurfaceNormals
+from beam_warp.surfaces import SurfaceNormals, SurfacePoints
 
 ROUGHNESS = 0.8
 SPECULAR_ALBEDO = 0.04
@@ -32,20 +28,22 @@ def with_radiance(cloud, linear, color_space=LINEAR_REC709):
     )
 
 
-def certain(normals):
+def certain(cloud, scene, normals, offset="auto"):
+    """Light is gathered at the centres, under normals that are known."""
     count = len(normals)
-    return SurfaceNormals(np.asarray(normals, np.float32), np.ones(count, np.float32), np.ones(count, bool))
+    surface = SurfaceNormals(np.asarray(normals, np.float32), np.ones(count, np.float32), np.ones(count, bool))
+    return SurfacePoints.at_centers(cloud, scene, surface, offset)
 
 
 def decompose(cloud, normals, environment, device, options=None, frames=(0,)):
     scene = Scene.from_gaussians(cloud, device)
-    light = SampledEnvironment.from_environment(environment, scene.device)
+    light = MaterialLight.from_environment(environment, scene.device)
     roughness = np.full(len(cloud), ROUGHNESS, np.float32)
     evidence = None
+    chosen = options or MaterialOptions()
+    points = certain(cloud, scene, normals, chosen.offset)
     for frame in frames:
-        measured = measure_materials(
-            cloud, scene, certain(normals), roughness, light, options=options or MaterialOptions(), frame=frame
-        )
+        measured = measure_materials(cloud, scene, points, roughness, light, options=chosen, frame=frame)
         evidence = measured.evidence if evidence is None else evidence + measured.evidence
     known = cloud.with_arrays(normal_confidence=np.ones(len(cloud), np.float32))
     return solve_base_color(known, evidence, light.mean_irradiance), measured
@@ -269,9 +267,9 @@ class TestExposure:
         factor = estimate_exposure(
             cloud,
             scene,
-            certain(points),
+            certain(cloud, scene, points),
             np.full(1500, ROUGHNESS, np.float32),
-            SampledEnvironment.from_environment(
+            MaterialLight.from_environment(
                 EnvironmentMap.constant((1.0, 1.0, 1.0), height=32).exposed(stops), scene.device
             ),
             options=MaterialOptions(),
@@ -288,8 +286,8 @@ def test_views_are_unit_and_on_the_visible_side():
 
 def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
     scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
-    one = SampledEnvironment.from_environment(sky(), scene.device).scaled(4.0)
-    other = SampledEnvironment.from_environment(sky().scaled(4.0), scene.device)
+    one = MaterialLight.from_environment(sky(), scene.device).scaled(4.0)
+    other = MaterialLight.from_environment(sky().scaled(4.0), scene.device)
     assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
     for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
         assert np.allclose(getattr(one.blocks, name).numpy(), getattr(other.blocks, name).numpy(), rtol=1e-5, atol=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 from shapes import cloud_of, random_cloud, sphere_points, tiles
 
 from beam_warp import GaussianCloud, Scene
-from beam_warp.materials import UNCERTAIN_NORMAL
+from beam_warp.base_color import UNCERTAIN_NORMAL
 from beam_warp.surfaces import estimate_normals
 
 

@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 from beam_warp._version import __version__
 from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
+from beam_warp.cli.decompose import Decompose, decompose
 from beam_warp.cli.demo import Demo, demo
 from beam_warp.cli.inspect import Inspect, inspect
 from beam_warp.cli.mesh import Mesh, mesh
@@ -30,6 +31,7 @@ See also beam-convert (formats, axes, units) and beam-validate (is an asset vali
 Command = (
     Annotated[Run, subcommand("run", prefix_name=False)]
     | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
+    | Annotated[Decompose, subcommand("decompose", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
     | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
@@ -50,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: run(command))
     if isinstance(command, Reconstruct):
         return run_command(lambda: reconstruct(command))
+    if isinstance(command, Decompose):
+        return run_command(lambda: decompose(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
     if isinstance(command, Mesh):

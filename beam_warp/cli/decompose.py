@@ -1,0 +1,212 @@
+"""``beam decompose``: from Gaussians and the images they were reconstructed from to a relightable asset."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from beam_warp import converters
+from beam_warp.captures import Capture
+from beam_warp.cli.console import print_json, progress
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from beam_warp.pipeline import OverviewOptions, RunOptions, RunResult
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """How materials are measured and shown; the same words in every command that does."""
+
+    environment: Annotated[
+        Path | None,
+        arg(metavar="ENV", help="Light of the capture: lat-long, .exr or .hdr; a capture's own by default."),
+    ] = None
+    relight: Annotated[
+        Path | None, arg(metavar="ENV", help="Another light for the overview; the capture's, turned, by default.")
+    ] = None
+    orbit: Annotated[
+        tuple[float, float], arg(metavar="AZIMUTH ELEVATION", help="Where the overview looks from, in degrees.")
+    ] = (0.0, 5.0)
+    rotate: Annotated[float, arg(metavar="DEG", help="Turn the light about z, counter-clockwise from above.")] = 0.0
+    exposure: Annotated[
+        float | Literal["auto"],
+        arg(metavar="STOPS|auto", help="Brighten the light by powers of two; auto where the colour has no scale."),
+    ] = "auto"
+    roughness: Annotated[
+        float | Literal["estimate"] | Path | None,
+        arg(
+            metavar="VALUE|estimate|FILE",
+            help="Roughness of everything, found from highlights, or a texture (with --roughness-mesh). "
+            "By default found where there is a capture, else 0.5.",
+        ),
+    ] = None
+    roughness_mesh: Annotated[
+        Path | None, arg(metavar="FILE", help="Mesh whose texture coordinates the roughness texture follows.")
+    ] = None
+    samples: Annotated[int, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light.")] = 64
+    offset: Annotated[
+        float | Literal["auto"], arg(metavar="M|auto", help="Lift of ray origins off the surface, in metres.")
+    ] = "auto"
+    bounce: Annotated[bool, arg(help="Account for one bounce of light between surfaces.")] = True
+
+
+@dataclass(frozen=True)
+class Decompose:
+    """Decompose Gaussians into base colour, roughness, ambient occlusion and normals, with their standard errors.
+
+    Light is gathered where the capture's images show the surface, and base colour explains what they show, over all
+    views and frames. Writes OUT/asset.usda (+ layers), OUT/report.json and OUT/overview.png. A job that was stopped
+    continues where it was. Without --capture, the Gaussians' own colour is explained.
+
+    Example: beam decompose walker/gaussians.usda --capture captures/walker --out walker_asset
+
+    Example: beam decompose walker/gaussians.usda --capture captures/walker --preset paper --out walker_paper
+    """
+
+    sequence: Annotated[
+        Positional[Path], arg(metavar="SEQ", help="PLY or USD file, or a folder of numbered PLY files.")
+    ]
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
+    capture: Annotated[
+        Path | None, arg(metavar="CAPTURE", help="Folder of the capture that SEQ was reconstructed from.")
+    ] = None
+    preset: Annotated[
+        Literal["direct", "paper"],
+        arg(help="Rays from every Gaussian (ours), or from every pixel as in the paper: 50 and 100 rays, 2 cm offset."),
+    ] = "direct"
+    measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
+    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+
+
+def decompose(args: Decompose) -> int:
+    """Run the job and say what came out; all that was asked is checked before the first frame is worked on."""
+    started = time.perf_counter()
+    capture = None if args.capture is None else Capture.read(args.capture)
+    if args.preset == "paper" and capture is None:
+        raise InvalidOptionError(
+            "capture must be given for the preset paper, got none: it works on images. Name one with --capture."
+        )
+    environment = EnvironmentMap.read(light_of(args.measuring, capture, args.sequence)).rotated(args.measuring.rotate)
+    sequence = converters.read(args.sequence)
+
+    from beam_warp.pipeline import run as run_pipeline
+
+    with progress(args.quiet or args.json) as report:
+        result = run_pipeline(
+            sequence,
+            environment,
+            args.out,
+            run_options(
+                args.measuring, capture, preset=args.preset, seed=args.seed, device=args.device, persistent=False
+            ),
+            capture=capture,
+            overview=overview_options(args.measuring),
+            progress=report,
+        )
+    if args.json:
+        print_json(result.report)
+    elif not args.quiet:
+        print_warnings(result.report["input"]["notes"], result.report["warnings"])
+        print(outcome(result, time.perf_counter() - started))
+    return 0
+
+
+def light_of(measuring: Measuring, capture: Capture | None, source: Path) -> Path:
+    """Return the file of the light.
+
+    Raises:
+        InvalidOptionError: There is none.
+    """
+    light = measuring.environment or (None if capture is None else capture.environment_path)
+    if light is None:
+        whose = "Gaussians come" if capture is None else "this capture comes"
+        raise InvalidOptionError(
+            f"environment must be given, got none for {source}: {whose} without their light. "
+            "Name a lat-long image with --environment."
+        )
+    return light
+
+
+def run_options(
+    measuring: Measuring,
+    capture: Capture | None,
+    *,
+    preset: Literal["direct", "paper"],
+    seed: int,
+    device: str | None,
+    persistent: bool,
+) -> RunOptions:
+    """Return the options that the words ask for.
+
+    Raises:
+        InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
+    """
+    from beam_warp.frame_inputs import RoughnessTexture
+    from beam_warp.materials import MaterialOptions
+    from beam_warp.pipeline import RunOptions
+
+    stated = measuring.roughness
+    if isinstance(stated, Path) != (measuring.roughness_mesh is not None):
+        raise InvalidOptionError(
+            "roughness-mesh must be given with a roughness texture, and only then, got "
+            f"{measuring.roughness_mesh} with {stated}. Give both or neither."
+        )
+    roughness: Any = stated
+    if isinstance(stated, Path) and measuring.roughness_mesh is not None:
+        roughness = RoughnessTexture(stated, measuring.roughness_mesh)
+    elif stated is None:
+        roughness = 0.5 if capture is None or preset == "paper" else "estimate"
+    return RunOptions(
+        materials=MaterialOptions(
+            sample_count=measuring.samples, offset=measuring.offset, bounce=measuring.bounce, seed=seed
+        ),
+        preset=preset,
+        roughness=roughness,
+        exposure=measuring.exposure,
+        persistent=persistent,
+        device=device,
+    )
+
+
+def overview_options(measuring: Measuring) -> OverviewOptions:
+    """Return what the contact sheet shows."""
+    from beam_warp.contact_sheet import Relighting
+    from beam_warp.pipeline import OverviewOptions
+
+    light = measuring.relight
+    return OverviewOptions(
+        second_light=None if light is None else Relighting(light.stem, EnvironmentMap.read(light)),
+        azimuth=measuring.orbit[0],
+        elevation=measuring.orbit[1],
+    )
+
+
+def print_warnings(notes: list[str], warnings: list[str]) -> None:
+    """Say what a user should know, beside the results."""
+    for line in [f"note: {note}" for note in notes] + [f"warning: {warning}" for warning in warnings]:
+        print(line, file=sys.stderr)
+
+
+def outcome(result: RunResult, seconds: float) -> str:
+    """Return what came out, in some lines."""
+    materials = result.report["materials"]
+    frames = len(result.sequence)
+    return (
+        f"wrote {result.asset}: {frames} frame{'s' if frames > 1 else ''}, "
+        f"{result.report['input']['gaussians']:,} Gaussians, {seconds:.1f} s on {result.report['device']['name']}\n"
+        f"exposure of the light {result.report['exposure_stops']:+.2f} stops, "
+        f"mean ambient occlusion {materials['mean_ambient_occlusion']:.3f}\n"
+        f"mean standard error of base colour {materials['mean_base_color_error_where_measured']:.3f}, "
+        f"{materials['flags']['FILLED']:,} Gaussians filled from neighbours\n"
+        f"overview: {result.overview}"
+    )
