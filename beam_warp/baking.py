@@ -58,6 +58,10 @@ GROUP_PIXELS = 2**23
 """Most pixels drawn at a time unless one view has more."""
 
 
+LEAST_EVIDENCE = 1e-6
+"""Pixels below which a mean of what a Gaussian is seen in is one of rounding."""
+
+
 @dataclass(frozen=True, eq=False)
 class BakeTarget:
     """What one view should show.
@@ -141,7 +145,8 @@ def bake(
     gaussians: GaussianArrays,
     views: Sequence[BakeTarget],
     *,
-    prior: ArrayLike,
+    prior: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     previous: ArrayLike | None = None,
     options: BakeOptions | None = None,
     raster_options: RasterOptions | None = None,
@@ -152,8 +157,10 @@ def bake(
     Args:
         gaussians: Geometry on the device; its values are not read.
         views: At least one, of any sizes, all with K columns, at most `MOST_COLUMNS`.
-        prior: What values are without evidence, and where solving begins, ``(N, K)``.
-        previous: Values of the frame before, ``(N, K)``; for ``temporal``.
+        prior: What values are pulled to, ``(N, K)``; without, the mean of the targets that each Gaussian is seen in,
+            weighted by how much it is seen there, and the middle of the bounds where it is not.
+        start: Where solving begins, ``(N, K)``; the prior without.
+        previous: Values of the frame before, ``(N, J)``, for ``temporal``: it pulls at the first J columns, J at most K.
         options: See `BakeOptions`.
         raster_options: How splats are drawn: as they were fitted.
         device: Where the arrays are.
@@ -168,27 +175,36 @@ def bake(
     if not views:
         raise InvalidOptionError("views must hold at least one view, got none. Pass what the cameras saw.")
     chosen = options or BakeOptions()
-    count = len(gaussians.positions)
-    start = require_array("prior", prior, (count, None), np.float32)
-    require_finite("prior", start)
-    columns = start.shape[1]
-    require_count("columns of prior", columns, 1, MOST_COLUMNS)
-    before = None
-    if previous is not None:
-        before = require_array("previous", previous, (count, columns), np.float32)
-        require_finite("previous", before)
-    elif chosen.temporal > 0.0:
+    count, columns = len(gaussians.positions), require_columns(views)
+    given = {}
+    for name, array, width in (("prior", prior, columns), ("start", start, columns), ("previous", previous, None)):
+        if array is not None:
+            given[name] = require_array(name, array, (count, width))
+            require_finite(name, given[name])
+    if chosen.temporal > 0.0 and previous is None:
         raise InvalidArrayError("previous must be given for a temporal term, got None. Pass the last frame's values.")
+    if "previous" in given and given["previous"].shape[1] > columns:
+        raise InvalidArrayError(
+            f"previous must have at most the {columns} columns of the targets, got {given['previous'].shape[1]}. "
+            "Drop the others."
+        )
     with wp.ScopedDevice(device):
         problem = _BlendedImages(gaussians, views, columns, chosen, raster_options, device)
-        problem.anchor(start, before)
-        values = problem.start(start)
+        evidence = problem.evidence.numpy()
+        center = given.get("prior", problem.mean_targets(evidence))
+        problem.anchor(center, given.get("previous"))
+        values = problem.start(given.get("start", center))
         if chosen.solver == "cg":
             passes, residuals = _solve_by_gradients(problem, values)
         else:
             passes, residuals = _solve_by_adam(problem, values)
-        evidence = problem.evidence.numpy()[:, :columns]
-        return BakedValues(values.numpy()[:, :columns], evidence, passes, residuals[:, :columns])
+        return BakedValues(values.numpy()[:, :columns], evidence[:, :columns], passes, residuals[:, :columns])
+
+
+def require_columns(views: Sequence[BakeTarget]) -> int:
+    """Return the number of columns of all targets."""
+    shape = np.shape(views[0].targets)
+    return require_count("columns of targets", shape[2] if len(shape) == 3 else 0, 1, MOST_COLUMNS)
 
 
 def _back_project(rasterizer: Rasterizer, pixels: wp.array) -> wp.array:
@@ -246,19 +262,31 @@ class _BlendedImages:
                     wp.copy(whole[rows, :columns], given.reshape((-1, columns)))
             self.groups.append(_Group(rasterizer, targets, weights))
         self.evidence = self._row_sums()
-        self.strength = wp.full((self.count, self.width), options.ridge + options.temporal, dtype=float)
+        self.strength = wp.zeros((self.count, self.width), dtype=float)
         self._anchors = wp.zeros((self.count, self.width), dtype=float)
         self._no_anchors = wp.empty((0, 0), dtype=float)
 
+    def mean_targets(self, evidence: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the mean of what each Gaussian is seen in, ``(N, K)``: W' M t / W' M W 1."""
+        sums = wp.zeros((self.count, self.width), dtype=float)
+        nothing = wp.zeros((self.count, self.width), dtype=float)
+        for group in self.groups:
+            self.add_gradient(group, nothing, sums)
+        middle = np.full(evidence.shape, 0.5 * (self.options.low + self.options.high), np.float32)
+        means = np.divide(-sums.numpy(), evidence, out=middle, where=evidence > LEAST_EVIDENCE)
+        return np.clip(means[:, : self.columns], self.options.low, self.options.high)
+
     def anchor(self, prior: NDArray[np.float32], previous: NDArray[np.float32] | None) -> None:
         """Join both pulls, which are quadratic: one towards their weighted mean."""
-        options = self.options
-        total = options.ridge + options.temporal
-        if total > 0.0:
-            pull = options.ridge * prior.astype(np.float64)
-            if previous is not None:
-                pull += options.temporal * previous
-            self._anchors.assign(self._padded(pull / total))
+        ridge, temporal = self.options.ridge, self.options.temporal
+        strength = np.full((self.count, self.width), ridge)
+        pull = ridge * self._padded(prior).astype(np.float64)
+        if previous is not None:
+            strength[:, : previous.shape[1]] += temporal
+            pull[:, : previous.shape[1]] += temporal * previous.astype(np.float64)
+        means = np.divide(pull, strength, out=np.zeros_like(pull), where=strength > 0.0)
+        self._anchors.assign(means.astype(np.float32))
+        self.strength.assign(strength.astype(np.float32))
 
     def start(self, values: NDArray[np.float32]) -> wp.array:
         """Return values on the device, within the bounds."""

@@ -1,4 +1,4 @@
-"""Diffuse and specular residue of surface points towards one camera (BEAM Eqs. 4 and 5), by independent samples.
+"""Diffuse and specular residue of surface points towards one camera (BEAM Eqs. 5 and 6), by independent samples.
 
 Both come from the same rays. A point's rays are drawn by three densities: the environment, the cosine, and the visible
 normals of its GGX lobe; each is divided by the density of all three together (balance heuristic, Veach 1997, 9.2), so
