@@ -301,7 +301,7 @@ class _BlendedImages:
     def _draw(self, group: _Group, values: wp.array) -> wp.array:
         """Return what a group shows of values, ``(P, K)``."""
         wp.copy(self._drawn_values, values)
-        return group.rasterizer.redraw().channels[0]
+        return group.rasterizer.redraw_values().channels[0]
 
     def _row_sums(self) -> wp.array:
         """Return W' M W 1: how many pixels each value is seen by."""
