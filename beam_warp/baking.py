@@ -102,7 +102,7 @@ class BakeOptions:
     passes: int = 40
     tolerance: float = 1e-4
     steps: int = 5000
-    learning_rate: float = 0.02
+    learning_rate: float = 0.05
     ridge: float = 1e-3
     temporal: float = 0.0
     low: float = 0.0
@@ -160,7 +160,7 @@ def bake(
         prior: What values are pulled to, ``(N, K)``; without, the mean of the targets that each Gaussian is seen in,
             weighted by how much it is seen there, and the middle of the bounds where it is not.
         start: Where solving begins, ``(N, K)``; the prior without.
-        previous: Values of the frame before, ``(N, J)``, for ``temporal``: it pulls at the first J columns, J at most K.
+        previous: Values of the frame before, ``(N, J)``, for ``temporal``: it pulls at the first J columns.
         options: See `BakeOptions`.
         raster_options: How splats are drawn: as they were fitted.
         device: Where the arrays are.
@@ -247,13 +247,9 @@ class _BlendedImages:
         alone = options.solver == "adam"  # a step is a view
         for part in _groups([view.camera for view in views], self.count, alone):
             cameras = [views[i].camera for i in part]
-            rasterizer = Rasterizer(
-                self.count, cameras, value_count=self.width, options=raster_options, device=device
-            )
+            rasterizer = Rasterizer(self.count, cameras, value_count=self.width, options=raster_options, device=device)
             rasterizer.draw(gaussians._replace(values=self._drawn_values, radiance=None))
-            targets, weights = (
-                wp.zeros((rasterizer.first_pixels[-1], self.width), dtype=float) for _ in range(2)
-            )
+            targets, weights = (wp.zeros((rasterizer.first_pixels[-1], self.width), dtype=float) for _ in range(2))
             for place, i in enumerate(part):
                 rows = slice(*rasterizer.first_pixels[place : place + 2])
                 shape = (cameras[place].height, cameras[place].width, columns)

@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from beam_warp.cameras import Camera
 from beam_warp.checks import require_choice
@@ -180,19 +179,28 @@ def _filter_by_rounds(colors: wp.array, error: wp.array, guides: Any) -> wp.arra
 
 
 def _filter_by_oidn(colors: wp.array, guides: SurfaceGuides, hdr: bool) -> wp.array:
-    """Hand an image to Open Image Denoise: on the CPU, whatever the device, so that results do not depend on it."""
+    """Hand an image to Open Image Denoise: on the CPU, whatever the device, so that results do not depend on it.
+
+    The background gets the mean of the surface: a black one bleeds into the rim, where it costs 0.08 RMS of 0.85
+    against 0.02, as measured on a ball at 0.05 noise; and so does an albedo that ends there.
+    """
     package = _open_image_denoise()
     shape = (guides.camera.height, guides.camera.width, 3)
-
-    def image(vectors: wp.array) -> NDArray[np.float32]:
-        return np.ascontiguousarray(vectors.numpy().reshape(shape))
-
-    normals = image(guides.normals)
-    white = np.repeat((np.abs(normals).max(axis=2, keepdims=True) > 0.0).astype(np.float32), 3, axis=2)
+    normals = np.ascontiguousarray(guides.normals.numpy().reshape(shape))
+    surface = np.abs(normals).max(axis=2) > 0.0
+    if not surface.any():
+        return colors
+    image = colors.numpy().reshape(shape).copy()
+    image[~surface] = image[surface].mean(axis=0, dtype=np.float64)
     clean = package.denoise(
-        image(colors), albedo=white, normal=normals, hdr=hdr, clean_aux=True, device=_oidn_device(package)
+        image,
+        albedo=np.ones(shape, np.float32),
+        normal=normals,
+        hdr=hdr,
+        clean_aux=True,
+        device=_oidn_device(package),
     )
-    return upload(np.asarray(clean).reshape(-1, 3) * white.reshape(-1, 3), wp.vec3, colors.device)
+    return upload((np.asarray(clean) * surface[..., None]).reshape(-1, 3), wp.vec3, colors.device)
 
 
 @cache

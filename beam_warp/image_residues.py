@@ -21,8 +21,8 @@ from beam_warp.ggx import specular_albedo_table
 from beam_warp.kernels.image_residues import (
     ALBEDO_SCALING,
     FRESNEL_HV,
-    ResidueSamples,
     Residues,
+    ResidueSamples,
     launch_draw_residue_rays,
     launch_reduce_residues,
 )

@@ -85,9 +85,7 @@ def launch_weigh_residuals(drawn: Any, targets: Any, weights: Any, out_pixels: A
 
 def launch_add_pull(values: Any, anchors: Any, strength: Any, scale: float, out_sums: Any, device: Any) -> None:
     """Add the gradient of half of strength times the squared distance from the anchors."""
-    launch(
-        add_pull_kernel, values.size, inputs=[values, anchors, strength, scale], outputs=[out_sums], device=device
-    )
+    launch(add_pull_kernel, values.size, inputs=[values, anchors, strength, scale], outputs=[out_sums], device=device)
 
 
 def launch_add_rows(rows: Any, out_sums: Any, device: Any) -> None:

@@ -29,6 +29,7 @@ WALK = wp.constant(0)
 FREE = wp.constant(1)
 SHIFT = wp.constant(2)
 
+
 @wp.struct
 class Problem:
     """State of all columns, ``(N, K)`` each."""
@@ -94,9 +95,7 @@ def over_scaling(problem: Problem, row: int, column: int, value: float) -> float
 
 
 @wp.kernel
-def sum_direction_kernel(
-    first: int, problem: Problem, out_sums: wp.array2d[wp.vec2d], out_rooms: wp.array2d[float]
-):
+def sum_direction_kernel(first: int, problem: Problem, out_sums: wp.array2d[wp.vec2d], out_rooms: wp.array2d[float]):
     """(g'd, d'Ad) and the room along -d of the rows of a lane."""
     item = first + wp.tid()
     columns = problem.x.shape[1]

@@ -1,8 +1,8 @@
 """Noise taken off images by averaging over the surface around each pixel: an edge-avoiding a-trous filter.
 
-Five rounds of a 5 x 5 B-spline whose taps lie 1, 2, 4, 8 and 16 pixels apart (Dammertz et al. 2010). A tap counts by how
-well its normal agrees, by how near it is to the pixel's tangent plane, and by how few of its standard errors its value
-is off, which are filtered along (Schied et al. 2017). Pixels that show no surface neither give nor take.
+Five rounds of a 5 x 5 B-spline whose taps lie 1, 2, 4, 8 and 16 pixels apart (Dammertz et al. 2010). A tap counts by
+how well its normal agrees, by how near it is to the pixel's tangent plane, and by how few of its standard errors its
+value is off, which are filtered along (Schied et al. 2017). Pixels that show no surface neither give nor take.
 """
 
 from typing import Any
@@ -25,7 +25,8 @@ VALUE_ERRORS = wp.constant(3.0)
 """Standard errors of a difference at which a tap counts exp(-1)."""
 
 FIREFLY = wp.constant(5.0)
-"""Times the mean of its 24 neighbours on the surface is what a pixel may be at most before filtering."""
+"""Times the mean of its 24 neighbours on the surface is what a pixel may be at most before filtering, by the largest
+channel."""
 
 TINY = wp.constant(1.0e-12)
 
@@ -62,15 +63,15 @@ def is_surface(guides: Guides, x: int, y: int) -> bool:
 def surface_point(guides: Guides, x: int, y: int) -> wp.vec3:
     """In camera axes."""
     ray = wp.vec3(
-        (float(x) + 0.5 - guides.center[0]) / guides.focal[0], (float(y) + 0.5 - guides.center[1]) / guides.focal[1], 1.0
+        (float(x) + 0.5 - guides.center[0]) / guides.focal[0],
+        (float(y) + 0.5 - guides.center[1]) / guides.focal[1],
+        1.0,
     )
     return guides.depth[y * guides.width + x] * ray
 
 
 @wp.kernel
-def clamp_fireflies_kernel(
-    first: int, guides: Guides, values: wp.array[wp.vec3], out_values: wp.array[wp.vec3]
-):
+def clamp_fireflies_kernel(first: int, guides: Guides, values: wp.array[wp.vec3], out_values: wp.array[wp.vec3]):
     pixel = first + wp.tid()
     x = pixel % guides.width
     y = pixel / guides.width
@@ -81,10 +82,10 @@ def clamp_fireflies_kernel(
         for dy in range(-2, 3):
             for dx in range(-2, 3):
                 if (dx != 0 or dy != 0) and is_surface(guides, x + dx, y + dy):
-                    total += luminance(values[(y + dy) * guides.width + x + dx])
+                    total += wp.max(values[(y + dy) * guides.width + x + dx])
                     count += 1.0
         limit = FIREFLY * total
-        own = luminance(value) * count
+        own = wp.max(value) * count
         if count > 0.0 and own > limit:
             value = value * (limit / own)
     out_values[pixel] = value
@@ -97,9 +98,7 @@ def square_errors_kernel(first: int, errors: wp.array[float], out_variances: wp.
 
 
 @wp.kernel
-def smooth_variances_kernel(
-    first: int, guides: Guides, variances: wp.array[float], out_variances: wp.array[float]
-):
+def smooth_variances_kernel(first: int, guides: Guides, variances: wp.array[float], out_variances: wp.array[float]):
     """A sample's own estimate of its error is noisy where samples are few: the mean of 3 x 3 pixels is less so."""
     pixel = first + wp.tid()
     x = pixel % guides.width

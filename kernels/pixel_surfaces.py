@@ -1,4 +1,4 @@
-"""The surface points that the pixels of one view show: which pixels have one, and where it is; no others cost anything."""
+"""The surface points that the pixels of one view show: which pixels have one, and where it is."""
 
 from typing import Any
 
@@ -95,9 +95,7 @@ def scatter_floats_kernel(first: int, pixels: wp.array[int], values: wp.array[fl
 
 
 @wp.kernel
-def scatter_vectors_kernel(
-    first: int, pixels: wp.array[int], values: wp.array[wp.vec3], out_image: wp.array[wp.vec3]
-):
+def scatter_vectors_kernel(first: int, pixels: wp.array[int], values: wp.array[wp.vec3], out_image: wp.array[wp.vec3]):
     row = first + wp.tid()
     out_image[pixels[row]] = values[row]
 

@@ -138,9 +138,7 @@ class TestRecovery:
             drawn = rasterize_values(cloud, camera, truth, device=device).values
             views.append(BakeTarget(camera, drawn, np.ones_like(drawn)))
         where = resolve_device(device)
-        found = bake(
-            upload_gaussians(cloud, where), views, options=BakeOptions(ridge=0.0, passes=60), device=where
-        )
+        found = bake(upload_gaussians(cloud, where), views, options=BakeOptions(ridge=0.0, passes=60), device=where)
         seen = found.evidence[:, 0] > 5.0
         assert seen.sum() > 200
         error = np.abs(found.values - truth)[seen]
@@ -223,7 +221,7 @@ class TestRepeats:
 class TestRefusals:
     def test_no_views(self, device):
         where = resolve_device(device)
-        with pytest.raises(InvalidOptionError, match="^views must hold at least one view"):
+        with pytest.raises(InvalidOptionError, match=r"^views must hold at least one view"):
             bake(upload_gaussians(problem(device).cloud, where), [], device=where)
 
     @pytest.mark.parametrize(
@@ -235,16 +233,16 @@ class TestRefusals:
             BakeOptions(**options)
 
     def test_bounds_out_of_order(self):
-        with pytest.raises(InvalidOptionError, match="^high must be"):
+        with pytest.raises(InvalidOptionError, match=r"^high must be"):
             BakeOptions(low=0.5, high=0.4)
 
     def test_arrays(self, device):
         made = problem(device)
-        with pytest.raises(InvalidArrayError, match="^prior must"):
+        with pytest.raises(InvalidArrayError, match=r"^prior must"):
             made.bake(prior=made.prior[:, :3])
-        with pytest.raises(InvalidArrayError, match="^previous must be given"):
+        with pytest.raises(InvalidArrayError, match=r"^previous must be given"):
             made.bake(temporal=1.0)
-        with pytest.raises(InvalidArrayError, match="^previous must have at most the 4 columns"):
+        with pytest.raises(InvalidArrayError, match=r"^previous must have at most the 4 columns"):
             made.bake(previous=np.zeros((60, 5), np.float32), temporal=1.0)
         other = Problem(device)
         other.masks[1] = other.masks[1][..., :3]

@@ -52,8 +52,8 @@ class TestSurfaces:
         toward = -camera.directions().reshape(-1, 3)[pixels]
         np.testing.assert_allclose(images.to_camera.numpy(), toward, atol=1e-6)
         # inside, largest responses are in the plane but for the Gaussians' thickness, 1e-3 of 0.65 spacings; what the
-        # pixel filter shows of one beyond three deviations has its depth cut there: alpha 0.99 exp(-4.5) at most, by the
-        # filter's deviation of half a pixel, which is 12 mm there; the median does not feel it
+        # pixel filter shows of one beyond three deviations has its depth cut there: alpha 0.99 exp(-4.5) at most, by
+        # the filter's deviation of half a pixel, which is 12 mm there; the median does not feel it
         t = camera.position[2] / toward[:, 2]
         inside = np.linalg.norm((camera.position - t[:, None] * toward)[:, :2], axis=1) < 0.8
         height = np.abs(images.positions.numpy()[inside, 2])
@@ -121,7 +121,8 @@ class TestOcclusion:
         at = found.rows.positions.numpy()
         away = np.linalg.norm(at[:, :2], axis=1).mean()
         open_part = [
-            (height - 0.02) ** 2 / (r**2 + (height - 0.02) ** 2) for r in (radius + 1.3 * spacing, radius - 0.5 * spacing)
+            (height - 0.02) ** 2 / (r**2 + (height - 0.02) ** 2)
+            for r in (radius + 1.3 * spacing, radius - 0.5 * spacing)
         ]
         sideways = 0.5 * away**2 / (height**2) * open_part[1]  # the second-order change off the axis
         assert open_part[0] - noise - sideways < result.visibility.numpy().mean() < open_part[1] + noise + sideways
@@ -278,5 +279,5 @@ def test_refusals(options):
     light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
     with pytest.raises(InvalidOptionError, match=f"^{next(iter(options))} must be"):
         surface_residues(nothing("cpu"), found, light, **options)
-    with pytest.raises(InvalidOptionError, match="^surface_depth must be"):
+    with pytest.raises(InvalidOptionError, match=r"^surface_depth must be"):
         surfaces_of(ball(50), looking_at(size=2), wp.get_device("cpu"), surface_depth="nearest")
