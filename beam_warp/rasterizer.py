@@ -289,6 +289,22 @@ class Rasterizer:
             self._composite()
         return self.images
 
+    def redraw_values(self) -> RasterImages:
+        """Draw the last frame again after the contents of its values changed and nothing else, without waiting.
+
+        Splats and their order are taken as they are, which is about half of the work; the bits are those of `redraw`.
+
+        Raises:
+            InvalidOptionError: Nothing was drawn.
+        """
+        gaussians = self._drawn_gaussians("redraw_values")
+        if len(self._bands) > 1:
+            return self.draw(gaussians)
+        with wp.ScopedDevice(self.device):
+            self._gather_channels()
+            self._composite()
+        return self.images
+
     def adjoints(self) -> RasterImages:
         """Return the buffers of a loss's derivatives to `images`, zeros at first; fill them, then call `backward`."""
         with wp.ScopedDevice(self.device):
@@ -424,11 +440,15 @@ class Rasterizer:
             )
         if self.value_channels:
             self._blocks.values = gaussians.values
-        for i, rows in enumerate(self._rows):
-            launch_gather_channels(self._blocks, i * CHANNEL_COUNTS[-1], rows.matrix, self.device)
+        self._gather_channels()
         launch_key_splats(self._splats, self._keys, self._order, self.device)
         if len(self._counts):
             wp.utils.radix_sort_pairs(self._keys, self._order, len(self._counts))
+
+    def _gather_channels(self) -> None:
+        """Write every splat's row of channels."""
+        for i, rows in enumerate(self._rows):
+            launch_gather_channels(self._blocks, i * CHANNEL_COUNTS[-1], rows.matrix, self.device)
 
     def _plan_bands(self) -> list[tuple[int, int]]:
         """Cut the tiles into runs of rows whose pairs fit, usually one, and make room for the largest."""

@@ -167,7 +167,7 @@ def test_a_frame_that_is_refused_cannot_be_drawn_again(rng, monkeypatch):
         limits.setattr(rasterizer, "MAX_BAND_PAIRS", 1)
         with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 1 times, got"):
             drawer.draw(arrays)
-    for call in (drawer.redraw, drawer.backward):
+    for call in (drawer.redraw, drawer.redraw_values, drawer.backward):
         with pytest.raises(InvalidOptionError, match="must follow draw"):
             call()
     drawer.draw(arrays)
@@ -241,6 +241,26 @@ def test_redraw_follows_contents_and_cameras(device, rng):
     filled(np.random.default_rng(1), drawer)
     fresh = Rasterizer(200, [around(azimuth=110.0)], value_count=3, device=device)
     fresh.draw(upload_gaussians(moved, fresh.device, values=values))
+    filled(np.random.default_rng(1), fresh)
+    for one, other in zip(state(drawer), state(fresh), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("limit", [2**24, 300])
+def test_values_are_redrawn_alone(device, rng, monkeypatch, limit):
+    """The bits of a frame drawn anew, and the gradients of what is shown now; also where there are bands."""
+    monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+    made = cloud(rng)
+    values, others = rng.uniform(0, 1, (2, 200, 3)).astype(np.float32)
+    cameras = [around(50, 40), around(20, 40, 80.0)]
+    drawer = Rasterizer(200, cameras, value_count=3, normals=True, device=device)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    drawer.draw(arrays)
+    arrays.values.assign(others)
+    drawer.redraw_values()
+    filled(np.random.default_rng(1), drawer)
+    fresh = Rasterizer(200, cameras, value_count=3, normals=True, device=device)
+    fresh.draw(upload_gaussians(made, fresh.device, values=others))
     filled(np.random.default_rng(1), fresh)
     for one, other in zip(state(drawer), state(fresh), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -499,7 +519,7 @@ def test_errors_name_the_contract(rng):
     with pytest.raises(InvalidOptionError, match="depth must be one of plane, exact"):
         RasterOptions(depth="median")  # pyright: ignore[reportArgumentType]
     drawer = Rasterizer(200, [around()], value_count=2, device="cpu")
-    for call in (drawer.redraw, drawer.backward):
+    for call in (drawer.redraw, drawer.redraw_values, drawer.backward):
         with pytest.raises(InvalidOptionError, match="must follow draw, got no draw before it"):
             call()
     arrays = upload_gaussians(made, drawer.device, values=np.zeros((200, 2), np.float32))
