@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp._version import __version__
-from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.assets import ATTRIBUTES, DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence, Observability
 from beam_warp.base_color import BaseColor, solve_base_color
 from beam_warp.cameras import Camera, bulk
 from beam_warp.capture_digests import CaptureDigests
@@ -29,6 +29,7 @@ from beam_warp.environments import EnvironmentMap
 from beam_warp.exposure import estimate_exposure
 from beam_warp.frame_inputs import CaptureImages, FrameInputs, RoughnessTexture, filled_occlusion
 from beam_warp.frame_store import frame_key, make_folders, read_frame, write_frame
+from beam_warp.image_path import ImagePathOptions, decompose_by_images
 from beam_warp.images import write_png
 from beam_warp.material_light import MaterialLight
 from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
@@ -41,6 +42,7 @@ Progress = Callable[[str, int, int], None]
 
 ASSET_NAME = "asset.usda"
 EVIDENCE = "evidence_"
+UNMEASURED = Observability.UNSEEN | Observability.FILLED
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
@@ -52,8 +54,10 @@ class RunOptions:
     """What the main job is asked for.
 
     Attributes:
-        materials: Rays, offset, bounce, seed.
-        roughness: Perceptual roughness of everything, or a texture.
+        materials: Rays, offset, bounce, seed of the direct path.
+        images: Take the image path, the paper's, with these options; None takes the direct one.
+        roughness: Perceptual roughness of everything, a texture, or ``"estimate"``: found from the specular residue
+            over views and frames.
         exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
             colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear.
         persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
@@ -62,7 +66,8 @@ class RunOptions:
     """
 
     materials: MaterialOptions = field(default_factory=MaterialOptions)
-    roughness: float | RoughnessTexture = 0.5
+    images: ImagePathOptions | None = None
+    roughness: float | RoughnessTexture | Literal["estimate"] = 0.5
     exposure: float | Literal["auto"] = "auto"
     persistent: bool = False
     device: str | None = None
@@ -295,7 +300,23 @@ class _Job:
         if frame_key(self.path(number)) == key:
             self.resumed += 1
             return
-        scene, points, surface, views = frame.scene, frame.points, frame.surface, frame.views
+        found = self._by_rays(frame) if self.options.images is None else self._by_images(frame)
+        arrays = {
+            **frame.cloud.arrays(),
+            "normals": frame.surface.normals,
+            "normal_confidence": frame.surface.confidence,
+            **found,
+            "from_shape": frame.surface.from_shape,
+            "report": np.array(
+                [frame.scene.report.traced, frame.scene.report.dropped, frame.scene.report.raised_scales]
+            ),
+        }
+        with self.timer("store"):
+            write_frame(self.path(number), key, arrays)
+
+    def _by_rays(self, frame: FrameInputs) -> dict[str, NDArray[Any]]:
+        """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
+        scene, points, views = frame.scene, frame.points, frame.views
         roughness = self._roughness(frame)
         with self.timer("materials"):
             measured = measure_materials(
@@ -306,26 +327,50 @@ class _Job:
                 self.light,
                 options=self.options.materials,
                 views=views,
-                frame=number,
-                progress=self.within("materials", number),
+                frame=frame.number,
+                progress=self.within("materials", frame.number),
             )
         with self.timer("fill"):
             occlusion, occlusion_error = filled_occlusion(
                 frame, measured.ambient_occlusion, measured.ambient_occlusion_error
             )
-        arrays = {
-            **frame.cloud.arrays(),
+        return {
             "ambient_occlusion": occlusion,
             "ambient_occlusion_error": occlusion_error,
-            "normals": surface.normals,
-            "normal_confidence": surface.confidence,
             "roughness": roughness,
             **{EVIDENCE + name: getattr(measured.evidence, name) for name in ColorEvidence.ARRAYS},
-            "from_shape": surface.from_shape,
-            "report": np.array([scene.report.traced, scene.report.dropped, scene.report.raised_scales]),
         }
-        with self.timer("store"):
-            write_frame(self.path(number), key, arrays)
+
+    def _by_images(self, frame: FrameInputs) -> dict[str, NDArray[Any]]:
+        """Measure a frame by rays from the pixels of its views, baked into its Gaussians: all materials at once."""
+        assert self.options.images is not None
+        assert self._images is not None
+        previous = None
+        if self.persistent and frame.number > 0:
+            previous = read_frame(self.path(frame.number - 1), ("base_color",))["base_color"]
+        scene, roughness = frame.scene, self._roughness(frame)
+        with self.timer("read images"):
+            views = self._images.views(frame.number)
+        with self.timer("materials"):
+            found = decompose_by_images(
+                frame.cloud,
+                scene,
+                views,
+                roughness,
+                self.light.sampled,
+                self.options.images,
+                raster_options=self._images.raster,
+                previous=previous,
+                frame=frame.number,
+                progress=self.within("materials", frame.number),
+            )
+        self._notes.update(dict.fromkeys(found.notes))
+        return {
+            "ambient_occlusion": found.ambient_occlusion,
+            "roughness": roughness,
+            "base_color": found.base_color,
+            "observability": np.where(found.filled.any(axis=1), np.uint8(UNMEASURED), np.uint8(0)),
+        }
 
     def stored_cloud(self, frame: int) -> GaussianCloud:
         """Return what is known of a frame before base colour is solved."""
