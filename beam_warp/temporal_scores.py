@@ -29,6 +29,9 @@ LEAST_COSINE = 0.3
 LEVEL_PIXELS = 5.0
 """Depths around a point may differ by so many widths of a pixel there: 3.2 come of a slope of `LEAST_COSINE`."""
 
+LEAST_LASTING = 0.9
+"""Part of the triangles that must stay: exporters cut a few squares along the other diagonal as they bend."""
+
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
@@ -163,7 +166,8 @@ def surface_scores(
 
     Args:
         sequence: With base colour.
-        capture: Its ``truth/mesh_FFFF.npz`` are of one topology.
+        capture: Its ``truth/mesh_FFFF.npz`` are of one topology; triangles that are cut otherwise in some frame are
+            left out.
         matched: See `beam_warp.capture_matching.match_frames`.
         split: Which records are the views. A camera that stands still is used in all frames, also in those of which
             there is no image.
@@ -181,16 +185,17 @@ def surface_scores(
     frames = [frame for frame in sorted(matched) if (capture.folder / f"truth/mesh_{frame:04d}.npz").is_file()]
     if len(frames) < 2:
         return "fewer than two frames of the asset have a true surface"
+    lasting = _lasting_faces(capture, frames)
+    if not lasting.mean() >= LEAST_LASTING:
+        return "the true surface is not of one topology in all frames"
     followed: _Followed | None = None
     for done, frame in enumerate(frames, start=1):
         mesh = read_truth_mesh(capture, frame)
+        tree = SurfaceTree(mesh.vertices, mesh.faces, device=device)
         if followed is None:
-            tree = SurfaceTree(mesh.vertices, mesh.faces, device=device)
-            followed = _Followed(tree, *tree.sample(point_count, seed))
-        elif not np.array_equal(mesh.faces, followed.tree.faces):
-            return "the true surface is of another topology in every frame"
-        else:
-            followed.tree = SurfaceTree(mesh.vertices, mesh.faces, device=device)
+            faces, weights = tree.sample(point_count, seed)
+            followed = _Followed(tree, faces[lasting[faces]], weights[lasting[faces]])
+        followed.tree = tree
         cloud = change_axes(sequence[matched[frame]], WORLD_AXES)
         for name, camera, record in _views(capture, split, frame):
             drawn = draw_materials(
@@ -201,6 +206,22 @@ def surface_scores(
             progress(done, len(frames))
     found = None if followed is None else followed.scores(frames)
     return found or "no point of the true surface is seen in two frames by a camera"
+
+
+def _lasting_faces(capture: Capture, frames: Sequence[int]) -> NDArray[np.bool_]:
+    """Return which triangles are of the same vertices in all frames, ``(F,)``; one False if surfaces differ in size."""
+    first: NDArray[Any] | None = None
+    lasting = np.zeros(1, bool)
+    vertex_count = 0
+    for frame in frames:
+        mesh = read_truth_mesh(capture, frame)
+        faces = np.asarray(mesh.faces)
+        if first is None:
+            first, lasting, vertex_count = faces, np.ones(len(faces), bool), len(mesh.vertices)
+        if faces.shape != first.shape or len(mesh.vertices) != vertex_count:
+            return np.zeros(1, bool)
+        lasting &= (faces == first).all(axis=1)
+    return lasting
 
 
 def _views(capture: Capture, split: str, frame: int) -> list[tuple[str, Camera, CaptureRecord | None]]:

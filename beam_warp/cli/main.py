@@ -13,6 +13,7 @@ from beam_warp._version import __version__
 from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
 from beam_warp.cli.demo import Demo, demo
+from beam_warp.cli.evaluate import Evaluate, evaluate
 from beam_warp.cli.inspect import Inspect, inspect
 from beam_warp.cli.mesh import Mesh, mesh
 from beam_warp.cli.reconstruct import Reconstruct, reconstruct
@@ -20,7 +21,7 @@ from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
 
-_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, demonstrate.
+_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, evaluate, demonstrate.
 
 Example: beam run person.ply --environment studio.hdr --out person
 
@@ -31,6 +32,7 @@ Command = (
     Annotated[Run, subcommand("run", prefix_name=False)]
     | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
+    | Annotated[Evaluate, subcommand("evaluate", prefix_name=False)]
     | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Stability, subcommand("stability", prefix_name=False)]
@@ -52,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: reconstruct(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
+    if isinstance(command, Evaluate):
+        return run_command(lambda: evaluate(command))
     if isinstance(command, Mesh):
         return run_command(lambda: mesh(command))
     if isinstance(command, Stability):
