@@ -25,7 +25,7 @@ class Score:
     Attributes:
         psnr: Inside the subject's bounding box, composited on black [dB].
         ssim: There, Gaussian window of sigma 1.5, data range 1.
-        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA` [dB].
+        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA`, composited on black too: holes count [dB].
     """
 
     psnr: float
@@ -108,12 +108,11 @@ def as_compared(
     solid = np.asarray(truth_alpha) > SOLID_ALPHA
     if is_color:
         a, b = linear_to_srgb(np.clip(a, 0.0, 1.0)), linear_to_srgb(np.clip(b, 0.0, 1.0))
-    solid_psnr = psnr(a, b, solid)
     if not premultiplied:
         extra = (...,) + (None,) * (a.ndim - 2)
         a, b = a * np.asarray(alpha, np.float64)[extra], b * np.asarray(truth_alpha, np.float64)[extra]
     box = bounding_box(truth_alpha)
-    return Compared(a[box], b[box], solid_psnr)
+    return Compared(a[box], b[box], psnr(a, b, solid))
 
 
 def compare(
