@@ -25,11 +25,13 @@ from beam_warp.rasterizing import MATERIAL_CHANNELS
 from beam_warp.relighters import RELIGHTERS, Relighter, RelitImage
 from beam_warp.temporal_scores import TemporalScores, gaussian_deviation, surface_scores
 
-LEAST_OVERLAP = 0.3
-"""Coverage of asset and truth below which they are not of the same thing: a person turned by a quarter is at .2."""
+LEAST_OVERLAP = 0.5
+"""Coverage of asset and truth in common, over what either covers, below which they are not of the same thing. Measured
+with a walking person of 320 x 320 pixels: .98 as it should be, .86 when 2 cm aside, .82 one frame and .59 five frames
+off, .45 turned by a quarter, .03 lying."""
 
 GOOD_OVERLAP = 0.8
-"""Below this overlap something is said: reconstructions are above .95."""
+"""Below this overlap something is said."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""

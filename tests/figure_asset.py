@@ -30,7 +30,7 @@ def figure_asset(size=48, frame_count=2, metadata=None):
             GaussianCloud(
                 positions=tree.at(faces, weights),
                 orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
-                scales=np.tile([0.014, 0.014, 1e-3], (DISCS, 1)),
+                scales=np.tile([0.010, 0.010, 1e-3], (DISCS, 1)),
                 opacities=np.full(DISCS, 0.99),
                 radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
                 radiance_color_space=LINEAR_REC709,

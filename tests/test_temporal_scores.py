@@ -1,5 +1,6 @@
 """Steadiness over time: sums against NumPy, known flicker, and that only points of one surface count."""
 
+import json
 import shutil
 
 import numpy as np
@@ -125,8 +126,8 @@ class TestSurface:
         ]
         assert errors[0] < 0.25 * errors[1]
 
-    def test_cameras_that_move_are_used_where_they_have_an_image(self, asset, relit_capture, tmp_path):
-        """The second frame's test records gone: cameras that stand still are used there all the same."""
+    def test_cameras_that_stand_still_need_no_image(self, asset, relit_capture, tmp_path):
+        """Without records of the second frame, what they would show of it is drawn all the same."""
         folder = tmp_path / "capture"
         shutil.copytree(relit_capture.folder, folder)
         text = (folder / "transforms.json").read_text()
@@ -135,6 +136,18 @@ class TestSurface:
         whole = surface_scores(asset, relit_capture, BOTH, point_count=POINTS, device="cpu")
         assert found.ours == whole.ours
         assert found.truth is None
+
+    def test_cameras_that_move_do(self, asset, relit_capture, tmp_path):
+        folder = tmp_path / "capture"
+        shutil.copytree(relit_capture.folder, folder)
+        content = json.loads((folder / "transforms.json").read_text())
+        for record in content["frames"]:
+            if record["frame"] == 1:
+                record["frame"] = 9
+                record["transform_matrix"][0][3] += 0.01
+        (folder / "transforms.json").write_text(json.dumps(content))
+        said = surface_scores(asset, Capture.read(folder), BOTH, point_count=POINTS, device="cpu")
+        assert said == "no point of the true surface is seen in two frames by a camera"
 
     def test_triangles_that_are_cut_otherwise_are_left_out(self, asset, relit_capture, tmp_path):
         folder = tmp_path / "capture"
