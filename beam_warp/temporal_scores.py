@@ -134,6 +134,8 @@ def gaussian_deviation(sequence: GaussianSequence, frames: Sequence[int]) -> Dev
         return "the asset has one frame"
     if sequence.topology != "constant":
         return "Gaussians do not persist from frame to frame"
+    if "base_color" in sequence.constant:
+        return Deviation(0.0, 0.0, len(sequence[0]), tuple(frames))
     running: RunningVariance | None = None
     for cloud in sequence:
         colors = linear_to_srgb(np.asarray(cloud.base_color, np.float64))
@@ -267,8 +269,7 @@ class _Followed:
         record: CaptureRecord | None,
     ) -> None:
         """Take what a view shows of the points."""
-        places = camera.project(self.tree.at(self._faces, self._weights))
-        seen = self._level(camera, places)
+        places, seen = readable_points(self.tree, camera, self._faces, self._weights)
         ours = linear_to_srgb(np.clip(interpolated(colors, alpha, places[:, :2], seen), 0.0, 1.0))
         self._of(self._ours, view).add(ours, seen)
         truth = None if record is None or record.truth_path is None else record.truth()
@@ -298,31 +299,38 @@ class _Followed:
     def _of(self, running: dict[str, RunningVariance], view: str) -> RunningVariance:
         return running.setdefault(view, RunningVariance(len(self._faces), 3))
 
-    def _level(self, camera: Camera, places: FloatArray) -> NDArray[np.bool_]:
-        """Return which points are seen, with the four nearest pixels on the same piece of surface."""
-        seen = self.tree.seen_by([camera], self._faces, self._weights, least_cosine=LEAST_COSINE)
-        with np.errstate(invalid="ignore"):
-            first = np.floor(places[:, :2] - 0.5)
-            inside = (first >= 0.0).all(axis=1) & (first + 1.0 < (camera.width, camera.height)).all(axis=1)
-        seen &= inside
-        rows = np.flatnonzero(seen)
-        limit = LEVEL_PIXELS * places[rows, 2] / min(camera.focal_x, camera.focal_y)
-        for right in (0.0, 1.0):
-            for down in (0.0, 1.0):
-                x, y = first[rows, 0] + 0.5 + right, first[rows, 1] + 0.5 + down
-                local = np.stack(
-                    [
-                        (x - camera.center_x) / camera.focal_x,
-                        (y - camera.center_y) / camera.focal_y,
-                        np.ones(len(rows)),
-                    ],
-                    axis=-1,
-                )
-                length = np.linalg.norm(local, axis=1)
-                along = (local / length[:, None]) @ camera.camera_to_world[:3, :3].T
-                depth = self.tree.cast(np.tile(camera.position, (len(rows), 1)), along) / length
-                seen[rows] &= np.abs(depth - places[rows, 2]) <= limit  # NaN, beside the surface, is not
-        return seen
+
+def readable_points(
+    tree: SurfaceTree, camera: Camera, faces: NDArray[np.int32], weights: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return where points of a surface are on an image, and which of them four pixels of the same piece show.
+
+    Args:
+        tree: The surface.
+        camera: Who sees it.
+        faces: The triangle of each point, ``(N,)``.
+        weights: Barycentric weights of its corners, ``(N, 3)``.
+
+    Returns:
+        x, y [pixel] and depth [m], ``(N, 3)``, and ``(N,)``: True where the camera sees the point past every triangle,
+        from the front by at least `LEAST_COSINE`, and the surface in its four nearest pixels is as deep as
+        `LEVEL_PIXELS` says.
+    """
+    places = camera.project(tree.at(faces, weights))
+    readable = tree.seen_by([camera], faces, weights, least_cosine=LEAST_COSINE)
+    first = np.floor(places[:, :2] - 0.5)  # NaN, behind the camera, is not inside
+    readable &= (first >= 0.0).all(axis=1) & (first + 1.0 < (camera.width, camera.height)).all(axis=1)
+    rows = np.flatnonzero(readable)
+    limit = LEVEL_PIXELS * places[rows, 2] / min(camera.focal_x, camera.focal_y)
+    for right in (0.5, 1.5):
+        for down in (0.5, 1.5):
+            x, y = (first[rows, 0] + right - camera.center_x), (first[rows, 1] + down - camera.center_y)
+            local = np.stack([x / camera.focal_x, y / camera.focal_y, np.ones(len(rows))], axis=-1)
+            length = np.linalg.norm(local, axis=1)
+            along = (local / length[:, None]) @ camera.camera_to_world[:3, :3].T
+            depth = tree.cast(np.tile(camera.position, (len(rows), 1)), along) / length
+            readable[rows] &= np.abs(depth - places[rows, 2]) <= limit  # NaN, beside the surface, is not
+    return places, readable
 
 
 def interpolated(

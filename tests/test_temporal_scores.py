@@ -2,11 +2,13 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from figure_asset import changed, figure_asset
 
+from beam_warp.cameras import Camera
 from beam_warp.captures import Capture
 from beam_warp.images import srgb_to_linear
 from beam_warp.reconstruction_scores import read_truth_mesh
@@ -16,6 +18,7 @@ from beam_warp.temporal_scores import (
     RunningVariance,
     gaussian_deviation,
     interpolated,
+    readable_points,
     surface_scores,
 )
 
@@ -94,6 +97,47 @@ class TestGaussians:
     def test_none_without_persistence(self, asset):
         without = changed(asset, lambda _, cloud: cloud.with_arrays(ids=None))
         assert gaussian_deviation(without, (0, 1)) == "Gaussians do not persist from frame to frame"
+
+    def test_constant_colour_is_steady_without_a_look(self, asset):
+        read = []
+
+        def read_frame(frame):
+            read.append(frame)
+            return asset[0]
+
+        constant = replace(asset, read_frame=read_frame, constant=frozenset({"base_color"}))
+        assert gaussian_deviation(constant, (4, 5)) == Deviation(0.0, 0.0, len(asset[0]), (4, 5))
+        assert read == [0]
+
+
+def test_points_are_read_where_four_pixels_show_their_piece(device):
+    """A wall at 3 m, half of it behind a screen at 2 m: hidden, beside the edge, beyond the image, from behind."""
+
+    def square(left, right, y, toward):
+        corners = np.array([(left, y, -1.0), (right, y, -1.0), (right, y, 1.0), (left, y, 1.0)])
+        return corners if toward else corners[::-1]
+
+    corners = np.concatenate([square(-3, 3, 3.0, True), square(-3, 0, 2.0, True), square(1, 1.2, 2.5, False)])
+    faces = np.array([(4 * i, 4 * i + a, 4 * i + a + 1) for i in range(3) for a in (1, 2)])
+    tree = SurfaceTree(corners, faces, device=device)
+    camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=100, height=100, vertical_fov=60.0)
+    pixel = 3.0 / camera.focal_x  # of the wall
+    points = {
+        "screen": (-0.5, 2.0, 0.1, True),
+        "wall": (0.5, 3.0, 0.1, True),
+        "hidden": (-0.5, 3.0, 0.1, False),
+        "at the edge": (0.4 * pixel, 3.0, 0.1, False),
+        "past the edge": (2.1 * pixel, 3.0, 0.1, True),
+        "beyond": (2.5, 3.0, 0.1, False),
+        "from behind": (1.1, 2.5, 0.1, False),
+        "at the rim": (0.5, 3.0, 0.999, False),
+    }
+    wanted = np.array([point[:3] for point in points.values()])
+    found = tree.closest(wanted)
+    np.testing.assert_allclose(found.points, wanted, atol=1e-6)
+    places, readable = readable_points(tree, camera, found.faces, found.weights)
+    assert dict(zip(points, readable.tolist(), strict=True)) == {name: point[3] for name, point in points.items()}
+    np.testing.assert_allclose(places[:, 2], wanted[:, 1], rtol=1e-6)
 
 
 class TestSurface:
