@@ -18,7 +18,7 @@ from beam_warp.images import read_image
 from beam_warp.material_scores import score_materials, stated_raster
 from beam_warp.perceptual_scores import PerceptualMetrics
 from beam_warp.raster_records import RasterOptions
-from beam_warp.relighters import DeferredRelighter
+from beam_warp.relighters import DeferredRelighter, RelitImage
 
 NO_METRICS = PerceptualMetrics()
 CAP = 120.0
@@ -266,6 +266,24 @@ class TestWhatIsThere:
         assert found.absent == {
             "novel_view": "the asset has no captured radiance", "relit": "no relighter was chosen",
         }  # fmt: skip
+
+    def test_relighters_are_told_how_to_draw(self, asset, mirror):
+        """As the asset states, with the samples asked for, a frame's cameras at a time, under each light."""
+        told = []
+
+        def relighter(cloud, environment, cameras, *, raster, samples, device):
+            told.append((len(cloud), [camera.width for camera in cameras], raster, samples, device))
+            black = np.zeros((cameras[0].height, cameras[0].width), np.float32)
+            return [RelitImage(np.repeat(black[..., None], 3, axis=-1), black) for _ in cameras]
+
+        stated = GaussianSequence.from_clouds(
+            list(asset), metadata={"raster_antialiased": "true", "raster_low_pass": "0.1"}
+        )
+        found = score(stated, mirror, "cpu", samples=3, relighters={"black": relighter})
+        expected = (len(asset[0]), [48, 48], RasterOptions(antialiased=True, low_pass=0.1), 3, "cpu")
+        assert told == [expected] * 4
+        assert set(found.mean_relit()["black"]) == {"sunset", "stage"}
+        assert found.conditions["samples_per_pixel"] == 9
 
     def test_the_record_is_json(self, evaluated):
         text = json.dumps(evaluated[0].report, allow_nan=False)
