@@ -144,6 +144,20 @@ class CaptureRecord:
             raise MissingFileError(f"truth must be given for {self.name}, got none. Choose a record that has it.")
         return self._undistorted(self._sized(read_image(self.truth_path), "image"))
 
+    def relit(self, light: str) -> Image:
+        """Read the exact image under another light, undistorted like the image.
+
+        Raises:
+            MissingFileError: The record has none of that name, or the file is not there.
+            AssetFormatError: It is damaged, or its size is not the camera's.
+        """
+        if light not in self.relit_paths:
+            raise MissingFileError(
+                f"light must be one that {self.name} is known under ({', '.join(self.relit_paths) or 'none'}), got "
+                f"{light!r}. Choose one of them."
+            )
+        return self._undistorted(self._sized(read_image(self.relit_paths[light]), "image"))
+
     def _photograph(self) -> Image:
         return self._sized(read_image(self.image_path, color_space=self.color_space), "image")
 

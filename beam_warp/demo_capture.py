@@ -83,6 +83,7 @@ def write_demo_capture(
     test_camera_count: int = 2,
     size: int = 128,
     samples: int = 16,
+    relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
     progress: WriteProgress | None = None,
@@ -100,6 +101,7 @@ def write_demo_capture(
         test_camera_count: Cameras with truth; 0 for none.
         size: Width and height of every image [pixel].
         samples: Paths per pixel of a training view; a power of two is best.
+        relit: Other lights by name, under which the test views are traced too; see `write_capture`.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
         seed: Same seed, same device: same files but for the headers of their formats.
         progress: Called with (stage, done, total) after every image.
@@ -121,7 +123,15 @@ def write_demo_capture(
     meshes = [figure.at(frame / period) for frame in range(frame_count)]
     dome = dome_cameras([mesh.vertices for mesh in meshes], camera_count, test_camera_count, size, size)
     return write_capture(
-        folder, meshes, dome, studio(), samples=samples, device=device, seed=seed, progress=progress or _quiet
+        folder,
+        meshes,
+        dome,
+        studio(),
+        samples=samples,
+        relit=relit,
+        device=device,
+        seed=seed,
+        progress=progress or _quiet,
     )
 
 
@@ -138,19 +148,25 @@ def write_capture(
     *,
     surfaces: Sequence[tuple[ArrayLike, ArrayLike]] | None = None,
     samples: int = 16,
+    relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
     progress: WriteProgress | None = None,
 ) -> Capture:
     """Path trace meshes, one a frame, for some cameras and write them as a capture; see `write_demo_capture`.
 
-    ``surfaces`` are vertices and faces to be written as truth, where they are less dense than the meshes.
+    ``surfaces`` are vertices and faces to be written as truth, where they are less dense than the meshes. ``relit`` are
+    lights by name, fit for a file name: ``truth/NAME.exr``; what test views show under them is in ``truth/relit_NAME``.
     """
     report = progress or _quiet
     total = len(meshes) * len(cameras)
     with replacing_folder(folder) as root:
         write_exr(root / "environment.exr", _layers(light.radiance, "RGB"))
         (root / "truth").mkdir()
+        others = dict(relit or {})
+        for name, other in others.items():
+            write_exr(root / f"truth/{name}.exr", _layers(other.radiance, "RGB"))
+            (root / f"truth/relit_{name}").mkdir()
         for entry in cameras:
             (root / "images" / entry.name).mkdir(parents=True)
         records = []
@@ -161,7 +177,7 @@ def write_capture(
             for entry in cameras:
                 # A seed of its own for every image: noise that frames share would look like texture.
                 stream = (seed * 1_000_003 + len(records)) % 2**32
-                records.append(_write_view(root, mesh, traced, entry, frame, light, samples, stream))
+                records.append(_write_view(root, mesh, traced, entry, frame, light, others, samples, stream))
                 report("path trace capture", len(records), total)
         write_transforms(root / "transforms.json", records, FRAMES_PER_SECOND)
     return Capture.read(folder)
@@ -290,10 +306,11 @@ def _write_view(
     entry: DomeCamera,
     frame: int,
     light: EnvironmentMap,
+    others: Mapping[str, EnvironmentMap],
     samples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Trace and write one image, with its truth if it is for testing; return its record."""
+    """Trace and write one image, with its truth and under other lights if it is for testing; return its record."""
     is_test = entry.split == "test"
     record = transforms_record(entry.name, entry.split, frame, entry.camera, FRAMES_PER_SECOND, has_truth=is_test)
     window = _Window.around(entry.camera, mesh.vertices)
@@ -314,6 +331,11 @@ def _write_view(
             "depth": window.whole(channels.depth),
         }
         write_exr(root / record["truth"], layers)
+        for name, other in others.items():
+            shown = trace_radiance(traced, window.camera, other, sample_count=paths, seed=seed)
+            path = f"truth/relit_{name}/{entry.name}_{frame:04d}.exr"
+            write_exr(root / path, _layers(window.whole(shown.rgb), "RGB") | {"A": window.whole(shown.alpha)})
+            record.setdefault("relit", {})[name] = path
     return record
 
 

@@ -25,7 +25,7 @@ class Score:
     Attributes:
         psnr: Inside the subject's bounding box, composited on black [dB].
         ssim: There, Gaussian window of sigma 1.5, data range 1.
-        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA` [dB].
+        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA`, composited on black too: holes count [dB].
     """
 
     psnr: float
@@ -67,10 +67,29 @@ def bounding_box(alpha: ArrayLike) -> tuple[slice, slice]:
     return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
 
 
-def compare(
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One channel of one view, as it is compared.
+
+    Attributes:
+        image: Inside the subject's bounding box, composited on black, colours encoded as sRGB; float64.
+        truth: Likewise.
+        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA`, anywhere in the image [dB].
+    """
+
+    image: NDArray[np.float64]
+    truth: NDArray[np.float64]
+    solid_psnr: float
+
+    def score(self) -> Score:
+        """Return the scores of this channel."""
+        return Score(psnr(self.image, self.truth), ssim(self.image, self.truth), self.solid_psnr)
+
+
+def as_compared(
     image: ArrayLike, truth: ArrayLike, *, alpha: ArrayLike, truth_alpha: ArrayLike, is_color: bool, premultiplied: bool
-) -> Score:
-    """Score one channel of one view.
+) -> Compared:
+    """Bring one channel of one view to the form in which it is compared.
 
     Args:
         image: ``(H, W)`` or ``(H, W, 3)``; colours linear, they are encoded here.
@@ -89,18 +108,32 @@ def compare(
     solid = np.asarray(truth_alpha) > SOLID_ALPHA
     if is_color:
         a, b = linear_to_srgb(np.clip(a, 0.0, 1.0)), linear_to_srgb(np.clip(b, 0.0, 1.0))
-    solid_psnr = psnr(a, b, solid)
     if not premultiplied:
         extra = (...,) + (None,) * (a.ndim - 2)
         a, b = a * np.asarray(alpha, np.float64)[extra], b * np.asarray(truth_alpha, np.float64)[extra]
     box = bounding_box(truth_alpha)
-    return Score(psnr(a[box], b[box]), ssim(a[box], b[box]), solid_psnr)
+    return Compared(a[box], b[box], psnr(a, b, solid))
+
+
+def compare(
+    image: ArrayLike, truth: ArrayLike, *, alpha: ArrayLike, truth_alpha: ArrayLike, is_color: bool, premultiplied: bool
+) -> Score:
+    """Score one channel of one view; see `as_compared`."""
+    return as_compared(
+        image, truth, alpha=alpha, truth_alpha=truth_alpha, is_color=is_color, premultiplied=premultiplied
+    ).score()
 
 
 def least_squares_scale(image: ArrayLike, truth: ArrayLike, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the factor per channel that best carries an image ``(H, W, 3)`` to its truth on a mask."""
     a, b = np.asarray(image, np.float64)[mask], np.asarray(truth, np.float64)[mask]
     return (a * b).sum(axis=0) / np.maximum((a * a).sum(axis=0), 1e-12)
+
+
+def angles_between(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return angles between vectors ``(N, 3)`` [degree]; a vector of length 0 is at a right angle to all."""
+    one, two = (v.astype(np.float64) / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (a, b))
+    return np.degrees(np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)))
 
 
 def mean_scores(scores: Mapping[str, list[Score]]) -> dict[str, dict[str, float]]:

@@ -15,7 +15,7 @@ from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.captures import Capture, CaptureRecord
 from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileError
-from beam_warp.evaluation import SOLID_ALPHA, Score, block_means, compare, psnr, ssim
+from beam_warp.evaluation import SOLID_ALPHA, Score, angles_between, block_means, compare, psnr, ssim
 from beam_warp.images import linear_to_srgb, srgb_to_linear
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, GBuffer, rasterize
@@ -208,7 +208,9 @@ def _score_view(
     if truth is None:
         return ViewScores(**colors)
     solid = truth_alpha > SOLID_ALPHA
-    angles = _angles(buffer.channels[SURFACE_NORMALS][solid], truth.stack("normal.X", "normal.Y", "normal.Z")[solid])
+    angles = angles_between(
+        buffer.channels[SURFACE_NORMALS][solid], truth.stack("normal.X", "normal.Y", "normal.Z")[solid]
+    )
     depth = truth.stack("depth")[..., 0][solid].astype(np.float64)
     return ViewScores(
         **colors,
@@ -217,9 +219,3 @@ def _score_view(
         depth_median_mm=1e3 * float(np.median(np.abs(buffer.depth[solid] - depth))),
         median_depth_median_mm=1e3 * float(np.median(np.abs(buffer.median_depth[solid] - depth))),
     )
-
-
-def _angles(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return angles between vectors ``(N, 3)`` [degree]; a vector of length 0 is at a right angle to all."""
-    one, two = (v.astype(np.float64) / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (a, b))
-    return np.degrees(np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)))

@@ -11,9 +11,17 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.cameras import Camera
-from beam_warp.checks import require_array, require_count, require_finite, require_range
+from beam_warp.checks import (
+    require_array,
+    require_count,
+    require_finite,
+    require_range,
+    require_same_length,
+    require_unit,
+)
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.mesh_rays import launch_cast_rays
 from beam_warp.kernels.surface_distance import SeeingCameras, launch_find_closest_points, launch_find_seen_points
 
 SAMPLE_COUNT = 200_000
@@ -111,6 +119,29 @@ class SurfaceTree:
         found, shares = faces.numpy(), weights.numpy().astype(np.float64)
         at = self.at(found, shares)
         return ClosestPoints(at, found, shares, np.linalg.norm(at - given, axis=1))
+
+    def cast(self, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
+        """Return how far rays go until they meet the surface from either side [m], ``(N,)``; NaN for those that do not.
+
+        Args:
+            origins: ``(N, 3)`` [m].
+            directions: Of unit length, ``(N, 3)``.
+
+        Raises:
+            InvalidArrayError: An array has another shape, is not finite, or a direction is not of unit length.
+        """
+        starts = require_array("origins", origins, (None, 3), np.float64)
+        along = require_array("directions", directions, (None, 3), np.float64)
+        require_same_length("directions", along, "origins", len(starts))
+        require_finite("origins", starts)
+        require_finite("directions", along)
+        require_unit("directions", along)
+        distances = wp.zeros(len(starts), dtype=float, device=self.device)
+        launch_cast_rays(
+            self._mesh.id, self._local(starts), upload(along.astype(np.float32), wp.vec3, self.device), distances
+        )
+        found = distances.numpy().astype(np.float64)
+        return np.where(found >= 0.0, found, np.nan)
 
     def seen_by(
         self,

@@ -43,3 +43,21 @@ def tiny_capture(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("captures") / "tiny"
     return write_demo_capture(folder, frame_count=2, camera_count=6, test_camera_count=1, size=64, device="cpu")
+
+
+@pytest.fixture(scope="session")
+def relit_capture(tmp_path_factory):
+    """The same with truth under two more lights: 2 frames of 48 x 48 from 1 training and 2 test cameras. Read only."""
+    from beam_warp.demo_capture import write_demo_capture
+    from beam_warp.demo_environments import stage, sunset
+
+    return write_demo_capture(
+        tmp_path_factory.mktemp("captures") / "relit",
+        frame_count=2,
+        camera_count=1,
+        test_camera_count=2,
+        size=48,
+        samples=4,
+        relit={"sunset": sunset(), "stage": stage()},
+        device="cpu",
+    )

@@ -10,7 +10,7 @@ from beam_warp.captures import Capture
 from beam_warp.demo_capture import dome_cameras, write_demo_capture
 from beam_warp.demo_environments import studio
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import OutputError
+from beam_warp.errors import MissingFileError, OutputError
 
 
 def truth_mesh(capture, frame):
@@ -154,3 +154,32 @@ def test_dome_looks_at_the_middle_from_one_distance():
 def test_read_takes_the_folder(tiny_capture):
     again = Capture.read(tiny_capture.folder)
     assert [record.name for record in again.records] == [record.name for record in tiny_capture.records]
+
+
+class TestRelit:
+    def test_the_light_of_the_capture_gives_its_own_image(self, tmp_path):
+        """The same paths under the same light: but for the half floats of images, 2^-11 of a value."""
+        capture = write_demo_capture(
+            tmp_path / "capture",
+            frame_count=1,
+            camera_count=1,
+            test_camera_count=1,
+            size=32,
+            samples=2,
+            relit={"same": studio(), "dark": EnvironmentMap.constant((0.0, 0.0, 0.0))},
+            device="cpu",
+        )
+        train, test = capture.records
+        assert train.relit_paths == {}
+        assert test.relit_paths["dark"] == capture.folder / "truth/relit_dark/test_00_0000.exr"
+        image, same, dark = (shown.linear_rgba() for shown in (test.image(), test.relit("same"), test.relit("dark")))
+        np.testing.assert_allclose(image, same, rtol=2.0**-11, atol=2.0**-25)
+        assert dark[..., :3].max() == 0.0
+        np.testing.assert_array_equal(dark[..., 3], same[..., 3])
+        light = EnvironmentMap.read(capture.folder / "truth/same.exr")
+        np.testing.assert_array_equal(light.radiance, studio().radiance)
+
+    def test_a_light_that_the_record_lacks(self, tiny_capture):
+        record = tiny_capture.select(split="test")[0]
+        with pytest.raises(MissingFileError, match=r"light must be one that test_00_0000 is known under \(none\), got"):
+            record.relit("noon")

@@ -14,6 +14,7 @@ from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
 from beam_warp.cli.decompose import Decompose, decompose
 from beam_warp.cli.demo import Demo, demo
+from beam_warp.cli.evaluate import Evaluate, evaluate
 from beam_warp.cli.inspect import Inspect, inspect
 from beam_warp.cli.mesh import Mesh, mesh
 from beam_warp.cli.reconstruct import Reconstruct, reconstruct
@@ -21,7 +22,7 @@ from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
 
-_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, demonstrate.
+_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, evaluate, demonstrate.
 
 Example: beam run person.ply --environment studio.hdr --out person
 
@@ -33,6 +34,7 @@ Command = (
     | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
     | Annotated[Decompose, subcommand("decompose", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
+    | Annotated[Evaluate, subcommand("evaluate", prefix_name=False)]
     | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Stability, subcommand("stability", prefix_name=False)]
@@ -56,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: decompose(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
+    if isinstance(command, Evaluate):
+        return run_command(lambda: evaluate(command))
     if isinstance(command, Mesh):
         return run_command(lambda: mesh(command))
     if isinstance(command, Stability):

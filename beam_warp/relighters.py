@@ -1,0 +1,95 @@
+"""Ways to put a relightable cloud under a light, all behind one call, so that they are scored alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.assets import GaussianCloud
+from beam_warp.cameras import Camera
+from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.devices import resolve_device
+from beam_warp.environments import EnvironmentMap
+from beam_warp.evaluation import block_means
+from beam_warp.raster_records import RasterOptions
+from beam_warp.rasterizing import rasterize
+
+
+class RelitImage(NamedTuple):
+    """A view under a light.
+
+    Attributes:
+        rgb: Scene-linear Rec.709 radiance multiplied by alpha, ``(H, W, 3)`` float32.
+        alpha: Coverage in [0, 1], ``(H, W)`` float32.
+    """
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+
+
+class Relighter(Protocol):
+    """Draws a relightable cloud under a light."""
+
+    def __call__(
+        self,
+        cloud: GaussianCloud,
+        environment: EnvironmentMap,
+        cameras: Sequence[Camera],
+        *,
+        raster: RasterOptions,
+        samples: int,
+        device: str | None,
+    ) -> list[RelitImage]:
+        """Return what some cameras see.
+
+        Args:
+            cloud: Relightable, in the world's axes.
+            environment: The light.
+            cameras: Of one sample a pixel.
+            raster: How splats are drawn.
+            samples: Side of the square of samples of a pixel.
+            device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+        """
+        ...
+
+
+class DeferredRelighter:
+    """Lights a G-buffer as real-time renderers do (see `beam_warp.deferred`): its only shadow is ambient occlusion."""
+
+    def __init__(self) -> None:
+        """Start with no light made ready."""
+        self._lightings: dict[tuple[EnvironmentMap, str], EnvironmentLighting] = {}
+
+    def __call__(
+        self,
+        cloud: GaussianCloud,
+        environment: EnvironmentMap,
+        cameras: Sequence[Camera],
+        *,
+        raster: RasterOptions,
+        samples: int,
+        device: str | None,
+    ) -> list[RelitImage]:
+        """Light every sample of a pixel, and take their mean."""
+        lighting = self._lighting(environment, str(resolve_device(device)))
+        images = []
+        for camera in cameras:
+            buffer = rasterize(cloud, camera.supersampled(samples), options=raster, device=device)
+            images.append(
+                RelitImage(block_means(relight(buffer, lighting), samples), block_means(buffer.alpha, samples))
+            )
+        return images
+
+    def _lighting(self, environment: EnvironmentMap, device: str) -> EnvironmentLighting:
+        """Return a light made ready, once for all frames."""
+        key = (environment, device)
+        if key not in self._lightings:
+            self._lightings[key] = EnvironmentLighting.from_environment(environment, device=device)
+        return self._lightings[key]
+
+
+RELIGHTERS: Mapping[str, Callable[[], Relighter]] = {"deferred": DeferredRelighter}
+"""By name, what makes a relighter."""

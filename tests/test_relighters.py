@@ -1,0 +1,62 @@
+"""Relighters: all behind one call; the deferred one is the mean of what `relight` gives of every sample."""
+
+import numpy as np
+import pytest
+from figure_asset import figure_asset
+
+from beam_warp import relighters
+from beam_warp.cameras import Camera
+from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.environments import EnvironmentMap
+from beam_warp.raster_records import RasterOptions
+from beam_warp.rasterizing import rasterize
+from beam_warp.relighters import RELIGHTERS, DeferredRelighter
+
+LIGHT = EnvironmentMap.constant((0.5, 0.7, 0.9))
+RASTER = RasterOptions(antialiased=True, low_pass=0.1)
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    return figure_asset(frame_count=1)[0]
+
+
+def cameras(cloud, count):
+    size = {"width": 20, "height": 30}
+    return [Camera.frame_cloud(cloud.positions, azimuth=70.0 * index, **size) for index in range(count)]
+
+
+def test_every_relighter_can_be_made_and_called(cloud, device):
+    for make in RELIGHTERS.values():
+        images = make()(cloud, LIGHT, cameras(cloud, 2), raster=RASTER, samples=1, device=device)
+        assert [image.rgb.shape for image in images] == [(30, 20, 3)] * 2
+        for image in images:
+            assert np.isfinite(image.rgb).all()
+            assert image.rgb[image.alpha == 0.0].max(initial=0.0) == 0.0
+
+
+def test_deferred_is_the_mean_of_what_samples_show(cloud, device):
+    (camera,) = cameras(cloud, 1)
+    lighting = EnvironmentLighting.from_environment(LIGHT, device=device)
+    buffer = rasterize(cloud, camera.supersampled(2), options=RASTER, device=device)
+    fine = relight(buffer, lighting).reshape(30, 2, 20, 2, 3)
+    (found,) = DeferredRelighter()(cloud, LIGHT, [camera], raster=RASTER, samples=2, device=device)
+    np.testing.assert_allclose(found.rgb, fine.mean(axis=(1, 3)), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(found.alpha, buffer.alpha.reshape(30, 2, 20, 2).mean(axis=(1, 3)), rtol=1e-6)
+
+
+def test_a_light_is_made_ready_once(cloud, monkeypatch):
+    made = []
+    usual = EnvironmentLighting.from_environment
+
+    class Counting:
+        @staticmethod
+        def from_environment(environment, *, device):
+            made.append(environment)
+            return usual(environment, device=device)
+
+    monkeypatch.setattr(relighters, "EnvironmentLighting", Counting)
+    deferred = DeferredRelighter()
+    for _ in range(2):
+        deferred(cloud, LIGHT, cameras(cloud, 1), raster=RASTER, samples=1, device="cpu")
+    assert made == [LIGHT]
