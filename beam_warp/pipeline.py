@@ -42,6 +42,7 @@ Progress = Callable[[str, int, int], None]
 
 ASSET_NAME = "asset.usda"
 EVIDENCE = "evidence_"
+ESTIMATE = "estimate"
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
 
 
@@ -236,6 +237,7 @@ class _Job:
         self.light = given.scaled(2.0**self.exposure)
         self.key = _digest(self._described(), self.lit.radiance)
         self._statistics: dict[str, Any] = {}
+        self._notes: dict[str, None] = {}
 
     def _inputs(self, number: int) -> FrameInputs:
         """Return what a frame brings."""
@@ -390,33 +392,17 @@ class _Job:
         """Solve base colour, over all frames at once or each by itself, and return the relightable sequence."""
         total = len(self.sequence)
         tally = Tally()
-        varying = not self.persistent
-        if self.persistent:
-            joint, test = self.evidence(0), ChangeTest()
-            test.add(joint)
-            for frame in range(1, total):
-                evidence = self.evidence(frame)
-                test.add(evidence)
-                joint = joint + evidence
-            change = test.result()
-            cloud = self.stored_cloud(0)
-            constant = solve_base_color(cloud, joint, self.light.mean_irradiance, dispersion=change.dispersion)
-            tally.add(constant, cloud, read_frame(self.path(0), ("from_shape", "report")))
-            varying = bool(change.changing.any())
-            for frame in range(total if varying else 1):
-                self._store_solution(frame, with_changes(constant, change, self.evidence(frame)))
-            tally.count_changes(change)
-        else:
+        if self.options.images is not None:
+            varying = True
             for frame in range(total):
-                cloud = self.stored_cloud(frame)
-                solved = solve_base_color(cloud, self.evidence(frame), self.light.mean_irradiance)
-                self._store_solution(frame, solved)
-                tally.add(solved, cloud, read_frame(self.path(frame), ("from_shape", "report")))
+                tally.add(self.stored_cloud(frame), read_frame(self.path(frame), ("from_shape", "report")))
+        else:
+            varying = self._solve_constant(tally) if self.persistent else self._solve_each(tally)
         self._statistics = tally.summary()
 
         def read(frame: int) -> GaussianCloud:
-            solution = read_frame(self.folder / f"solution_{frame if varying else 0:06d}.h5")
-            return self.stored_cloud(frame).with_arrays(**solution)
+            cloud = self.stored_cloud(frame)
+            return cloud if self.options.images is not None else self._solved(cloud, frame if varying else 0)
 
         solution_names = {"base_color", "base_color_error", "observability"}
         constant_roughness_names = {"roughness"} if self.persistent else set()
@@ -432,12 +418,52 @@ class _Job:
                 **self.sequence.metadata,
                 "generator": f"beam-warp {__version__}",
                 "normal_source": "shortestAxis" if self._statistics["normals_from_shape"] > 0.5 else "authored",
-                "roughness_source": "texture" if isinstance(self.options.roughness, RoughnessTexture) else "constant",
+                "roughness_source": _roughness_source(self.options.roughness),
                 "radiance_meaning": "captured",
                 "source_axes": self.first.original.axes,
                 "exposure_stops": f"{self.exposure:.4f}",
             },
         )
+
+    def _solve_constant(self, tally: Tally) -> bool:
+        """Solve one base colour for all frames, and more where they disagree; return whether any Gaussian needs it."""
+        total = len(self.sequence)
+        joint, test = self.evidence(0), ChangeTest()
+        test.add(joint)
+        for frame in range(1, total):
+            evidence = self.evidence(frame)
+            test.add(evidence)
+            joint = joint + evidence
+        change = test.result()
+        constant = solve_base_color(
+            self.stored_cloud(0), joint, self.light.mean_irradiance, dispersion=change.dispersion
+        )
+        varying = bool(change.changing.any())
+        for frame in range(total if varying else 1):
+            self._store_solution(frame, with_changes(constant, change, self.evidence(frame)))
+        tally.add(
+            self._solved(self.stored_cloud(0), 0),
+            read_frame(self.path(0), ("from_shape", "report")),
+            constant.clipped_part,
+        )
+        tally.count_changes(change)
+        return varying
+
+    def _solve_each(self, tally: Tally) -> bool:
+        """Solve every frame by itself: its Gaussians are those of no other."""
+        for frame in range(len(self.sequence)):
+            solved = solve_base_color(self.stored_cloud(frame), self.evidence(frame), self.light.mean_irradiance)
+            self._store_solution(frame, solved)
+            tally.add(
+                self._solved(self.stored_cloud(frame), frame),
+                read_frame(self.path(frame), ("from_shape", "report")),
+                solved.clipped_part,
+            )
+        return True
+
+    def _solved(self, cloud: GaussianCloud, frame: int) -> GaussianCloud:
+        """Return a stored cloud with a stored solution."""
+        return cloud.with_arrays(**read_frame(self.folder / f"solution_{frame:06d}.h5"))
 
     def _store_solution(self, frame: int, solved: BaseColor) -> None:
         write_frame(
@@ -456,7 +482,7 @@ class _Job:
         samples = self.options.materials.sample_count
         seconds = self.timer.seconds.get("materials", 0.0)
         rays = measured * len(self.first.cloud) * samples * 2
-        notes = self.sequence.metadata.get("notes", "").splitlines()
+        notes = [*self.sequence.metadata.get("notes", "").splitlines(), *self._notes]
         return {
             "input": {"frames": len(self.sequence), "gaussians": len(self.first.cloud), "notes": notes},
             "device": device_facts(self.device),
@@ -470,6 +496,13 @@ class _Job:
             "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
             "warnings": warnings_about(self._statistics),
         }
+
+
+def _roughness_source(source: float | RoughnessTexture | str) -> str:
+    """Return the asset's word for where roughness comes from."""
+    if isinstance(source, RoughnessTexture):
+        return "texture"
+    return "estimated" if source == ESTIMATE else "constant"
 
 
 def options_as_dict(options: RunOptions) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from beam_warp._version import __version__
 from beam_warp.assets import GaussianCloud, Observability
-from beam_warp.base_color import BaseColor
 from beam_warp.errors import OutputError
 from beam_warp.kernels.launching import thread_count
 from beam_warp.temporal_color import ColorChange
@@ -71,19 +70,23 @@ class Tally:
         self._changes: dict[str, float] = {}
         self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
-    def add(self, solved: BaseColor, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]]) -> None:
-        """Count one frame: its solution, its cloud, and ``from_shape`` and ``report`` of the store."""
+    def add(self, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]], clipped_part: float = 0.0) -> None:
+        """Count one frame: its relightable cloud, ``from_shape`` and ``report`` of the store, and what was cut at 1."""
         count = len(cloud)
-        measured = (solved.observability & np.uint8(Observability.FILLED)) == 0
+        assert cloud.observability is not None
         assert cloud.ambient_occlusion is not None
         assert cloud.normal_confidence is not None
+        measured = (cloud.observability & np.uint8(Observability.FILLED)) == 0
+        error = 0.0
+        if cloud.base_color_error is not None:
+            error = cloud.base_color_error[measured].mean(axis=1).sum(dtype=np.float64)
         self._rows += count
         for name, value in (
-            ("clipped", solved.clipped_part * count),
+            ("clipped", clipped_part * count),
             ("from_shape", stored["from_shape"].sum()),
             ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
             ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
-            ("error", solved.standard_error[measured].mean(axis=1).sum(dtype=np.float64)),
+            ("error", error),
             ("measured", measured.sum()),
             ("dropped", stored["report"][1]),
             ("raised", stored["report"][2]),
@@ -91,7 +94,7 @@ class Tally:
             self._sums[name] = self._sums.get(name, 0.0) + float(value)
         for flag in Observability:
             if flag and flag.name:
-                self._flags[flag.name] += int(((solved.observability & np.uint8(flag)) != 0).sum())
+                self._flags[flag.name] += int(((cloud.observability & np.uint8(flag)) != 0).sum())
 
     def count_changes(self, change: ColorChange) -> None:
         """Keep what a test of frames against each other found."""

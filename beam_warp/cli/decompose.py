@@ -152,6 +152,7 @@ def run_options(
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
     from beam_warp.frame_inputs import RoughnessTexture
+    from beam_warp.image_path import ImagePathOptions
     from beam_warp.materials import MaterialOptions
     from beam_warp.pipeline import RunOptions
 
@@ -170,7 +171,7 @@ def run_options(
         materials=MaterialOptions(
             sample_count=measuring.samples, offset=measuring.offset, bounce=measuring.bounce, seed=seed
         ),
-        preset=preset,
+        images=ImagePathOptions(seed=seed) if preset == "paper" else None,
         roughness=roughness,
         exposure=measuring.exposure,
         persistent=persistent,
