@@ -194,6 +194,18 @@ class LitPoints:
     views: Observations
     rows: NDArray[np.int64]
 
+    def without_views(self) -> LitPoints:
+        """Return the same points, towards no view."""
+        none = Observations()
+        device = self.surface.normals.device
+        for name, variable in Observations.vars.items():
+            setattr(none, name, wp.empty((0, len(self.rows)), dtype=variable.type.dtype, device=device))
+        return LitPoints(self.light, self.surface, none, self.rows)
+
+
+def without_report(done: int, total: int) -> None:
+    """Report to nobody."""
+
 
 def view_set() -> NDArray[np.float32]:
     """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
@@ -262,8 +274,9 @@ def measure_materials(
         if progress is not None:
             progress(count - (total - done) // 2, count)
 
-    measured = lit_points(cloud, scene, points, roughness, light, lit, views)
-    for _ in light_batches(cloud, scene, points, light, measured, options, views, frame, report):
+    measured = lit_points(cloud, points, roughness, light, lit, views)
+    bounced = mean_radiance(cloud, views) if options.bounce else None
+    for _ in light_batches(scene, points, light, measured, options, bounced, frame, report):
         pass
     fit = _empty(ColorFit, len(lit), device)
     launch_fit_color(measured.views, measured.light, measured.surface, options.robust, fit, device)
@@ -294,7 +307,6 @@ def measure_materials(
 
 def lit_points(
     cloud: GaussianCloud,
-    scene: Scene,
     points: SurfacePoints,
     roughness: NDArray[np.float32],
     light: MaterialLight,
@@ -307,22 +319,18 @@ def lit_points(
         InvalidArrayError: The cloud has no captured radiance.
     """
     _require_radiance(cloud)
-    device, count = scene.device, len(rows)
+    device, count = light.device, len(rows)
     at = upload(np.asarray(rows, np.int32), int, device)
-    surface = Surface()
-    surface.normals = points.normals[at].contiguous()
-    surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
     observed = Observations()
     if views is None:
-        around = upload(view_set(), wp.vec3, device)
         observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
         observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
         launch_sample_radiance(
             upload(cloud.radiance, wp.vec3, device),
             at,
             int(cloud.radiance_color_space == DISPLAY_SRGB),
-            surface.normals,
-            around,
+            points.normals[at].contiguous(),
+            upload(view_set(), wp.vec3, device),
             observed.colors,
             observed.directions,
             device,
@@ -330,33 +338,67 @@ def lit_points(
     else:
         observed.colors = views.colors[:, at].contiguous()
         observed.directions = views.directions[:, at].contiguous()
-    observed.specular = wp.zeros(observed.directions.shape, dtype=wp.vec3, device=device)
-    observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
-    arriving = _empty(PointLight, count, device)
+    return make_points(points, roughness, light, rows, observed)
+
+
+def make_points(
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: MaterialLight,
+    rows: NDArray[np.integer[Any]],
+    views: Observations,
+) -> LitPoints:
+    """Make room for the light of some Gaussians and its residues towards views.
+
+    Args:
+        points: Of all Gaussians.
+        roughness: Of all Gaussians, ``(N,)``.
+        light: The light.
+        rows: Which Gaussians, ``(M,)``.
+        views: Colours and directions of views, ``(V, M)``; the residues are allocated here.
+    """
+    device = light.device
+    at = upload(np.asarray(rows, np.int32), int, device)
+    surface = Surface()
+    surface.normals = points.normals[at].contiguous()
+    surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
+    views.specular = wp.zeros(views.directions.shape, dtype=wp.vec3, device=device)
+    views.diffuse_share = wp.zeros(views.directions.shape, dtype=float, device=device)
+    arriving = _empty(PointLight, len(rows), device)
     launch_sum_unshadowed(light.sampled.moments, surface.normals, arriving.unshadowed, device)
-    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64))
+    return LitPoints(arriving, surface, views, np.asarray(rows, np.int64))
 
 
 def light_batches(
-    cloud: GaussianCloud,
     scene: Scene,
     points: SurfacePoints,
     light: MaterialLight,
     measured: LitPoints,
     options: MaterialOptions,
-    views: ViewEvidence | None,
+    hit_radiance: NDArray[np.float32] | None,
     frame: int,
     progress: Progress,
 ) -> Iterator[LitBatch]:
     """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
 
     A batch's rays are gone when the next one is asked for.
+
+    Args:
+        scene: Occluders.
+        points: Of all Gaussians.
+        light: The light.
+        measured: Which points; its arrays are filled.
+        options: Rays and what they are drawn by.
+        hit_radiance: What rays that hit a Gaussian see of it, scene-linear, ``(N, 3)``: one bounce; None keeps the
+            bounce that ``measured`` holds.
+        frame: Number of the frame.
+        progress: Called with (points done, points in all).
     """
     device = scene.device
     if not len(measured.rows):
         return
     at = upload(measured.rows.astype(np.int32), int, device)
-    hit_radiance = upload(_hit_radiance(cloud, views), wp.vec3, device)
+    bounced = None if hit_radiance is None else upload(hit_radiance, wp.vec3, device)
     parts = techniques(options.density, options.sampler, options.sample_count)
     is_product = parts[0].density == int(PRODUCT)
     stream = (options.seed, frame)
@@ -381,12 +423,12 @@ def light_batches(
         for part in parts:
             launch_draw_light(part, light.sampled, cumulative, batch, stream, rays, found.weights, device)
         trace_rays(scene, EXACT, rays, found.visibility)
-        if options.bounce:
+        if bounced is not None:
             launch_trace_bounce(
                 scene,
                 EXACT.settings(scene),
                 batch,
-                hit_radiance,
+                bounced,
                 stream,
                 max(options.sample_count // BOUNCE_PART, 2),
                 measured.light.bounce,
@@ -414,8 +456,8 @@ def _require_radiance(cloud: GaussianCloud) -> None:
         )
 
 
-def _hit_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
-    """Return what a ray that hits a Gaussian sees: hits are taken as diffuse, so its mean colour.
+def mean_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
+    """Return what a ray that hits a Gaussian sees, ``(N, 3)``: hits are taken as diffuse, so its mean colour.
 
     Over the views that show it; the band of degree 0 is the mean over all directions, seen or not.
     """

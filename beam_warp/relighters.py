@@ -14,8 +14,10 @@ from beam_warp.deferred import EnvironmentLighting, relight
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.evaluation import block_means
+from beam_warp.material_light import MaterialLight
 from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize
+from beam_warp.rasterizing import rasterize, rasterize_values
+from beam_warp.traced_relighting import traced_radiance
 
 
 class RelitImage(NamedTuple):
@@ -91,5 +93,35 @@ class DeferredRelighter:
         return self._lightings[key]
 
 
-RELIGHTERS: Mapping[str, Callable[[], Relighter]] = {"deferred": DeferredRelighter}
+class TracedRelighter:
+    """Gathers light by rays from every Gaussian (see `beam_warp.traced_relighting`): shadows are cast."""
+
+    def __init__(self) -> None:
+        """Start with no light made ready."""
+        self._lights: dict[tuple[EnvironmentMap, str], MaterialLight] = {}
+
+    def __call__(
+        self,
+        cloud: GaussianCloud,
+        environment: EnvironmentMap,
+        cameras: Sequence[Camera],
+        *,
+        raster: RasterOptions,
+        samples: int,
+        device: str | None,
+    ) -> list[RelitImage]:
+        """Light every Gaussian, and blend what it sends."""
+        target = resolve_device(device)
+        key = (environment, str(target))
+        if key not in self._lights:
+            self._lights[key] = MaterialLight.from_environment(environment, target)
+        radiance = traced_radiance(cloud, self._lights[key], cameras, raster=raster)
+        images = []
+        for camera, sent in zip(cameras, radiance, strict=True):
+            drawn = rasterize_values(cloud, camera.supersampled(samples), sent, options=raster, device=device)
+            images.append(RelitImage(block_means(drawn.values, samples), block_means(drawn.alpha, samples)))
+        return images
+
+
+RELIGHTERS: Mapping[str, Callable[[], Relighter]] = {"deferred": DeferredRelighter, "traced": TracedRelighter}
 """By name, what makes a relighter."""
