@@ -60,7 +60,8 @@ def estimate_exposure(
         A positive factor; 1 where nothing was observed.
     """
     rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(subset, len(cloud))).astype(np.int64))
-    direct = replace(options, bounce=False)
+    # Weights that depend on the light would make the sums more than linear in it.
+    direct = replace(options, bounce=False, robust=False)
     full, half = (
         measure_materials(
             cloud,

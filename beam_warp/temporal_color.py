@@ -57,7 +57,7 @@ class ColorChange:
         color, variance, known = _frame(evidence)
         variance = variance * self.dispersion
         gain = np.where(known, self.variance / np.maximum(self.variance + variance, 1e-30), 0.0)
-        return self.mean + gain * (color - self.mean), np.sqrt((1.0 - gain) * self.variance + gain**2 * variance)
+        return self.mean + gain * (color - self.mean), np.sqrt((1.0 - gain) * self.variance)
 
 
 class ChangeTest:
