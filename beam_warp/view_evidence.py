@@ -40,6 +40,10 @@ SURFACE_CHANNELS = 8
 LEAST_WEIGHT = 0.5
 """Pixels that all views together must show of a Gaussian, by its blending weights, for it to be seen."""
 
+LEAST_SHARE = 0.01
+"""Part of the pixels that it would cover without others before it that they must show: layers let something through,
+and with enough pixels that adds up."""
+
 PIXELS_AT_ONCE = 2**21
 """Most pixels drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
 
@@ -56,6 +60,7 @@ class ViewEvidence:
         normals: Unit normal of that surface, ``(N,)`` vec3; 0 where it is not seen.
         agreement: Length of the mean of the normals that pixels see there, ``(N,)`` float: 1 on planes, less at edges.
         weight: Pixels of all views together, by blending weights, ``(N,)`` float32 on the host.
+        seen: Which Gaussians any view shows, ``(N,)`` bool, host.
         saturated: Part of its weight in pixels with an image that were cut at their ceiling, ``(N,)`` float32, host.
         colors: Scene-linear radiance towards each camera and its weight [pixel], ``(V, N)`` vec4; of no views if there
             were no images.
@@ -66,14 +71,10 @@ class ViewEvidence:
     normals: wp.array
     agreement: wp.array
     weight: NDArray[np.float32]
+    seen: NDArray[np.bool_]
     saturated: NDArray[np.float32]
     colors: wp.array
     directions: wp.array
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """Which Gaussians any view shows, ``(N,)``."""
-        return self.weight >= LEAST_WEIGHT
 
 
 def view_evidence(
@@ -147,15 +148,23 @@ def view_evidence(
             )
         if progress is not None:
             progress(part.stop, len(cameras))
+    totals = sums.numpy()
+    weight, cut = totals[:, 6].copy(), totals[:, 7]
+    seen = weight >= np.maximum(LEAST_WEIGHT, LEAST_SHARE * _coverage(cloud, cameras, origin))
     positions, normals = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
     agreement = wp.empty(count, dtype=float, device=target)
     launch_finish_surface(
-        sums, gaussians.positions, wp.vec3(*origin), LEAST_WEIGHT, positions, normals, agreement, target
+        sums,
+        gaussians.positions,
+        wp.vec3(*origin),
+        upload(seen.astype(np.int32), int, target),
+        positions,
+        normals,
+        agreement,
+        target,
     )
-    totals = sums.numpy()
-    weight, cut = totals[:, 6].copy(), totals[:, 7]
     saturated = np.divide(cut, weight, out=np.zeros_like(cut), where=weight > 0.0)
-    return ViewEvidence(positions, normals, agreement, weight, saturated, colors, directions)
+    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions)
 
 
 def _groups(
@@ -180,6 +189,20 @@ def _groups(
             rasterizer = Rasterizer(count, group, radiance=True, normals=True, options=options, device=device)
         yield rasterizer, range(start, end)
         start = end
+
+
+def _coverage(cloud: GaussianCloud, cameras: Sequence[Camera], center: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return about how many pixels each Gaussian would cover in all views with nothing before it, ``(N,)``.
+
+    2 pi opacity times the product of its larger deviations, at the distance of the whole cloud's middle, half of the
+    views from behind.
+    """
+    density = sum(
+        camera.focal_x * camera.focal_y / max(float(np.sum((camera.position - center) ** 2)), 1e-12)
+        for camera in cameras
+    )
+    larger = np.sort(cloud.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
+    return np.pi * density * cloud.opacities * larger
 
 
 def _captured(image: CapturedView | None, ceiling: float, device: wp.Device) -> CapturedPixels:

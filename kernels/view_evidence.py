@@ -129,18 +129,18 @@ def finish_surface_kernel(
     sums: wp.array2d[float],
     positions: wp.array[wp.vec3],
     origin: wp.vec3,
-    least_weight: float,
+    seen: wp.array[int],
     out_positions: wp.array[wp.vec3],
     out_normals: wp.array[wp.vec3],
     out_agreement: wp.array[float],
 ):
-    """Means of the sums; a Gaussian that hardly any pixel shows keeps its own place and has no normal."""
+    """Means of the sums; a Gaussian that is not seen keeps its own place and has no normal."""
     i = first + wp.tid()
     weight = sums[i, 6]
     place = positions[i]
     normal = wp.vec3()
     agreement = float(0.0)
-    if weight >= least_weight:
+    if seen[i] != 0:
         place = origin + wp.vec3(sums[i, 0], sums[i, 1], sums[i, 2]) / weight
         mean = wp.vec3(sums[i, 3], sums[i, 4], sums[i, 5]) / weight
         agreement = wp.min(wp.length(mean), 1.0)
@@ -177,12 +177,12 @@ def launch_observe(rows, positions, radiance, display_srgb, views, first_view, o
     )
 
 
-def launch_finish_surface(sums, positions, origin, least_weight, out_positions, out_normals, out_agreement, device):
+def launch_finish_surface(sums, positions, origin, seen, out_positions, out_normals, out_agreement, device):
     """Turn sums into a surface."""
     launch(
         finish_surface_kernel,
         len(positions),
-        inputs=[sums, positions, origin, least_weight],
+        inputs=[sums, positions, origin, seen],
         outputs=[out_positions, out_normals, out_agreement],
         device=device,
     )
