@@ -99,11 +99,11 @@ class BakeOptions:
     """
 
     solver: Solver = "cg"
-    passes: int = 40
-    tolerance: float = 1e-4
+    passes: int = 30
+    tolerance: float = 1e-2
     steps: int = 5000
     learning_rate: float = 0.05
-    ridge: float = 1e-3
+    ridge: float = 0.1
     temporal: float = 0.0
     low: float = 0.0
     high: float = 1.0

@@ -109,7 +109,7 @@ class ImagePathOptions:
     solver: Solver = "cg"
     passes: int = 30
     steps: int = 5000
-    ridge: float = 1e-2
+    ridge: float = 0.1
     temporal: float = 1.0
     diffuse_weight: DiffuseWeight = "fresnel_hv"
     surface_depth: SurfaceDepth = "mean"

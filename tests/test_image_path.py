@@ -84,7 +84,7 @@ class TestKnownMaterials:
         made = Ball(device)
         found = made.decompose(solver=solver, steps=300)
         seen = found.color_evidence > 2.0
-        assert seen.mean() > 0.9
+        assert seen.mean() > 0.8
         # residues have a relative noise of 0.1 a pixel and less after denoising; a Gaussian is two pixels and more
         error = (found.base_color - made.truth)[seen]
         assert np.sqrt((error**2).mean()) < 0.04
@@ -236,11 +236,12 @@ class TestBehaviour:
         assert crop_to_subject(unknown) is unknown
 
 
-class TestRefusals:
-    @pytest.fixture(scope="class")
-    def made(self):
-        return Ball("cpu", count=100, views=1)
+@pytest.fixture(scope="module")
+def made():
+    return Ball("cpu", count=100, views=1)
 
+
+class TestRefusals:
     def test_no_views(self, made):
         with pytest.raises(InvalidOptionError, match=r"^views must hold at least one view"):
             made.decompose([])
