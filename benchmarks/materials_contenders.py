@@ -16,10 +16,12 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 from materials_truth import Materials
+from numpy.typing import NDArray
 
 from beam_warp.assets import LINEAR_REC709, GaussianCloud
 from beam_warp.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.captured_views import CapturedView
+from beam_warp.image_path import ImagePathOptions, decompose_by_images
 from beam_warp.material_light import MaterialLight
 from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
 from beam_warp.raster_records import RasterOptions
@@ -177,8 +179,7 @@ def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
     assert joint is not None
     cloud, measured, points = first
     with stages("solve"):
-        facing = points.normals.numpy()
-        up = np.where(points.seen[:, None], facing, np.array([[0.0, 0.0, 1.0]])).astype(np.float32)
+        up = normals_of(cloud, points)
         known = cloud.with_arrays(normals=up, normal_confidence=points.confidence)
         solved = solve_base_color(known, joint, subject.light.mean_irradiance)
         openness, _ = fill_from_neighbors(
@@ -191,6 +192,23 @@ def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
     return Decomposed(materials, stages.seconds, len(frames))
 
 
+def normals_of(cloud: GaussianCloud, points: SurfacePoints) -> NDArray[np.float32]:
+    """Return the normals that views show, and those of neighbours where they show none."""
+    known = points.normals.numpy()
+    filled, _ = fill_from_neighbors(cloud.positions, known, np.zeros_like(known), ~points.seen)
+    lengths = np.linalg.norm(filled, axis=1, keepdims=True)
+    return np.where(lengths > 1e-6, filled / np.maximum(lengths, 1e-6), (0.0, 0.0, 1.0)).astype(np.float32)
+
+
+def seen_normals(subject: Subject) -> NDArray[np.float32]:
+    """Return the normals of the first frame, to relight what comes without."""
+    frame = subject.frames[0]
+    cameras = [view.camera for view in frame.views]
+    seen = view_evidence(frame.cloud, cameras, options=subject.raster, device=str(subject.device))
+    scene = Scene.from_gaussians(frame.cloud, str(subject.device))
+    return normals_of(frame.cloud, SurfacePoints.seen_by(frame.cloud, seen, scene, 0.0))
+
+
 def without_color(cloud: GaussianCloud) -> GaussianCloud:
     """Return Gaussians that send out nothing: what is spread back of the difference is then the image itself."""
     black = np.full((len(cloud), 1, 3), -0.5 / SH_C0, np.float32)
@@ -199,10 +217,6 @@ def without_color(cloud: GaussianCloud) -> GaussianCloud:
 
 def by_images(subject: Subject, **options: Any) -> Decomposed:
     """Decompose by the image path; without options, the paper's preset."""
-    try:
-        from beam_warp.image_path import ImagePathOptions, decompose_by_images
-    except ImportError as error:
-        raise Unavailable("the image path is not installed") from error
     frame = subject.frames[0]
     stages = Stages(subject.device)
     with stages("upload and build"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from beam_warp.assets import GaussianCloud
 from beam_warp.captured_views import CapturedView
 from beam_warp.captures import Capture
-from beam_warp.deferred import EnvironmentLighting, relight
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.evaluation import (
@@ -28,8 +27,9 @@ from beam_warp.evaluation import (
 from beam_warp.images import linear_to_srgb, read_image, write_png
 from beam_warp.incident_light import irradiance
 from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize, rasterize_values
+from beam_warp.rasterizing import rasterize_values
 from beam_warp.reconstruction_scores import read_truth_mesh
+from beam_warp.relighters import Relighter
 from beam_warp.scene import Scene
 from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surface_gaussians import colored_by_views, gaussians_on_mesh
@@ -43,9 +43,6 @@ SHARP = RasterOptions(antialiased=True, low_pass=0.1)
 
 REFERENCE_SEED = 1 << 31
 """References draw other samples than what is measured, whose seeds count up from 0."""
-
-Relighter = Callable[[GaussianCloud, EnvironmentMap, Any, RasterOptions, int, str], NDArray[np.floating[Any]]]
-"""Of a relightable cloud, a light, a camera, how splats are drawn, samples a side and the device: radiance and alpha."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,28 +114,21 @@ class TruthViews:
         return result
 
     def score_relit(self, cloud: GaussianCloud, found: Materials, relighter: Relighter) -> Row:
-        """Return means over views of PSNR and SSIM under every light that the truth has, unscaled and with one scale.
-
-        The scale is that of the base colour against the truth, per view and channel, as relit images are published.
-        """
+        """Return means over views of PSNR and SSIM under every light that the truth has, nothing scaled."""
         lit = relightable(cloud, found)
+        how: dict[str, Any] = {"raster": self.raster, "samples": self.samples, "device": self.device}
         result: Row = {}
         for name, light in self._lights.items():
-            scores = []
-            for record, truth in zip(self.records, self._truths, strict=True):
-                if name in record.relit_paths:
-                    exact = read_image(record.relit_paths[name]).linear_rgba()
-                    image = relighter(lit, light, record.camera, self.raster, self.samples, self.device)
-                    scores.append(
-                        compare(
-                            image[..., :3],
-                            exact[..., :3],
-                            alpha=image[..., 3],
-                            truth_alpha=truth.channels["A"],
-                            is_color=True,
-                            premultiplied=True,
-                        )
-                    )
+            shown = [
+                (record.camera, truth.channels["A"], read_image(record.relit_paths[name]).linear_rgba()[..., :3])
+                for record, truth in zip(self.records, self._truths, strict=True)
+                if name in record.relit_paths
+            ]
+            images = relighter(lit, light, [camera for camera, _, _ in shown], **how)
+            scores = [
+                compare(image.rgb, exact, alpha=image.alpha, truth_alpha=true_alpha, is_color=True, premultiplied=True)
+                for image, (_, true_alpha, exact) in zip(images, shown, strict=True)
+            ]
             result[name] = mean_scores({name: scores})[name]
         if result:
             result["mean"] = {key: float(np.mean([row[key] for row in result.values()])) for key in ("psnr", "ssim")}
@@ -172,24 +162,6 @@ def relightable(cloud: GaussianCloud, found: Materials) -> GaussianCloud:
         roughness=np.full(count, 0.5, np.float32) if found.roughness is None else found.roughness,
         normals=cloud.normals if found.normals is None else found.normals,
     )
-
-
-def deferred(
-    cloud: GaussianCloud, light: EnvironmentMap, camera: Any, raster: RasterOptions, samples: int, device: str
-) -> NDArray[np.floating[Any]]:
-    """Relight a G-buffer: the only shadow is ambient occlusion."""
-    if (light, device) not in _LIGHTINGS:
-        _LIGHTINGS[light, device] = EnvironmentLighting.from_environment(light, device=device)
-    buffer = rasterize(cloud, camera.supersampled(samples), options=raster, device=device)
-    lit = np.concatenate([relight(buffer, _LIGHTINGS[light, device]), buffer.alpha[..., None]], axis=-1)
-    return block_means(lit, samples)
-
-
-_LIGHTINGS: dict[tuple[EnvironmentMap, str], EnvironmentLighting] = {}
-"""Lights made ready, once for all rows."""
-
-RELIGHTERS: dict[str, Relighter] = {"deferred": deferred}
-"""Ways to relight that are scored, by name."""
 
 
 @dataclass(frozen=True, eq=False)
