@@ -9,8 +9,8 @@ and 81 views of 3840 x 2160 that lie in memory decoded, and how that grows. ``--
 does all of it run?
 
 Reconstructions are given with ``--assets NAME=PATH``, or made here (``--gaussians``). Writes the JSON after every row,
-so that a kill loses little; ``--pictures DIR`` gets a strip of every row: ambient occlusion and base colour of the first
-test view. ``materials_plot.py`` draws all of it. A part that fails says so in its place, and the program returns 1.
+so that a kill loses little. ``--pictures DIR`` gets a strip of every row, occlusion and base colour of the first
+test view; ``materials_plot.py`` draws all of it. A part that fails says so in its place; the program returns 1 then.
 """
 
 from __future__ import annotations
@@ -30,16 +30,9 @@ from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
-from materials_contenders import (
-    AblationRow,
-    Subject,
-    SubjectFrame,
-    Unavailable,
-    ablation_rows,
-)
+from materials_contenders import AblationRow, Subject, SubjectFrame, Unavailable, ablation_rows, seen_normals
 from materials_cost import PAPER, Scale, measure_cost
 from materials_truth import (
-    RELIGHTERS,
     SHARP,
     Materials,
     PerfectFrame,
@@ -64,6 +57,7 @@ from beam_warp.material_light import MaterialLight
 from beam_warp.materials import MaterialOptions, measure_materials
 from beam_warp.raster_records import RasterOptions
 from beam_warp.reconstruction_scores import truth_frames
+from beam_warp.relighters import RELIGHTERS
 from beam_warp.reporting import versions
 
 PUBLISHED = {
@@ -331,9 +325,9 @@ def measure_ablation(bench: Bench) -> Iterator[Row]:
             "rows": [],
         }
         result["captures"][name] = part
-        warm = subject.small()
+        warm, normals = subject.small(), seen_normals(subject)
         for row in rows:
-            entry = {"group": row.group, "name": row.name, **measure_row(row, subject, warm, truth)}
+            entry = {"group": row.group, "name": row.name, **measure_row(row, subject, warm, truth, normals)}
             if "found" in entry:
                 found = entry.pop("found")
                 entry["picture"] = bench.picture(
@@ -346,8 +340,11 @@ def measure_ablation(bench: Bench) -> Iterator[Row]:
             yield result
 
 
-def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthViews) -> Row:
-    """Return scores, seconds by stage and memory of a row; why not, where it cannot be run."""
+def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthViews, normals: Any) -> Row:
+    """Return scores, seconds by stage and memory of a row; why not, where it cannot be run.
+
+    Rows of the ladder are relit too; ``normals`` are for those that bring none.
+    """
     try:
         row.method(warm)  # compiles what this row is the first to need
         with peak_memory(subject.device) as memory:
@@ -358,10 +355,9 @@ def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthV
         return {"failed": traceback.format_exc()}
     cloud = subject.frames[0].cloud
     scores = truth.score(cloud, done.materials)
-    if done.materials.normals is not None or cloud.normals is not None:
-        scores["relit"] = {
-            name: truth.score_relit(cloud, done.materials, relighter) for name, relighter in RELIGHTERS.items()
-        }
+    if row.group == "ladder":
+        found = done.materials if done.materials.normals is not None else replace(done.materials, normals=normals)
+        scores["relit"] = {name: truth.score_relit(cloud, found, make()) for name, make in RELIGHTERS.items()}
     return {
         "seconds": sum(done.seconds.values()),
         "seconds_per_frame": sum(done.seconds.values()) / done.frames,
