@@ -346,7 +346,7 @@ def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthV
     Rows of the ladder are relit too; ``normals`` are for those that bring none.
     """
     try:
-        row.method(warm)  # compiles what this row is the first to need
+        row.warm(warm)  # compiles what this row is the first to need
         with peak_memory(subject.device) as memory:
             done = row.method(subject)
     except Unavailable as error:
@@ -451,7 +451,8 @@ def markdown(result: Row) -> str:
     lines: list[str] = []
     for name, row in result.get("perfect", {}).get("captures", {}).items():
         lines += [f"\n### {name}, {row['gaussians']:,} Gaussians on the true surface\n"]
-        lines += ["| light | relative error at 64 rays | cosine, iid |", "|---|---|---|"]
+        rays = next(iter(row["irradiance"].values()))["rays"]
+        lines += [f"| light | relative error at {rays} rays | cosine, iid |", "|---|---|---|"]
         for light, found in row["irradiance"].items():
             ways = found["ways"]
             cells = [f"{ways[way]['relative_rmse']:.4f}" for way in ("product, ratio, Owen", "cosine, iid")]
