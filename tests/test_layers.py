@@ -135,6 +135,10 @@ RANKS = {
     "beam_warp.tracing_plan": 11,
     "beam_warp.tracing_references": 12,
     "beam_warp.tracing_study": 13,
+    "beam_warp.surface_gaussians": 9,
+    "beam_warp.materials_plan": 12,
+    "beam_warp.materials_references": 11,
+    "beam_warp.materials_study": 14,
     "beam_warp.cli": 18,
     "beam_warp": 19,
 }
