@@ -120,10 +120,9 @@ class MaterialsPlan:
         metres = [label for label in self.offsets if label != "auto"]
         if "images" in self.paths and metres:
             default = {"path": "images", "offset": metres[0], "denoiser": self.denoisers[0]}
-            # After the direct defaults: a budget cuts off the end.
-            images = [default, *({**default, "denoiser": denoiser} for denoiser in self.denoisers[1:])]
-            images += [{**default, "offset": offset} for offset in metres[1:]]
-            found[1:1] = images
+            found.insert(1, default)  # beside the direct defaults: a budget cuts off the end
+            found += [{**default, "denoiser": denoiser} for denoiser in self.denoisers[1:]]
+            found += [{**default, "offset": offset} for offset in metres[1:]]
         return found
 
 

@@ -43,6 +43,9 @@ GAUSSIANS = {False: 4000, True: 60_000}
 ROUGHNESS = 0.5
 """Where Gaussians have none."""
 
+BAKING_RAYS = 64
+"""Rays a pixel that drawing and baking take the time of, about."""
+
 REFERENCE_SEED = 1 << 31
 """References draw other samples than every measurement, whose seeds count up from 0."""
 
@@ -206,7 +209,7 @@ class _Bench:
             view.camera.width * view.camera.height if view.alpha is None else int((view.alpha > 0.5).sum())
             for view in self.subject.views
         )
-        return 3 * rays * pixels * self.plan.repeats
+        return 3 * (rays + BAKING_RAYS) * pixels * self.plan.repeats
 
     def measure(self, settings: Settings) -> Row:
         """Time a setting, and compare what it gives with the reference."""

@@ -120,7 +120,7 @@ def colored_by_views(
         raise InvalidArrayError("views must hold at least one view, got none. Pass what the cameras saw.")
     drawn = _DrawnViews.of(cloud, views, options, resolve_device(device))
     shown = drawn.spread([view.color.reshape(-1, 3) for view in views])
-    total = drawn.spread([np.ones((view.camera.width * view.camera.height, 3), np.float32) for view in views])
+    total = drawn.normal_matrix(np.ones((len(cloud), 3)))  # its rows' sums: with it, one colour comes back as it is
     seen = total[:, :1] > UNSEEN_PIXELS
     diagonal = np.where(seen, total, 1.0)
     colors = np.where(seen, shown / diagonal, 0.0)

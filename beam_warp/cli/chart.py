@@ -29,8 +29,8 @@ REFERENCE_PART = 0.35
 LEAST_PART = 0.4
 """Measuring gets at least this part of the budget, however long normals and references took."""
 
-FIGURE_SIZE = 96
-"""Width and height of the built-in capture's images [pixel]."""
+FIGURE_CAMERAS, FIGURE_SIZE = 8, 96
+"""Cameras of the built-in capture, and width and height of their images [pixel]."""
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,12 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
                 f"capture must be given with an asset, got {args.asset} alone. Pass what it was reconstructed from."
             )
         capture = write_demo_capture(
-            folder / "capture", frame_count=args.frame + 1, size=FIGURE_SIZE, device=args.device, progress=report
+            folder / "capture",
+            frame_count=args.frame + 1,
+            camera_count=FIGURE_CAMERAS,
+            size=FIGURE_SIZE,
+            device=args.device,
+            progress=report,
         )
         name = "the built-in figure"
     else:
