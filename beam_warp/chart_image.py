@@ -45,14 +45,16 @@ def require_package(name: str) -> Any:
 
 
 def encoded(table: Table, name: str, values: Sequence[str], rows: Sequence[Row]) -> dict[Any, str]:
-    """Return what stands for each level of an axis that occurs in rows; a level keeps its own as others go."""
+    """Return what stands for each level of an axis that occurs in rows; a level keeps its own as others go.
+
+    The last of the values stands for rows that the axis does not apply to.
+    """
     if not name:
         return {None: values[0]}
     axis = table.subject.axis(name)
     present = {row.settings.get(name) for row in rows}
-    return {level: values[k % len(values)] for k, level in enumerate(axis.levels) if level in present} or {
-        None: values[0]
-    }
+    found: dict[Any, str] = {level: values[k % len(values)] for k, level in enumerate(axis.levels) if level in present}
+    return found | {None: values[-1]} if None in present or not found else found
 
 
 def lines_of(table: Table, rows: Sequence[Row]) -> list[list[Row]]:
@@ -286,7 +288,7 @@ def draw_legend(axes: Any, table: Table, metric: Metric, colors: Any, markers: A
                 line = Line2D([], [], color=GREY, marker=value, linewidth=0)
             else:
                 line = Line2D([], [], color=GREY, linestyle=value)
-            line.set_label(axis.label(level))
+            line.set_label("does not apply" if level is None else axis.label(level))
             row.append(line)
         rows.append(row)
     for number, row in enumerate(rows):

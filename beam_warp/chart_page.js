@@ -87,7 +87,8 @@ function hoverOf(row, metric) {
 }
 
 function styleOf(name, values, row) {
-  if (!name || !(name in row.settings)) return values[0];
+  if (!name) return values[0];
+  if (!(name in row.settings)) return values[values.length - 1];
   return values[axisOf[name].levels.indexOf(row.settings[name]) % values.length];
 }
 

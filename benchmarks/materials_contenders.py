@@ -18,15 +18,15 @@ import warp as wp
 from materials_truth import Materials
 from numpy.typing import NDArray
 
-from beam_warp.assets import LINEAR_REC709, GaussianCloud
+from beam_warp.assets import GaussianCloud
 from beam_warp.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.captured_views import CapturedView
 from beam_warp.image_path import ImagePathOptions, decompose_by_images
 from beam_warp.material_light import MaterialLight
 from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
+from beam_warp.materials_study import without_color
 from beam_warp.raster_records import RasterOptions
 from beam_warp.scene import Scene
-from beam_warp.spherical_harmonics import SH_C0
 from beam_warp.surfaces import SurfacePoints
 from beam_warp.view_evidence import view_evidence
 
@@ -207,12 +207,6 @@ def seen_normals(subject: Subject) -> NDArray[np.float32]:
     seen = view_evidence(frame.cloud, cameras, options=subject.raster, device=str(subject.device))
     scene = Scene.from_gaussians(frame.cloud, str(subject.device))
     return normals_of(frame.cloud, SurfacePoints.seen_by(frame.cloud, seen, scene, 0.0))
-
-
-def without_color(cloud: GaussianCloud) -> GaussianCloud:
-    """Return Gaussians that send out nothing: what is spread back of the difference is then the image itself."""
-    black = np.full((len(cloud), 1, 3), -0.5 / SH_C0, np.float32)
-    return cloud.with_arrays(radiance=black, radiance_color_space=LINEAR_REC709)
 
 
 def by_images(subject: Subject, **options: Any) -> Decomposed:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
+from beam_warp.asset_metadata import numbers_of_frames
 from beam_warp.axes import change_axes
 from beam_warp.chart_image import require_package, write_image
 from beam_warp.chart_page import write_page
-from beam_warp.charts import Settings, Table, read_table, run_study, table_paths
+from beam_warp.charts import Settings, Study, Table, read_table, run_study, table_paths
 from beam_warp.checks import require_number
 from beam_warp.cli.console import ProgressCallback, print_json, progress
 from beam_warp.environments import EnvironmentMap
@@ -27,9 +29,12 @@ REFERENCE_PART = 0.35
 LEAST_PART = 0.4
 """Measuring gets at least this part of the budget, however long normals and references took."""
 
+FIGURE_CAMERAS, FIGURE_SIZE = 8, 96
+"""Cameras of the built-in capture, and width and height of their images [pixel]."""
+
 
 @dataclass(frozen=True)
-class Chart:
+class TracingChart:
     """Measure error against time for every way to trace visibility, and mark the best ones.
 
     Writes OUT/tracing.csv, OUT/tracing.png and OUT/tracing.html (one file, no network). A run that was stopped, or that
@@ -47,7 +52,6 @@ class Chart:
     Example: beam chart tracing person.ply --environment studio.hdr --out chart
     """
 
-    study: Annotated[Positional[Literal["tracing"]], arg(metavar="tracing", help="What to measure.")]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     scene: Annotated[
         Positional[Path | None],
@@ -98,14 +102,102 @@ class Chart:
     json: Annotated[bool, arg(help="Print the frontier as JSON.")] = False
 
 
-def chart(args: Chart) -> int:
+@dataclass(frozen=True)
+class MaterialsChart:
+    """Measure error against time for every way to decompose materials, and mark the best ones.
+
+    Writes OUT/materials.csv, OUT/materials.png and OUT/materials.html (one file, no network). A run that was stopped,
+    or that the budget cut short, goes on when it is called again with the same options; OUT/materials.partial.csv can
+    be drawn as it is, with --from-csv.
+
+    How to read it: each curve is one way to decompose, with more rays to the right; its error has three parts, which
+    only the first of falls with rays: noise, what the method leaves out (the bounce, a lift that leaks light), and the
+    Gaussians' own error. Where the capture has exact channels for its test views, errors are against them; without,
+    against many rays with the default settings, so that they say nothing about the last two.
+
+    Without files a figure is path traced, and decomposed on Gaussians of its true surface. With --capture alone, too,
+    if that capture has its true surface; else give what was reconstructed from it.
+
+    Example: beam chart materials person/asset.usda --capture person --out chart
+    """
+
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
+    asset: Annotated[
+        Positional[Path | None],
+        arg(metavar="[ASSET]", help="Reconstruction of the capture: any file or folder that beam-convert reads."),
+    ] = None
+    capture: Annotated[Path | None, arg(metavar="DIR", help="Images and cameras; a path-traced figure if none.")] = None
+    from_csv: Annotated[Path | None, arg(metavar="FILE", help="Draw this table again; measure nothing.")] = None
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; the capture's own by default.")
+    ] = None
+    frame: Annotated[int, arg(metavar="N", help="Frame of the asset, or of the capture without one, from 0.")] = 0
+    budget_seconds: Annotated[
+        float, arg(metavar="S", help="Time for measuring; what does not fit is skipped and counted.")
+    ] = 120.0
+    rays: Annotated[tuple[int, ...], arg(metavar="N ...", help="Rays a Gaussian.")] = (8, 16, 32, 64, 128, 256)
+    paths: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="direct, images (the paper's).")] = (
+        "direct",
+        "images",
+    )
+    samplers: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="owen, stratified, iid.")] = (
+        "owen",
+        "stratified",
+        "iid",
+    )
+    offsets: Annotated[tuple[str, ...], arg(metavar="OFFSET ...", help="Lifts of ray origins: auto or metres.")] = (
+        "auto",
+        "0.02",
+        "0",
+        "0.1",
+    )
+    densities: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="product, mis, environment, cosine.")] = (
+        "product",
+        "mis",
+        "environment",
+        "cosine",
+    )
+    ratios: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="ratio, plain.")] = ("ratio", "plain")
+    bounces: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="one, none.")] = ("one", "none")
+    weights: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="albedo_scaling, fresnel_hv.")] = (
+        "albedo_scaling",
+        "fresnel_hv",
+    )
+    fits: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="robust, plain.")] = ("robust", "plain")
+    observed: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="difference, images.")] = ("difference", "images")
+    denoisers: Annotated[
+        tuple[str, ...], arg(metavar="NAME ...", help="Of the path by images: auto, oidn, bilateral, none.")
+    ] = ("auto", "none")
+    reference_rays: Annotated[int, arg(metavar="N", help="Of the reference, where there is no truth.")] = 4096
+    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts.")] = 1
+    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
+    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    json: Annotated[bool, arg(help="Print the frontier as JSON.")] = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Measure error against time on your own data and device, and mark the settings that no other beats in both."""
+
+    study: Annotated[
+        Annotated[TracingChart, subcommand("tracing", prefix_name=False)]
+        | Annotated[MaterialsChart, subcommand("materials", prefix_name=False)],
+        OmitArgPrefixes,
+    ]
+
+
+def chart(command: Chart) -> int:
     """Measure or read a table, draw it, and say what is on the frontier."""
+    args = command.study
     for package in ("matplotlib", "plotly"):
         require_package(package)
-    if args.from_csv is not None and (args.scene is not None or args.environment is not None):
+    files = [args.scene] if isinstance(args, TracingChart) else [args.asset, args.capture]
+    given = [str(path) for path in (*files, args.environment) if path is not None]
+    if args.from_csv is not None and given:
+        what = "a scene" if isinstance(args, TracingChart) else "an asset, a capture"
         raise InvalidOptionError(
-            f"from-csv must be given without a scene or an environment, got {args.scene or args.environment} too: it "
-            "measures nothing. Drop one of them."
+            f"from-csv must be given without {what} or an environment, got {given[0]} too: it measures nothing. "
+            "Drop one of them."
         )
     skipped: list[Settings] = []
     if args.from_csv is not None:
@@ -113,7 +205,8 @@ def chart(args: Chart) -> int:
         _make_folder(args.out)
     else:
         with progress(args.quiet or args.json) as report:
-            table, skipped = _measure(args, report)
+            measure = _measure if isinstance(args, TracingChart) else _measure_materials
+            table, skipped = measure(args, report)  # type: ignore[arg-type]
     name = table.subject.name
     image, page = args.out / f"{name}.png", args.out / f"{name}.html"
     write_image(table, image)
@@ -125,7 +218,7 @@ def chart(args: Chart) -> int:
     return 0
 
 
-def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
     from beam_warp.devices import resolve_device
@@ -176,12 +269,98 @@ def _measure(args: Chart, report: ProgressCallback) -> tuple[Table, list[Setting
         progress=report,
     )
     left = max(args.budget_seconds - (time.perf_counter() - started), LEAST_PART * args.budget_seconds)
+    return _run(study, args.out, left, report)
+
+
+def _run(study: Study, out: Path, seconds: float, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+    """Measure a study; say what is kept if it is stopped."""
     try:
-        return run_study(study, args.out, budget_seconds=left, progress=report)
+        return run_study(study, out, budget_seconds=seconds, progress=report)
     except KeyboardInterrupt:
-        partial = table_paths(args.out, study.subject)[1]
+        partial = table_paths(out, study.subject)[1]
         print(f"kept {partial}: call again to continue, or draw it with --from-csv", file=sys.stderr)
         raise
+
+
+def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+    """Read or make the inputs, prepare the study and measure it."""
+    require_number("budget-seconds", args.budget_seconds, 0.0)
+    from beam_warp.devices import resolve_device
+    from beam_warp.materials_plan import MaterialsPlan
+    from beam_warp.materials_study import materials_study
+
+    plan = MaterialsPlan(
+        paths=args.paths,
+        samplers=args.samplers,
+        offsets=args.offsets,
+        densities=args.densities,
+        ratios=args.ratios,
+        bounces=args.bounces,
+        weights=args.weights,
+        fits=args.fits,
+        observed=args.observed,
+        denoisers=args.denoisers,
+        rays=args.rays,
+        reference_rays=args.reference_rays,
+        repeats=args.repeats,
+    )
+    resolve_device(args.device)  # an unknown device is refused before a folder is made
+    with tempfile.TemporaryDirectory() as folder:
+        subject = _materials_subject(args, Path(folder), report)
+        _make_folder(args.out)
+        study = materials_study(subject, plan, device=args.device)
+        return _run(study, args.out, args.budget_seconds, report)
+
+
+def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallback) -> Any:
+    """Return what is decomposed; a built-in capture is written to the folder."""
+    from beam_warp.captures import Capture
+    from beam_warp.demo_capture import write_demo_capture
+    from beam_warp.frame_inputs import CaptureImages
+    from beam_warp.materials_study import MaterialsSubject
+
+    if args.capture is None:
+        if args.asset is not None:
+            raise InvalidOptionError(
+                f"capture must be given with an asset, got {args.asset} alone. Pass what it was reconstructed from."
+            )
+        capture = write_demo_capture(
+            folder / "capture",
+            frame_count=args.frame + 1,
+            camera_count=FIGURE_CAMERAS,
+            size=FIGURE_SIZE,
+            device=args.device,
+            progress=report,
+        )
+        name = "the built-in figure"
+    else:
+        capture, name = Capture.read(args.capture), args.capture.name
+    light = args.environment or capture.environment_path
+    if light is None:
+        raise InvalidOptionError(f"environment must be given, got none and {name} has none. Pass --environment.")
+    environment = EnvironmentMap.read(light)
+    if args.asset is None:
+        if args.frame not in capture.frames:
+            raise InvalidOptionError(
+                f"frame must be one of the capture's, got {args.frame}. Choose one of {capture.frames[:8]}."
+            )
+        return MaterialsSubject.on_true_surface(capture, environment, args.frame, name, args.device)
+    sequence = converters.read(args.asset)
+    if not (0 <= args.frame < len(sequence)):
+        raise InvalidOptionError(
+            f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
+        )
+    images = CaptureImages(capture, sequence)
+    return MaterialsSubject(
+        change_axes(sequence[args.frame], "rfu"),
+        images.views(args.frame),
+        environment,
+        images.raster,
+        capture,
+        numbers_of_frames(sequence.metadata, len(sequence))[args.frame],
+        args.asset.parent.name or args.asset.name,
+        images.ceiling(args.frame),
+    )
 
 
 def _make_folder(folder: Path) -> None:
