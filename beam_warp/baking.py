@@ -207,14 +207,6 @@ def require_columns(views: Sequence[BakeTarget]) -> int:
     return require_count("columns of targets", shape[2] if len(shape) == 3 else 0, 1, MOST_COLUMNS)
 
 
-def _back_project(rasterizer: Rasterizer, pixels: wp.array) -> wp.array:
-    """Return the transpose of drawing values: for every Gaussian the sum of pixels by its blending weights."""
-    wp.copy(rasterizer.adjoints().channels[0], pixels)
-    values = rasterizer.backward().values
-    assert values is not None
-    return values
-
-
 @dataclass(eq=False)
 class _Group:
     """Views that are drawn together."""
@@ -222,6 +214,12 @@ class _Group:
     rasterizer: Rasterizer
     targets: wp.array  # (P, K)
     weights: wp.array
+    rows: wp.array  # (V * N, K), room for what each view says
+
+    def back_project(self, pixels: wp.array, out: wp.array) -> None:
+        """Write the transpose of drawing values: for every Gaussian the sum of pixels by its blending weights."""
+        self.rasterizer.back_project(pixels, self.rows)
+        self.rasterizer.sum_views(self.rows, out)
 
 
 class _BlendedImages:
@@ -242,7 +240,7 @@ class _BlendedImages:
         self.count = len(gaussians.positions)
         self.columns = columns
         self.width = next(n for n in CHANNEL_COUNTS if n >= columns)
-        self._drawn_values = wp.zeros((self.count, self.width), dtype=float)
+        self._drawn_values, self._summed = (wp.zeros((self.count, self.width), dtype=float) for _ in range(2))
         self.groups = []
         alone = options.solver == "adam"  # a step is a view
         for part in _groups([view.camera for view in views], self.count, alone):
@@ -256,7 +254,8 @@ class _BlendedImages:
                 for name, whole in (("targets", targets), ("weights", weights)):
                     given = device_array(f"views[{i}].{name}", getattr(views[i], name), shape, device)
                     wp.copy(whole[rows, :columns], given.reshape((-1, columns)))
-            self.groups.append(_Group(rasterizer, targets, weights))
+            room = wp.empty((len(part) * self.count, self.width), dtype=float)
+            self.groups.append(_Group(rasterizer, targets, weights, room))
         self.evidence = self._row_sums()
         self.strength = wp.zeros((self.count, self.width), dtype=float)
         self._anchors = wp.zeros((self.count, self.width), dtype=float)
@@ -311,7 +310,8 @@ class _BlendedImages:
         for group in self.groups:
             pixels = self._draw(group, values)
             launch_weigh_pixels(pixels, group.weights, pixels, self.device)
-            launch_add_rows(_back_project(group.rasterizer, pixels), out, self.device)
+            group.back_project(pixels, self._summed)
+            launch_add_rows(self._summed, out, self.device)
 
     def apply(self, values: wp.array, out: wp.array) -> None:
         """Write A values to ``out``, A = W' M W + ridge + temporal."""
@@ -323,7 +323,8 @@ class _BlendedImages:
         """Add what the pixels of a group say to half of the objective's gradient."""
         pixels = self._draw(group, values)
         launch_weigh_residuals(pixels, group.targets, group.weights, pixels, self.device)
-        launch_add_rows(_back_project(group.rasterizer, pixels), out, self.device)
+        group.back_project(pixels, self._summed)
+        launch_add_rows(self._summed, out, self.device)
 
     def add_pulls(self, values: wp.array, scale: float, out: wp.array) -> None:
         """Add ``scale`` times what the pulls are to half of the objective's gradient."""

@@ -131,6 +131,10 @@ class Camera:
             center_y=self.center_y / factor,
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """Return the camera that sees a part of the image, in whole pixels."""
+        return replace(self, width=width, height=height, center_x=self.center_x - left, center_y=self.center_y - top)
+
     def directions(self) -> NDArray[np.float64]:
         """Return unit world directions from the camera through every pixel centre, ``(height, width, 3)`` float64."""
         x = (np.arange(self.width) + 0.5 - self.center_x) / self.focal_x

@@ -54,16 +54,9 @@ class CapturedView:
                 f"{left}, {top}. Cut it down."
             )
         part = (slice(top, top + height), slice(left, left + width))
-        camera = replace(
-            self.camera,
-            width=width,
-            height=height,
-            center_x=self.camera.center_x - left,
-            center_y=self.camera.center_y - top,
-        )
         return replace(
             self,
-            camera=camera,
+            camera=self.camera.cropped(left, top, width, height),
             color=np.ascontiguousarray(self.color[part]),
             alpha=None if self.alpha is None else np.ascontiguousarray(self.alpha[part]),
         )

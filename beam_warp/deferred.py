@@ -74,7 +74,10 @@ class EnvironmentLighting:
             DeviceError: There is no such device.
         """
         target = resolve_device(device)
-        heights = [environment.height, *(_level_rows(roughness) for roughness in LEVEL_ROUGHNESS[1:])]
+        heights = [
+            environment.height,
+            *(_level_rows(roughness, environment.height) for roughness in LEVEL_ROUGHNESS[1:]),
+        ]
         offsets = np.concatenate([[0], np.cumsum([2 * height * height for height in heights])])
         texels = wp.empty(int(offsets[-1]), dtype=wp.vec3, device=target)
         wp.copy(texels, wp.array(environment.radiance.reshape(-1, 3), dtype=wp.vec3, device=target))
@@ -193,12 +196,14 @@ def relight(buffer: GBuffer, lighting: EnvironmentLighting) -> NDArray[np.float3
     )
 
 
-def _level_rows(roughness: float) -> int:
-    """Rows of a blurred level: texels of 0.8 alpha, at least 32 rows and at most those of the tree.
+def _level_rows(roughness: float, height: int) -> int:
+    """Rows of a blurred level: texels of 0.8 alpha, at least 32 rows, at most those of the tree, or twice the map's.
 
     A lobe falls to half at 1.3 alpha from its axis: bilinear lookup takes a few per cent off the peak of a point light.
+    What is between the texels of a coarse map is interpolation, which finer levels only repeat.
     """
-    return int(np.clip(np.ceil(np.pi / (0.8 * roughness * roughness)), 32, MAX_TREE_ROWS))
+    finest = min(MAX_TREE_ROWS, max(32, 2 * height))
+    return int(np.clip(np.ceil(np.pi / (0.8 * roughness * roughness)), 32, finest))
 
 
 def _flux_tree(environment: EnvironmentMap, device: Any) -> Any:

@@ -7,7 +7,10 @@ a fitted cloud lies behind the surface); and images give it colours.
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +22,7 @@ from beam_warp.cameras import Camera
 from beam_warp.captured_views import CapturedView
 from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.bin_tiles import TILE
 from beam_warp.kernels.project import View
 from beam_warp.kernels.view_evidence import (
     PIXEL_CHANNELS,
@@ -46,6 +50,15 @@ and with enough pixels that adds up."""
 
 PIXELS_AT_ONCE = 2**21
 """Most pixels drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
+
+CUTTING_THREADS = 8
+"""Images cut at a time."""
+
+RADII = 3.4
+"""Standard deviations up to which a Gaussian is drawn: beyond, alpha is below 1/255."""
+
+MARGIN = 4
+"""Pixels around the subject that stay: the pixel filter widens splats."""
 
 HEADROOM = 0.995
 """Of what a display-referred image can hold: from there on a pixel counts as cut."""
@@ -121,16 +134,17 @@ def view_evidence(
     sums = wp.zeros((count, SURFACE_CHANNELS), dtype=float, device=target)
     colors = wp.zeros((observed, count), dtype=wp.vec4, device=target)
     directions = wp.zeros((observed, count), dtype=wp.vec3, device=target)
-    for rasterizer, part in _groups(count, cameras, options, target):
+    cut = _cut_to_subject(cloud, cameras, images)
+    for rasterizer, part, shown in _groups(count, cut, options, target):
         drawn = SurfacePixels()
         image = rasterizer.draw(gaussians)
         drawn.colors, drawn.alpha, drawn.depth = image.channels[0], image.alpha, image.median_depth
         drawn.display_srgb = int(cloud.radiance_color_space == DISPLAY_SRGB)
         pixels = wp.empty((rasterizer.first_pixels[-1], PIXEL_CHANNELS), dtype=float, device=target)
         rows = wp.empty((len(part) * count, PIXEL_CHANNELS), dtype=float, device=target)
-        views = ViewLayout.of(cameras[part.start : part.stop]).views
-        for view, index in zip(views, part, strict=True):
-            captured = _captured(None if images is None else images[index], ceiling, target)
+        views = ViewLayout.of(rasterizer.cameras).views
+        for view, image_shown in zip(views, shown, strict=True):
+            captured = _captured(image_shown, ceiling, target)
             launch_write_pixels(view, drawn, captured, wp.vec3(*origin), pixels, target)
         rasterizer.back_project(pixels, rows)
         launch_add_rows(rows, len(part), SURFACE_CHANNELS, sums, target)
@@ -168,27 +182,82 @@ def view_evidence(
 
 
 def _groups(
-    count: int, cameras: Sequence[Camera], options: RasterOptions | None, device: wp.Device
-) -> Iterator[tuple[Rasterizer, range]]:
+    count: int,
+    views: Iterator[tuple[Camera, CapturedView | None]],
+    options: RasterOptions | None,
+    device: wp.Device,
+) -> Iterator[tuple[Rasterizer, range, list[CapturedView | None]]]:
     """Rasterise some views at a time; views of the same sizes share their buffers."""
     rasterizer: Rasterizer | None = None
     start = 0
-    while start < len(cameras):
-        end = start + 1
-        pixels = cameras[start].width * cameras[start].height
-        while end < len(cameras):
-            pixels += cameras[end].width * cameras[end].height
-            if pixels > PIXELS_AT_ONCE:
-                break
-            end += 1
-        group = list(cameras[start:end])
-        sizes = [(camera.width, camera.height) for camera in group]
-        if rasterizer is not None and [(c.width, c.height) for c in rasterizer.cameras] == sizes:
-            rasterizer.set_cameras(group)
-        else:
-            rasterizer = Rasterizer(count, group, radiance=True, normals=True, options=options, device=device)
-        yield rasterizer, range(start, end)
-        start = end
+    group: list[tuple[Camera, CapturedView | None]] = []
+    for view in itertools.chain(views, (None,)):
+        pixels = sum(camera.width * camera.height for camera, _ in group)
+        if group and (view is None or pixels + view[0].width * view[0].height > PIXELS_AT_ONCE):
+            cameras = [camera for camera, _ in group]
+            sizes = [(camera.width, camera.height) for camera in cameras]
+            if rasterizer is not None and [(c.width, c.height) for c in rasterizer.cameras] == sizes:
+                rasterizer.set_cameras(cameras)
+            else:
+                rasterizer = Rasterizer(count, cameras, radiance=True, normals=True, options=options, device=device)
+            yield rasterizer, range(start, start + len(group)), [image for _, image in group]
+            start += len(group)
+            group = []
+        if view is not None:
+            group.append(view)
+
+
+def _cut_to_subject(
+    cloud: GaussianCloud, cameras: Sequence[Camera], images: Sequence[CapturedView] | None
+) -> Iterator[tuple[Camera, CapturedView | None]]:
+    """Cut cameras and images to where Gaussians can be: most of a picture is background, which costs as much to move.
+
+    Images are cut ahead by threads while earlier ones are worked on.
+    """
+    low, high = _bounds(cloud)
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+
+    def cut(index: int) -> tuple[Camera, CapturedView | None]:
+        camera, image = cameras[index], None if images is None else images[index]
+        left, top, right, bottom = _box(camera, corners)
+        part = (left, top, right - left, bottom - top)
+        if image is not None:
+            image = image.cropped(*part)
+            return image.camera, image
+        return camera.cropped(*part), None
+
+    with ThreadPoolExecutor(CUTTING_THREADS) as pool:
+        waiting: deque[Future[tuple[Camera, CapturedView | None]]] = deque()
+        for index in range(len(cameras)):
+            waiting.append(pool.submit(cut, index))
+            if len(waiting) > CUTTING_THREADS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _bounds(cloud: GaussianCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the box of all Gaussians, their reach included [m]."""
+    reach = RADII * cloud.scales.max(axis=1, keepdims=True).astype(np.float64)
+    if not len(cloud):
+        return np.zeros(3), np.zeros(3)
+    return (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+
+
+def _box(camera: Camera, corners: NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """Return the part of an image that a box can be in: left, top, right, bottom; all of it where that is unclear."""
+    whole = (0, 0, camera.width, camera.height)
+    if not (((corners - camera.position) @ camera.forward) > 0.0).all():
+        return whole
+    places = camera.project(corners)[:, :2]
+    low = np.floor(places.min(axis=0)).astype(int) - MARGIN
+    high = np.ceil(places.max(axis=0)).astype(int) + MARGIN
+    left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+    right, bottom = min(int(high[0]), camera.width), min(int(high[1]), camera.height)
+    # tiles are 16 pixels wide: parts of the same size share buffers more often if sizes are whole tiles
+    left, top = left // TILE * TILE, top // TILE * TILE
+    right, bottom = min(-(-right // TILE) * TILE, camera.width), min(-(-bottom // TILE) * TILE, camera.height)
+    return (left, top, right, bottom) if left < right and top < bottom else (0, 0, 1, 1)
 
 
 def _coverage(cloud: GaussianCloud, cameras: Sequence[Camera], center: NDArray[np.float64]) -> NDArray[np.float64]:
