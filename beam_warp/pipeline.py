@@ -35,6 +35,7 @@ from beam_warp.material_light import MaterialLight
 from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
 from beam_warp.raster_records import RasterOptions
 from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_report
+from beam_warp.roughness_estimation import measure_roughness_profile, solve_roughness
 from beam_warp.temporal_color import ChangeTest, with_changes
 
 Progress = Callable[[str, int, int], None]
@@ -43,6 +44,12 @@ Progress = Callable[[str, int, int], None]
 ASSET_NAME = "asset.usda"
 EVIDENCE = "evidence_"
 ESTIMATE = "estimate"
+
+ROUGHNESS_FRAMES = 8
+"""Frames of persistent Gaussians that roughness is found from, evenly spread: more add little that is new."""
+
+EXPOSURE_ROUGHNESS = 0.5
+"""Assumed while the exposure of the light is looked for, where roughness is yet to be found."""
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
 
 
@@ -238,6 +245,8 @@ class _Job:
         self.key = _digest(self._described(), self.lit.radiance)
         self._statistics: dict[str, Any] = {}
         self._notes: dict[str, None] = {}
+        self._roughness_paths: set[Path] = set()
+        self._roughness_report: dict[str, Any] = {}
 
     def _inputs(self, number: int) -> FrameInputs:
         """Return what a frame brings."""
@@ -276,7 +285,10 @@ class _Job:
         key = _digest(self._described(), environment.radiance, *self.first.cloud.arrays().values())
         if frame_key(path) != key:
             first = self.first
-            scene, points, roughness = first.scene, first.points, self._roughness(first)
+            scene, points = first.scene, first.points
+            # Highlights cannot be told from the light before its exposure is known.
+            stated = EXPOSURE_ROUGHNESS if self.options.roughness == ESTIMATE else self.options.roughness
+            roughness = first.roughness(stated)
             with self.timer("exposure"):
                 factor = estimate_exposure(first.cloud, scene, points, roughness, light, options=self.options.materials)
             write_frame(path, key, {"stops": np.array([np.log2(factor)])})
@@ -290,15 +302,60 @@ class _Job:
     def path(self, frame: int) -> Path:
         return self.folder / f"frame_{frame:06d}.h5"
 
-    def _roughness(self, inputs: FrameInputs) -> NDArray[np.float32]:
-        """Return the roughness of a frame's Gaussians, ``(N,)``."""
-        return inputs.roughness(self.options.roughness)
+    def _roughness(self, frame: FrameInputs) -> dict[str, NDArray[np.float32]]:
+        """Return the roughness of a frame's Gaussians, ``(N,)``, and its standard error where it is estimated."""
+        if self.options.roughness != ESTIMATE:
+            return {"roughness": frame.roughness(self.options.roughness)}
+        path = self.folder / f"roughness_{0 if self.persistent else frame.number:06d}.h5"
+        asked = [frame.number]
+        if self.persistent:
+            count = min(len(self.sequence), ROUGHNESS_FRAMES)
+            asked = sorted({round(place) for place in np.linspace(0, len(self.sequence) - 1, count)})
+        if path not in self._roughness_paths:
+            self._estimate_roughness(path, frame, asked)
+            self._roughness_paths.add(path)
+        return read_frame(path, ("roughness", "roughness_error"))
+
+    def _estimate_roughness(self, path: Path, frame: FrameInputs, asked: list[int]) -> None:
+        """Find roughness from what the views of some frames show, into the store, unless it is there already."""
+        frames = {n: frame if n == frame.number else self.first if n == 0 else None for n in asked}
+        key = _digest(self.key, *(np.frombuffer(self._frame_key(n, f).encode(), np.uint8) for n, f in frames.items()))
+        if frame_key(path) == key:
+            return
+        total = None
+        for number in asked:
+            inputs = frames[number] or self._inputs(number)
+            scene, points, views = inputs.scene, inputs.points, inputs.views
+            with self.timer("roughness"):
+                found = measure_roughness_profile(
+                    inputs.cloud,
+                    scene,
+                    points,
+                    self.light,
+                    views,
+                    options=self.options.materials,
+                    frame=number,
+                    progress=self.within("roughness", number),
+                )
+            total = found if total is None else total + found
+        assert total is not None
+        with self.timer("roughness"):
+            estimate = solve_roughness(frame.cloud.positions, total)
+        self._roughness_report = estimate.report
+        write_frame(
+            path, key, {"roughness": estimate.roughness, "roughness_error": estimate.standard_error}
+        )
+
+    def _frame_key(self, number: int, frame: FrameInputs | None) -> str:
+        """Return what a frame's measurements depend on, as one word."""
+        cloud = (frame or self._inputs(number)).cloud
+        seen = "" if self._images is None else self._images.digest(number, self._digests)
+        return _digest(f"{self.key} {number} {cloud.radiance_color_space} {seen}", *cloud.arrays().values())
 
     def measure(self, number: int) -> None:
         """Measure a frame into the store, unless it is there already."""
         frame = self.first if number == 0 else self._inputs(number)
-        seen = "" if self._images is None else self._images.digest(number, self._digests)
-        key = _digest(f"{self.key} {number} {frame.cloud.radiance_color_space} {seen}", *frame.cloud.arrays().values())
+        key = self._frame_key(number, frame)
         if frame_key(self.path(number)) == key:
             self.resumed += 1
             return
@@ -325,7 +382,7 @@ class _Job:
                 frame.cloud,
                 scene,
                 points,
-                roughness,
+                roughness["roughness"],
                 self.light,
                 options=self.options.materials,
                 views=views,
@@ -339,7 +396,7 @@ class _Job:
         return {
             "ambient_occlusion": occlusion,
             "ambient_occlusion_error": occlusion_error,
-            "roughness": roughness,
+            **roughness,
             **{EVIDENCE + name: getattr(measured.evidence, name) for name in ColorEvidence.ARRAYS},
         }
 
@@ -358,7 +415,7 @@ class _Job:
                 frame.cloud,
                 scene,
                 views,
-                roughness,
+                roughness["roughness"],
                 self.light.sampled,
                 self.options.images,
                 raster_options=self._images.raster,
@@ -369,7 +426,7 @@ class _Job:
         self._notes.update(dict.fromkeys(found.notes))
         return {
             "ambient_occlusion": found.ambient_occlusion,
-            "roughness": roughness,
+            **roughness,
             "base_color": found.base_color,
             "observability": np.where(found.filled.any(axis=1), np.uint8(UNMEASURED), np.uint8(0)),
         }
@@ -405,7 +462,7 @@ class _Job:
             return cloud if self.options.images is not None else self._solved(cloud, frame if varying else 0)
 
         solution_names = {"base_color", "base_color_error", "observability"}
-        constant_roughness_names = {"roughness"} if self.persistent else set()
+        constant_roughness_names = {"roughness", "roughness_error"} if self.persistent else set()
         return GaussianSequence(
             frame_count=total,
             read_frame=read,
@@ -492,6 +549,7 @@ class _Job:
             "resumed_frames": self.resumed,
             "persistent": self.persistent,
             "materials": self._statistics,
+            "roughness": self._roughness_report,
             "seconds": dict(self.timer.seconds),
             "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
             "warnings": warnings_about(self._statistics),
