@@ -101,6 +101,7 @@ RANKS = {
     "beam_warp.material_light": 10,
     "beam_warp.surfaces": 10,
     "beam_warp.base_color": 12,
+    "beam_warp.roughness_estimation": 12,
     "beam_warp.deferred": 9,
     "beam_warp.materials": 11,
     "beam_warp.evaluation": 9,
