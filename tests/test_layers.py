@@ -104,6 +104,7 @@ RANKS = {
     "beam_warp.base_color": 12,
     "beam_warp.temporal_color": 13,
     "beam_warp.frame_inputs": 13,
+    "beam_warp.roughness_estimation": 12,
     "beam_warp.deferred": 9,
     "beam_warp.materials": 11,
     "beam_warp.image_residues": 10,
