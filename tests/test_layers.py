@@ -121,6 +121,7 @@ RANKS = {
     "beam_warp.reconstruction_scores": 10,
     "beam_warp.reconstruction_previews": 11,
     "beam_warp.exposure": 13,
+    "beam_warp.light_check": 13,
     "beam_warp.reporting": 13,
     "beam_warp.pipeline": 14,
     "beam_warp.reconstruction": 14,
