@@ -342,9 +342,7 @@ class _Job:
         with self.timer("roughness"):
             estimate = solve_roughness(frame.cloud.positions, total)
         self._roughness_report = estimate.report
-        write_frame(
-            path, key, {"roughness": estimate.roughness, "roughness_error": estimate.standard_error}
-        )
+        write_frame(path, key, {"roughness": estimate.roughness, "roughness_error": estimate.standard_error})
 
     def _frame_key(self, number: int, frame: FrameInputs | None) -> str:
         """Return what a frame's measurements depend on, as one word."""
@@ -462,14 +460,14 @@ class _Job:
             return cloud if self.options.images is not None else self._solved(cloud, frame if varying else 0)
 
         solution_names = {"base_color", "base_color_error", "observability"}
-        constant_roughness_names = {"roughness", "roughness_error"} if self.persistent else set()
+        roughness_names = {"roughness", "roughness_error"} if self.options.roughness == ESTIMATE else {"roughness"}
         return GaussianSequence(
             frame_count=total,
             read_frame=read,
             frames_per_second=self.sequence.frames_per_second,
             constant=frozenset(self.sequence.constant & set(ATTRIBUTES)) - {"normals"}
             | (set() if varying else solution_names)
-            | constant_roughness_names,
+            | (roughness_names if self.persistent else set()),
             topology="constant" if self.persistent else "perFrame",
             metadata={
                 **self.sequence.metadata,

@@ -1,13 +1,13 @@
 """Perceptual roughness from photographs: which one explains best how a point's colour changes with the view.
 
-The residues of every view are known for any roughness (`beam_warp.kernels.roughness_profile`), and what views show beyond
-them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect four parts
+The residues of every view are known for any roughness (`beam_warp.kernels.roughness_profile`), and what views show
+beyond them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect four parts
 in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how well one
 half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and standard
 deviation are stated: where the data cannot tell, these are the prior's.
 
-The weights: a misfit A counts as evidence exp(-T A). With halves 1 and 2 of the views, each with a base colour of its own,
-T maximises the sum over places of
+The weights: a misfit A counts as evidence exp(-T A). With halves 1 and 2 of the views, each with a base colour of its
+own, T maximises the sum over places of
 
     log sum_r p(r) exp(-T (A_1 + A_2)) - log sum_r p(r) exp(-T A_1) - log sum_r p(r) exp(-T A_2),
 
@@ -37,7 +37,7 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
 from beam_warp.lighting import Progress
 from beam_warp.material_light import MaterialLight
-from beam_warp.materials import MaterialOptions, light_batches, lit_points
+from beam_warp.materials import MaterialOptions, light_batches, lit_points, mean_radiance
 from beam_warp.scene import Scene
 from beam_warp.surfaces import SurfacePoints
 from beam_warp.view_evidence import ViewEvidence
@@ -167,7 +167,7 @@ def measure_roughness_profile(
     scene: Scene,
     points: SurfacePoints,
     light: MaterialLight,
-    views: ViewEvidence,
+    views: ViewEvidence | None,
     *,
     options: MaterialOptions,
     frame: int = 0,
@@ -181,7 +181,7 @@ def measure_roughness_profile(
         scene: The same Gaussians, uploaded.
         points: Where their light is gathered.
         light: The light of the capture, prepared on the scene's device.
-        views: What views with images show.
+        views: What views with images show; None takes the captured radiance around each normal.
         options: Rays, offset, bounce, seed; as for `beam_warp.materials.measure_materials`.
         frame: Number of the frame, for the rays' random streams.
         rows: Gaussians to measure; all of them if None.
@@ -194,7 +194,7 @@ def measure_roughness_profile(
     chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
     shown = chosen[points.seen[chosen]]
     # Any roughness will do here: the candidates take its place.
-    measured = lit_points(cloud, scene, points, np.ones(len(cloud), np.float32), light, shown, views)
+    measured = lit_points(cloud, points, np.ones(len(cloud), np.float32), light, shown, views)
     candidates = upload(np.array(CANDIDATES, np.float32), float, device)
     fit = ProfileFit()
     fit.misfit = wp.zeros((int(PARTS), len(shown), len(CANDIDATES)), dtype=float, device=device)
@@ -205,7 +205,8 @@ def measure_roughness_profile(
             progress(len(chosen) - (total - done), len(chosen))
 
     normals, observed, lobes = measured.surface.normals, measured.views, light.blurred.light
-    for lit in light_batches(cloud, scene, points, light, measured, options, views, frame, report):
+    bounced = mean_radiance(cloud, views) if options.bounce else None
+    for lit in light_batches(scene, points, light, measured, options, bounced, frame, report):
         shares = wp.empty((len(lit.batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
         launch_lobe_shares(lit.batch, lit.rays, measured.light, normals, observed, shares, device)
         launch_profile(lit.batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
@@ -317,7 +318,8 @@ def _weigh(
     """Return the prior, and what misfits of places and of surroundings are worth; each needs the others: two rounds.
 
     The prior's mean is taken from evidence as far as it counts. Its spread is taken from evidence at its word: cut to
-    a quarter, evidence cannot tell apart places that differ, and the spread of two captures comes out a third too small.
+    a quarter, evidence cannot tell apart places that differ, and the spread of two captures comes out a third too
+    small.
     """
     start = prior or RoughnessPrior()
     chosen = start
