@@ -29,6 +29,10 @@ UNCERTAIN_NORMAL = 0.2
 
 FILL_NEIGHBORS = 8
 
+PAIRED = 512
+PAIR_GROUPS = 64
+"""Gaussians whose pairs say how values differ with distance, and groups of as many pairs each by distance."""
+
 MISSING = Observability.UNLIT | Observability.UNSEEN
 """What base colour cannot be measured of."""
 
@@ -69,7 +73,7 @@ def solve_base_color(
     Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
     """
     flags = observability(cloud, evidence, mean_irradiance)
-    missing = (flags & np.uint8(MISSING)) != 0
+    missing = ((flags & np.uint8(MISSING)) != 0) | ~_has_evidence(evidence)
     raw, error = least_squares(evidence)
     base_color, error = np.clip(raw, 0.0, 1.0), error * np.sqrt(dispersion)
     weight = np.where(missing, 0.0, cloud.opacities)
@@ -100,20 +104,25 @@ def observability(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance
     irradiance = np.asarray(evidence.irradiance).mean(axis=1) / frames
     openness = np.asarray(evidence.openness) / frames
     unseen = ~(openness > BURIED_VISIBILITY) | ~(np.asarray(evidence.unseen) < frames)
-    grazing = ~unseen & ~(np.asarray(evidence.facing) / frames > FACING_PART)
+    saturated = np.asarray(evidence.saturated) / frames > SATURATED_PART
+    # What was cut, or seen at grazing angles alone, is without evidence for that reason and not for want of light.
+    grazing = ~unseen & ~saturated & ~(np.asarray(evidence.facing) / frames > FACING_PART)
+    unexplained = ~_has_evidence(evidence) & ~saturated & ~grazing
     flags = np.zeros(len(irradiance), np.uint8)
     for mask, flag in (
-        (
-            ~(irradiance > UNLIT_PART * mean_irradiance) | ~(np.asarray(evidence.denominator) > 0.0).all(axis=1),
-            Observability.UNLIT,
-        ),
+        (~(irradiance > UNLIT_PART * mean_irradiance) | unexplained, Observability.UNLIT),
         (unseen, Observability.UNSEEN),
-        (np.asarray(evidence.saturated) / frames > SATURATED_PART, Observability.SATURATED),
+        (saturated, Observability.SATURATED),
         (~(cloud.normal_confidence > UNCERTAIN_NORMAL), Observability.UNCERTAIN_NORMAL),
         (grazing, Observability.GRAZING),
     ):
         flags[mask] |= np.uint8(flag)
     return flags
+
+
+def _has_evidence(evidence: ColorEvidence) -> NDArray[np.bool_]:
+    """Return which Gaussians have any view that base colour follows from, in every channel."""
+    return (np.asarray(evidence.denominator) > 0.0).all(axis=1)
 
 
 def fill_from_neighbors(
@@ -122,7 +131,10 @@ def fill_from_neighbors(
     errors: NDArray[Any],
     missing: NDArray[np.bool_],
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Give what was not observed the mean of its nearest observed neighbours; its error is their spread.
+    """Give what was not observed the mean of its nearest observed neighbours.
+
+    Its error is their spread, or how much values differ at its distance from them if that is more, and their own error
+    beside it.
 
     Args:
         positions: Centres [m], ``(N, 3)``.
@@ -142,5 +154,29 @@ def fill_from_neighbors(
     mean = np.einsum("nk,nkc->nc", weight, near)
     filled, spread = values.copy(), errors.copy()
     filled[missing] = mean
-    spread[missing] = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2)) + errors[known].mean(axis=0)
+    around = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2))
+    away = _difference_at(distance[:, 0], positions[known], values[known])
+    spread[missing] = np.maximum(around, away) + errors[known].mean(axis=0)
     return filled, spread
+
+
+def _difference_at(distance: NDArray[Any], positions: NDArray[np.float32], values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return by how much values that far from each other differ, root mean square, ``(M, C)``.
+
+    The larger of what pairs of that distance and of any smaller one show; nearer than the nearest pairs, nothing.
+
+    Source: the structure function (variogram) of geostatistics, Matheron 1963.
+    """
+    rows = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), PAIRED)).astype(np.int64))
+    one, two = np.triu_indices(len(rows), 1)
+    if not len(one):
+        return np.zeros((len(distance), values.shape[1]))
+    place, value = positions[rows].astype(np.float64), values[rows].astype(np.float64)
+    apart = np.linalg.norm(place[one] - place[two], axis=1)
+    order = np.argsort(apart, kind="stable")
+    groups = np.array_split(order, min(PAIR_GROUPS, len(order)))
+    at = np.array([apart[group].mean() for group in groups])
+    differ = np.array([np.sqrt(((value[one[group]] - value[two[group]]) ** 2).mean(axis=0)) for group in groups])
+    differ = np.maximum.accumulate(differ, axis=0)
+    at, differ = np.append(0.0, at), np.vstack([np.zeros(values.shape[1]), differ])
+    return np.stack([np.interp(distance, at, differ[:, channel]) for channel in range(values.shape[1])], axis=1)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture_findings import Finding
+from beam_warp.capture_findings import Finding, count_of
 from beam_warp.checks import require_count
 from beam_warp.environment_sampling import LUMINANCE
 from beam_warp.environments import EnvironmentMap, texel_directions
@@ -29,6 +29,9 @@ LIGHT_ROWS, LIGHT_COLUMNS = 16, 32
 
 LEAST_POINTS = 64
 """Fewest Gaussians that say anything about light."""
+
+LEAST_VIEWS = 4
+"""Fewest views: one side of a subject alone is explained by many lights."""
 
 MOST_VIEWS = 12
 """Views that gloss is looked at in: what more of them say costs more than it tells."""
@@ -216,8 +219,11 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
     if not environment.radiance.any():
         remedy = "Check its exposure and the file; nothing can be measured without light."
         return _unjudged(count, Finding("error", "environment-black", "environment is black", remedy=remedy))
-    if count < LEAST_POINTS:
-        what = f"only {count} Gaussians are seen well enough to check the environment, of {LEAST_POINTS} needed"
+    if count < LEAST_POINTS or len(weights) < LEAST_VIEWS:
+        what = (
+            f"environment is not checked: {count} Gaussians are seen well in {count_of(len(weights), 'view')}, "
+            f"{LEAST_POINTS} and {LEAST_VIEWS} are needed"
+        )
         remedy = "More views, or views from nearer, would allow it."
         return _unjudged(count, Finding("note", "light-unchecked", what, remedy=remedy))
     weights, total, observed, luminance = weights[:, asked], total[asked], observed[asked], luminance[:, asked]
