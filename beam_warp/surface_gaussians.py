@@ -33,8 +33,8 @@ COLOR_STEPS = 6
 """Of conjugate gradients: with the pull below, the residual falls by half or more a step."""
 
 PULL = 0.1
-"""Towards the mean of what pixels show around, in parts of the pixels that a Gaussian is worth, or the median one if that
-is more: what is finer than a pixel no image tells, and least squares alone fills it with noise."""
+"""Towards the mean of what pixels show around, in parts of the pixels that a Gaussian is worth, or the median one if
+that is more: what is finer than a pixel no image tells, and least squares alone fills it with noise."""
 
 NEIGHBORS = 8
 """Gaussians that mean is over."""
