@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -200,14 +200,11 @@ class PerfectFrame:
         if exact:
             assert self.cloud.normals is not None
             device = self.scene.device
-            evidence = ViewEvidence(
-                wp.array(self.cloud.positions, dtype=wp.vec3, device=device),
-                wp.array(self.cloud.normals, dtype=wp.vec3, device=device),
-                wp.full(len(self.cloud), 1.0, dtype=float, device=device),
-                evidence.weight,
-                evidence.saturated,
-                evidence.colors,
-                evidence.directions,
+            evidence = replace(
+                evidence,
+                positions=wp.array(self.cloud.positions, dtype=wp.vec3, device=device),
+                normals=wp.array(self.cloud.normals, dtype=wp.vec3, device=device),
+                agreement=wp.full(len(self.cloud), 1.0, dtype=float, device=device),
             )
         return SurfacePoints.seen_by(self.cloud, evidence, self.scene, offset)
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import materials as benchmark
 import numpy as np
@@ -109,7 +110,7 @@ class TestContenders:
             row.method(None)
         assert calls[0] == DIRECT_AS_PAPER
         assert calls[-1] == OURS
-        for before, after in zip(calls[:-1], calls[1:], strict=True):
+        for before, after in pairwise(calls):
             changed = [
                 name for name in ("offset", "observed", "joint") if getattr(before, name) != getattr(after, name)
             ]
