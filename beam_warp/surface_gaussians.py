@@ -29,15 +29,18 @@ OPACITY = 0.99
 FLATNESS = 0.02
 """Thickness over width: thinner than the surface's bend over a Gaussian, so that silhouettes stay where they are."""
 
-COLOR_STEPS = 8
+COLOR_STEPS = 6
 """Of conjugate gradients: with the pull below, the residual falls by half or more a step."""
 
 PULL = 0.1
-"""Towards what pixels show spread back, in parts of the pixels that a Gaussian is worth: what is finer than a pixel no
-image tells, and least squares alone fills it with noise."""
+"""Towards the mean of what pixels show around, in parts of the pixels that a Gaussian is worth, or the median one if
+that is more: what is finer than a pixel no image tells, and least squares alone fills it with noise."""
+
+NEIGHBORS = 8
+"""Gaussians that mean is over."""
 
 UNSEEN_PIXELS = 1e-2
-"""Gaussians that are worth fewer pixels over all views take the colour of their nearest neighbour that is not."""
+"""Gaussians that are worth fewer, neighbours included, take the colour of the nearest one that is worth more."""
 
 GROUP_SPLATS = 2**22
 """Most splats, Gaussians times views, that are kept drawn together unless one view has more."""
@@ -98,7 +101,7 @@ def colored_by_views(
 ) -> GaussianCloud:
     """Give Gaussians the colours, the same from everywhere, whose drawing comes nearest to what views show.
 
-    Least squares over all pixels, each Gaussian pulled a little towards the mean of the pixels it is part of, by
+    Least squares over all pixels, each Gaussian pulled a little towards the mean of what pixels show around it, by
     conjugate gradients, preconditioned by the pixels that it is worth; geometry stays as it is.
 
     Args:
@@ -120,16 +123,16 @@ def colored_by_views(
         raise InvalidArrayError("views must hold at least one view, got none. Pass what the cameras saw.")
     drawn = _DrawnViews.of(cloud, views, options, resolve_device(device))
     shown = drawn.spread([view.color.reshape(-1, 3) for view in views])
-    total = drawn.normal_matrix(np.ones((len(cloud), 3)))  # its rows' sums: with it, one colour comes back as it is
-    seen = total[:, :1] > UNSEEN_PIXELS
-    diagonal = np.where(seen, total, 1.0)
-    colors = np.where(seen, shown / diagonal, 0.0)
-    # At the mean itself the pull is 0.
-    residual = np.where(seen, shown - drawn.normal_matrix(colors), 0.0)
+    worth = drawn.normal_matrix(np.ones((len(cloud), 3)))  # with these sums of its rows, one colour comes back as it is
+    colors = _mean_around(cloud.positions, shown, worth)
+    seen = worth[worth > UNSEEN_PIXELS]
+    pull = PULL * np.maximum(worth, np.median(seen) if len(seen) else 1.0)
+    diagonal = worth + pull
+    residual = shown - drawn.normal_matrix(colors)  # at the mean itself the pull is 0
     scaled = residual / diagonal
     direction, energy = scaled, (residual * scaled).sum(axis=0)
     for _ in range(steps):
-        image = np.where(seen, drawn.normal_matrix(direction) + PULL * diagonal * direction, 0.0)
+        image = drawn.normal_matrix(direction) + pull * direction
         step = energy / np.maximum((direction * image).sum(axis=0), 1e-30)
         colors = colors + step * direction
         residual = residual - step * image
@@ -138,13 +141,26 @@ def colored_by_views(
         direction = scaled + following / np.maximum(energy, 1e-30) * direction
         energy = following
     colors = np.maximum(colors, 0.0)
-    known = np.flatnonzero(seen[:, 0])
-    if 0 < len(known) < len(cloud):
-        unknown = np.flatnonzero(~seen[:, 0])
-        nearest = cKDTree(cloud.positions[known]).query(cloud.positions[unknown], workers=-1)[1]
-        colors[unknown] = colors[known[nearest]]
     radiance = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
     return cloud.with_arrays(radiance=radiance, radiance_color_space=LINEAR_REC709)
+
+
+def _mean_around(
+    positions: NDArray[np.float32], shown: NDArray[np.float64], worth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the mean of what pixels show of each Gaussian and its neighbours; the nearest one's where they show none.
+
+    A Gaussian that neighbours hide from nearly all views would take its colour from a few pixels' noise.
+    """
+    near = (
+        cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1].reshape(len(positions), -1)
+    )
+    total = worth[near].sum(axis=1)
+    seen = total[:, 0] > UNSEEN_PIXELS
+    mean = np.where(seen[:, None], shown[near].sum(axis=1) / np.maximum(total, UNSEEN_PIXELS), 0.0)
+    if 0 < seen.sum() < len(seen):
+        mean[~seen] = mean[seen][cKDTree(positions[seen]).query(positions[~seen], workers=-1)[1]]
+    return mean
 
 
 @dataclass(frozen=True, eq=False)

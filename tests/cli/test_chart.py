@@ -120,3 +120,60 @@ def test_own_light_is_named(scene, tmp_path, capsys):
     words = ("--environment", tmp_path / "sky.exr", "--json", "--budget-seconds", 0)
     assert beam("chart", "tracing", scene, "--out", tmp_path / "out", *QUICK, *words) == 0
     assert json.loads(capsys.readouterr().out)["notes"]["Light"] == "sky.exr"
+
+
+MATERIALS = (
+    *("--device", "cpu", "--rays", 4, 8, "--samplers", "owen", "--densities", "product", "--ratios", "ratio"),
+    *("--offsets", "auto", "0.02", "--bounces", "one", "--weights", "albedo_scaling", "--fits", "robust"),
+    *("--observed", "difference", "--denoisers", "none"),
+)
+
+
+def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("beam_warp.materials_study.GAUSSIANS", {False: 500})
+    assert beam("chart", "materials", "--capture", tiny_capture.folder, "--out", tmp_path, *MATERIALS, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["measured"] == report["planned"] == 6  # auto and 0.02 m directly, 0.02 m by images
+    assert set(report["frontier"]) == {"occlusion_error", "color_error"}
+    assert {path.name for path in tmp_path.iterdir()} == {"materials.csv", "materials.png", "materials.html"}
+    again = tmp_path / "again"
+    words = ("--from-csv", tmp_path / "materials.csv", "--out", again)
+    assert beam("chart", "materials", *words) == 0
+    assert "6 of 6 planned settings measured" in capsys.readouterr().out
+
+
+def test_materials_of_an_asset(tiny_capture, tmp_path, capsys):
+    from beam_warp.environments import EnvironmentMap
+    from beam_warp.materials_study import MaterialsSubject
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("beam_warp.materials_study.GAUSSIANS", {False: 300})
+        light = EnvironmentMap.read(tiny_capture.environment_path)
+        cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud
+    write(GaussianSequence.from_clouds([cloud]), tmp_path / "figure" / "asset.usda")
+    words = (tmp_path / "figure" / "asset.usda", "--capture", tiny_capture.folder, "--out", tmp_path / "chart")
+    assert beam("chart", "materials", *words, *MATERIALS, "--budget-seconds", 0, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["measured"] == 1
+    assert report["title"].startswith("Error against time of materials: figure, 300 Gaussians")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("asset.usda",), "capture must be given with an asset, got asset.usda alone"),
+        (("--capture", "none"), "capture must be a folder"),
+        (("--capture", "none", "--from-csv", "none.csv"), "from-csv must be given without an asset, a capture"),
+        (("--samplers", "sobol"), "samplers must be one of owen, stratified, iid, got 'sobol'"),
+        (("--offsets", "3t"), "offsets must be auto or metres"),
+        (("--budget-seconds", "nan"), "budget-seconds must be a number"),
+        (("--device", "cuda:99"), "device must be one of"),
+    ],
+)
+def test_materials_mistakes(words, says, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert beam("chart", "materials", *words, "--out", out) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert says in line
+    assert not out.exists()
