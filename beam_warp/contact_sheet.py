@@ -34,10 +34,10 @@ Panel = tuple[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True, eq=False)
 class Relighting:
-    """A light to show the asset under."""
+    """A light to show the asset under; one that is prepared, on the device that draws, is not prepared again."""
 
     title: str
-    environment: EnvironmentMap
+    light: EnvironmentMap | EnvironmentLighting
 
 
 def display_exposure(lighting: EnvironmentLighting) -> float:
@@ -79,12 +79,14 @@ def contact_sheet(
         ("roughness (white is 1)", over_background(_gray(buffer.channels["roughness"]), alpha)),
         ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels["normals"] + 0.5, alpha)),
     ]
-    for light in relightings:
-        lighting = EnvironmentLighting.from_environment(light.environment, device=device)
+    for relighting in relightings:
+        lighting = relighting.light
+        if isinstance(lighting, EnvironmentMap):
+            lighting = EnvironmentLighting.from_environment(lighting, device=device)
         radiance = relight(buffer, lighting)
         straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
         shown = display_image(straight, display_exposure(lighting)) / 255.0
-        panels.append((light.title, over_background(shown, alpha)))
+        panels.append((relighting.title, over_background(shown, alpha)))
     return _grid(panels)
 
 

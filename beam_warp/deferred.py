@@ -113,6 +113,20 @@ class EnvironmentLighting:
             setattr(light, name, wp.array(array.numpy() * np.float32(factor), dtype=wp.vec3, device=self.device))
         return EnvironmentLighting(self.environment.scaled(factor), self.device, light)
 
+    def turned_around(self) -> EnvironmentLighting:
+        """Return the same light turned by 180 degrees about z, a whole number of columns in every level: a copy."""
+
+        def turned(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.roll(image, image.shape[1] // 2, axis=1)
+
+        light = EnvironmentLight()
+        for name in EnvironmentLight.vars:
+            setattr(light, name, getattr(self.light, name))
+        light.irradiance = wp.array(turned(self.light.irradiance.numpy()), dtype=wp.vec3, device=self.device)
+        levels = [turned(self.blurred_level(level)).reshape(-1, 3) for level in range(self.light.level_count)]
+        light.texels = wp.array(np.concatenate(levels), dtype=wp.vec3, device=self.device)
+        return EnvironmentLighting(self.environment.rotated(180.0), self.device, light)
+
     def blurred_level(self, level: int) -> NDArray[np.float32]:
         """Return one level of blurred radiance as a lat-long image, ``(H, 2 H, 3)``, to look at or to test."""
         height = int(self.light.heights.numpy()[level])

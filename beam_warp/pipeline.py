@@ -191,8 +191,8 @@ def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: O
         height=options.height,
     )
     lights = [
-        Relighting("relit by the light of the capture", job.lit),
-        options.second_light or Relighting("relit by that light turned by 180°", job.lit.rotated(180.0)),
+        Relighting("relit by the light of the capture", job.light.blurred),
+        options.second_light or Relighting("relit by that light turned by 180°", job.light.blurred.turned_around()),
     ]
     raster = RasterOptions.from_metadata(sequence.metadata)
     write_png(path, contact_sheet(cloud, camera, lights, options=raster, device=str(job.device)))

@@ -167,6 +167,17 @@ class TestBlurredLevels:
             brightest = texel_directions(height, 2 * height).reshape(-1, 3)[blurred[..., 0].argmax()]
             assert np.arccos(np.clip(brightest @ sun, -1, 1)) < np.pi / height
 
+    def test_turned_around_is_prepared_from_the_turned_map(self, device, rng):
+        environment = sunny_environment(rng, height=32)
+        turned = EnvironmentLighting.from_environment(environment, device=device).turned_around()
+        expected = EnvironmentLighting.from_environment(environment.rotated(180.0), device=device)
+        np.testing.assert_array_equal(turned.environment.radiance, expected.environment.radiance)
+        rounding = 2 * 2 * 64**2 * FLOAT32  # of two sums of as many positive terms as the tree's finest level has cells
+        for level in range(len(LEVEL_ROUGHNESS)):
+            np.testing.assert_allclose(turned.blurred_level(level), expected.blurred_level(level), rtol=rounding)
+        ours, theirs = (lighting.light.irradiance.numpy() for lighting in (turned, expected))
+        np.testing.assert_allclose(ours, theirs, rtol=rounding)
+
     def test_same_bits_for_any_thread_count(self, monkeypatch, rng):
         environment = sunny_environment(rng)
         surfaces = random_surfaces(rng, (50, 60))
