@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -13,16 +13,26 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.asset_metadata import numbers_of_frames
-from beam_warp.assets import DISPLAY_SRGB, WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709, WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.axes import change_axes
 from beam_warp.base_color import fill_from_neighbors
 from beam_warp.capture_digests import CaptureDigests
+from beam_warp.capture_findings import Finding
 from beam_warp.capture_inspection import SPLIT
 from beam_warp.captured_views import CapturedView
 from beam_warp.captures import Capture, CaptureRecord
-from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.decomposition_checks import (
+    judge_clipping,
+    judge_environment,
+    largest_value,
+    match_silhouettes,
+    matched_frames,
+    require_match,
+)
+from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidArrayError
 from beam_warp.images import SCENE_REFERRED_SUFFIXES
+from beam_warp.light_check import check_light
 from beam_warp.raster_records import RasterOptions
 from beam_warp.roughness import constant_roughness, textured_roughness
 from beam_warp.scene import Scene
@@ -31,6 +41,9 @@ from beam_warp.view_evidence import ViewEvidence, view_evidence
 
 LOADING_THREADS = 8
 """Images decoded at a time."""
+
+SILHOUETTES = 6
+"""Views, evenly chosen, in which silhouettes are compared."""
 
 Timer = Callable[[str], AbstractContextManager[None]]
 """Charges what is done in its context to a stage."""
@@ -57,26 +70,20 @@ class CaptureImages:
             InvalidOptionError: The capture lacks a frame of the sequence.
         """
         self.raster = RasterOptions.from_metadata(sequence.metadata)
-        self._records: dict[int, list[CaptureRecord]] = {}
-        available = sorted({record.frame for record in capture.select(split=SPLIT)})
-        for index, frame in enumerate(numbers_of_frames(sequence.metadata, len(sequence))):
-            records = capture.select(split=SPLIT, frames={frame})
-            if not records:
-                spread = f"{available[0]} to {available[-1]}" if available else "none"
-                raise InvalidOptionError(
-                    f"capture must have images of every frame of the sequence, got none of frame {frame} (it has "
-                    f"{spread}). Pass the capture that the sequence was reconstructed from."
-                )
-            self._records[index] = list(records)
+        self._records = {
+            index: list(capture.select(split=SPLIT, frames={frame}))
+            for index, frame in enumerate(matched_frames(sequence, capture, SPLIT))
+        }
 
     def views(self, index: int) -> list[CapturedView]:
         """Read the images of a frame of the sequence."""
         with ThreadPoolExecutor(LOADING_THREADS) as pool:
             return list(pool.map(lambda record: record.view(), self._records[index]))
 
-    def ceiling(self, index: int) -> float:
-        """Return the largest value that the images of a frame can hold: display-referred files end at white."""
-        return 1.0 if any(_is_display_referred(record) for record in self._records[index]) else float("inf")
+    def ceiling(self, index: int, views: Sequence[CapturedView]) -> float:
+        """Return the largest value that the images of a frame can hold."""
+        spaces = [_color_space(record) for record in self._records[index]]
+        return min(largest_value(view, space) for view, space in zip(views, spaces, strict=True))
 
     def digest(self, index: int, digests: CaptureDigests) -> str:
         """Return what the images of a frame are, cameras included, as one word."""
@@ -136,20 +143,44 @@ class FrameInputs:
         with self._timer("upload and build"):
             return Scene.from_gaussians(self.cloud, self._device)
 
+    @property
+    def images(self) -> list[CapturedView]:
+        """What the cameras saw, read anew each time."""
+        if self._images is None:
+            return []
+        with self._timer("read images"):
+            return self._images.views(self.number)
+
+    def check(self, environment: EnvironmentMap) -> list[Finding]:
+        """Find what is wrong with the light and the images, before anything is measured.
+
+        Raises:
+            InvalidOptionError: The light is black, or the images show something else than the Gaussians.
+        """
+        findings = judge_environment(environment)
+        if self._images is None or self.views is None:
+            return findings
+        images = self.images
+        some = images[:: max(1, len(images) // SILHOUETTES)]
+        match = match_silhouettes(self.cloud, some, options=self._images.raster, device=self._device)
+        require_match(match)
+        findings += [match.finding] if match.finding is not None else []
+        findings += judge_clipping(images, self._images.ceiling(self.number, images))
+        return findings + list(check_light(self.scene, self.points, self.views, environment).findings)
+
     @cached_property
     def views(self) -> ViewEvidence | None:
         """What the capture's images show; None without a capture."""
         if self._images is None:
             return None
-        with self._timer("read images"):
-            images = self._images.views(self.number)
+        images = self.images
         with self._timer("views"):
             return view_evidence(
                 self.cloud,
                 [image.camera for image in images],
                 images,
                 options=self._images.raster,
-                ceiling=self._images.ceiling(self.number),
+                ceiling=self._images.ceiling(self.number, images),
                 device=self._device,
                 progress=lambda done, total: self._progress("views", done, total),
             )
@@ -201,7 +232,8 @@ def filled_occlusion(
     return mean[:, 0].astype(np.float32), spread[:, 0].astype(np.float32)
 
 
-def _is_display_referred(record: CaptureRecord) -> bool:
+def _color_space(record: CaptureRecord) -> str:
+    """Return the colour space of a record's image: as stated, or by the custom of its format."""
     if record.color_space is not None:
-        return record.color_space == DISPLAY_SRGB
-    return record.image_path.suffix.lower() not in SCENE_REFERRED_SUFFIXES
+        return record.color_space
+    return LINEAR_REC709 if record.image_path.suffix.lower() in SCENE_REFERRED_SUFFIXES else DISPLAY_SRGB

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -34,7 +35,7 @@ from beam_warp.images import write_png
 from beam_warp.material_light import MaterialLight
 from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
 from beam_warp.raster_records import RasterOptions
-from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_report
+from beam_warp.reporting import Tally, device_facts, versions, warnings_about, write_json, write_report
 from beam_warp.roughness_estimation import measure_roughness_profile, solve_roughness
 from beam_warp.temporal_color import ChangeTest, with_changes
 
@@ -157,6 +158,7 @@ def run(
     frames, digests = make_folders(folder, "frames", "digests")
     images = None if capture is None else CaptureImages(capture, sequence)
     job = _Job(sequence, environment, frames, chosen, images, CaptureDigests(digests), progress)
+    job.check()
     total = len(sequence)
     for frame in range(total):
         job.measure(frame)
@@ -245,6 +247,7 @@ class _Job:
         self.key = _digest(self._described(), self.lit.radiance)
         self._statistics: dict[str, Any] = {}
         self._notes: dict[str, None] = {}
+        self._findings: list[dict[str, Any]] = []
         self._roughness_paths: set[Path] = set()
         self._roughness_report: dict[str, Any] = {}
 
@@ -349,6 +352,20 @@ class _Job:
         cloud = (frame or self._inputs(number)).cloud
         seen = "" if self._images is None else self._images.digest(number, self._digests)
         return _digest(f"{self.key} {number} {cloud.radiance_color_space} {seen}", *cloud.arrays().values())
+
+    def check(self) -> None:
+        """Look at the light and the images of the first frame; what was found is kept beside the frames."""
+        path = self.folder / "findings.json"
+        key = self._frame_key(0, self.first)
+        # Whatever is wrong with what was kept, it is found again.
+        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+            known = json.loads(path.read_text(encoding="utf-8"))
+            if known["key"] == key:
+                self._findings = list(known["findings"])
+                return
+        with self.timer("check"):
+            self._findings = [vars(finding) for finding in self.first.check(self.lit)]
+        write_json(path, {"key": key, "findings": self._findings})
 
     def measure(self, number: int) -> None:
         """Measure a frame into the store, unless it is there already."""
@@ -550,8 +567,15 @@ class _Job:
             "roughness": self._roughness_report,
             "seconds": dict(self.timer.seconds),
             "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
-            "warnings": warnings_about(self._statistics),
+            "findings": self._findings,
+            "warnings": [*map(_warning, self._findings), *warnings_about(self._statistics)],
         }
+
+
+def _warning(finding: Mapping[str, Any]) -> str:
+    """Return a stored finding as a line for people."""
+    place = f" ({finding['where']})" if finding["where"] else ""
+    return f"{finding['what']}{place}. {finding['remedy']}".strip()
 
 
 def _roughness_source(source: float | RoughnessTexture | str) -> str:

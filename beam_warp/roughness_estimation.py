@@ -1,8 +1,8 @@
 """Perceptual roughness from photographs: which one explains best how a point's colour changes with the view.
 
 The residues of every view are known for any roughness (`beam_warp.kernels.roughness_profile`), and what views show
-beyond them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect four parts
-in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how well one
+beyond them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect four
+parts in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how well one
 half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and standard
 deviation are stated: where the data cannot tell, these are the prior's.
 

@@ -103,7 +103,7 @@ RANKS = {
     "beam_warp.traced_relighting": 12,
     "beam_warp.base_color": 12,
     "beam_warp.temporal_color": 13,
-    "beam_warp.frame_inputs": 13,
+    "beam_warp.frame_inputs": 14,
     "beam_warp.roughness_estimation": 12,
     "beam_warp.deferred": 9,
     "beam_warp.materials": 11,
