@@ -2,8 +2,8 @@
 
 The residues of every view are known for any roughness (`beam_warp.kernels.roughness_profile`), and what views show
 beyond them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect four
-parts in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how well one
-half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and standard
+parts in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how well
+one half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and standard
 deviation are stated: where the data cannot tell, these are the prior's.
 
 The weights: a misfit A counts as evidence exp(-T A). With halves 1 and 2 of the views, each with a base colour of its
