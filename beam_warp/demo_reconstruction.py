@@ -28,7 +28,7 @@ from beam_warp.joint_tracking import JointOptions
 from beam_warp.mesh_path_tracing import TracedMesh
 from beam_warp.mesh_preview import shaded_image
 from beam_warp.meshing import mesh_of_gaussians
-from beam_warp.pipeline import OverviewOptions, Progress, RunOptions, RunResult, run
+from beam_warp.pipeline import ESTIMATE, OverviewOptions, Progress, RunOptions, RunResult, run
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import RADIANCE, SURFACE_NORMALS, rasterize
 from beam_warp.reconstruction import reconstruct
@@ -150,7 +150,8 @@ def demo_from_images(
         lights[light],
         out / "from_images",
         # The capture's light and its exposure are known, and its images are scene-linear.
-        RunOptions(exposure=0.0, device=device),
+        RunOptions(exposure=0.0, roughness=ESTIMATE, device=device),
+        capture=capture,
         overview=OverviewOptions(
             second_light=Relighting(f"relit by a {others[0]}", lights[others[0]]) if others else None,
             azimuth=25.0,
