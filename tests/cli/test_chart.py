@@ -150,6 +150,7 @@ def test_materials_of_an_asset(tiny_capture, tmp_path, capsys):
         patch.setattr("beam_warp.materials_study.GAUSSIANS", {False: 300})
         light = EnvironmentMap.read(tiny_capture.environment_path)
         cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud
+    (tmp_path / "figure").mkdir()
     write(GaussianSequence.from_clouds([cloud]), tmp_path / "figure" / "asset.usda")
     words = (tmp_path / "figure" / "asset.usda", "--capture", tiny_capture.folder, "--out", tmp_path / "chart")
     assert beam("chart", "materials", *words, *MATERIALS, "--budget-seconds", 0, "--json") == 0
