@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -209,12 +210,17 @@ def require_columns(views: Sequence[BakeTarget]) -> int:
 
 @dataclass(eq=False)
 class _Group:
-    """Views that are drawn together."""
+    """Views that are drawn together; of each, what it should show and what that counts, ``(pixels of the view, K)``."""
 
     rasterizer: Rasterizer
-    targets: wp.array  # (P, K)
-    weights: wp.array
+    targets: list[wp.array]
+    weights: list[wp.array]
     rows: wp.array  # (V * N, K), room for what each view says
+
+    def pixels_by_view(self, pixels: wp.array) -> list[wp.array]:
+        """Return each view's part of what was drawn."""
+        ends = self.rasterizer.first_pixels
+        return [pixels[start:end] for start, end in pairwise(ends)]
 
     def back_project(self, pixels: wp.array, out: wp.array) -> None:
         """Write the transpose of drawing values: for every Gaussian the sum of pixels by its blending weights."""
@@ -241,21 +247,38 @@ class _BlendedImages:
         self.columns = columns
         self.width = next(n for n in CHANNEL_COUNTS if n >= columns)
         self._drawn_values, self._summed = (wp.zeros((self.count, self.width), dtype=float) for _ in range(2))
-        self.groups = []
         alone = options.solver == "adam"  # a step is a view
-        for part in _groups([view.camera for view in views], self.count, alone):
-            cameras = [views[i].camera for i in part]
-            rasterizer = Rasterizer(self.count, cameras, value_count=self.width, options=raster_options, device=device)
+        parts = _groups([view.camera for view in views], self.count, alone)
+        rows = wp.empty((max(len(part) for part in parts) * self.count, self.width), dtype=float)
+        # All groups draw into the same images: what one drew is used up before the next one draws.
+        first = max(parts, key=lambda part: sum(views[i].camera.width * views[i].camera.height for i in part))
+        room = Rasterizer(
+            self.count,
+            [views[i].camera for i in first],
+            value_count=self.width,
+            options=raster_options,
+            device=device,
+        )
+        self.groups = []
+        for part in parts:
+            rasterizer = room
+            if part is not first:
+                rasterizer = Rasterizer(
+                    self.count,
+                    [views[i].camera for i in part],
+                    value_count=self.width,
+                    options=raster_options,
+                    device=device,
+                    images_of=room,
+                )
             rasterizer.draw(gaussians._replace(values=self._drawn_values, radiance=None))
-            targets, weights = (wp.zeros((rasterizer.first_pixels[-1], self.width), dtype=float) for _ in range(2))
-            for place, i in enumerate(part):
-                rows = slice(*rasterizer.first_pixels[place : place + 2])
-                shape = (cameras[place].height, cameras[place].width, columns)
-                for name, whole in (("targets", targets), ("weights", weights)):
+            group = _Group(rasterizer, [], [], rows[: len(part) * self.count])
+            for i in part:
+                shape = (views[i].camera.height, views[i].camera.width, columns)
+                for name, held in (("targets", group.targets), ("weights", group.weights)):
                     given = device_array(f"views[{i}].{name}", getattr(views[i], name), shape, device)
-                    wp.copy(whole[rows, :columns], given.reshape((-1, columns)))
-            room = wp.empty((len(part) * self.count, self.width), dtype=float)
-            self.groups.append(_Group(rasterizer, targets, weights, room))
+                    held.append(given.contiguous().reshape((-1, columns)))
+            self.groups.append(group)
         self.evidence = self._row_sums()
         self.strength = wp.zeros((self.count, self.width), dtype=float)
         self._anchors = wp.zeros((self.count, self.width), dtype=float)
@@ -309,7 +332,8 @@ class _BlendedImages:
         """Add W' M W values to ``out``."""
         for group in self.groups:
             pixels = self._draw(group, values)
-            launch_weigh_pixels(pixels, group.weights, pixels, self.device)
+            for part, weights in zip(group.pixels_by_view(pixels), group.weights, strict=True):
+                launch_weigh_pixels(part, weights, part, self.device)
             group.back_project(pixels, self._summed)
             launch_add_rows(self._summed, out, self.device)
 
@@ -322,7 +346,9 @@ class _BlendedImages:
     def add_gradient(self, group: _Group, values: wp.array, out: wp.array) -> None:
         """Add what the pixels of a group say to half of the objective's gradient."""
         pixels = self._draw(group, values)
-        launch_weigh_residuals(pixels, group.targets, group.weights, pixels, self.device)
+        parts = group.pixels_by_view(pixels)
+        for part, targets, weights in zip(parts, group.targets, group.weights, strict=True):
+            launch_weigh_residuals(part, targets, weights, part, self.device)
         group.back_project(pixels, self._summed)
         launch_add_rows(self._summed, out, self.device)
 

@@ -95,6 +95,7 @@ class Rasterizer:
         options: RasterOptions | None = None,
         device: Any = None,
         readable: bool = False,
+        images_of: Rasterizer | None = None,
     ) -> None:
         """Allocate what every frame needs.
 
@@ -107,10 +108,14 @@ class Rasterizer:
             options: How splats are drawn.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
             readable: Composite with the readable kernel, the oracle of the fast ones.
+            images_of: Another rasteriser on the device, of as many channels and of at least as many pixels, to draw
+                into the first of its pixels instead of images of its own. What either shows, and what `backward` and
+                `back_project` start from, lasts until the other draws.
 
         Raises:
             DeviceError: There is no such device.
-            InvalidOptionError: ``cameras`` is no sequence of at least one camera, or a count is out of range.
+            InvalidOptionError: ``cameras`` is no sequence of at least one camera, a count is out of range, or
+                ``images_of`` has other channels, too few pixels, or another device.
         """
         require_cameras(cameras)
         self._count = require_count("gaussian_count", gaussian_count, 0, MAX_SPLATS // len(cameras))
@@ -129,14 +134,27 @@ class Rasterizer:
         if readable:
             self._launch_composite = launch_composite_pixels
         self._layout = ViewLayout.of(self.cameras)
+        self._require_images(images_of)
         with wp.ScopedDevice(self.device):
-            self._allocate()
+            self._allocate(images_of)
             self._reserve(0)
         self._gaussians: GaussianArrays | None = None
         self._bands: list[tuple[int, int]] = []
         self._back: _BackwardBuffers | None = None
 
-    def _allocate(self) -> None:
+    def _require_images(self, other: Rasterizer | None) -> None:
+        """Refuse a rasteriser whose images cannot hold this one's."""
+        if other is None:
+            return
+        found = other.first_pixels[-1], other.value_channels.stop, other.device
+        needed = self.first_pixels[-1], self.value_channels.stop, self.device
+        if found[0] < needed[0] or found[1:] != needed[1:]:
+            raise InvalidOptionError(
+                f"images_of must have at least {needed[0]} pixels of {needed[1]} channels on {needed[2]}, got "
+                f"{found[0]} of {found[1]} on {found[2]}. Make the rasteriser of the most pixels first."
+            )
+
+    def _allocate(self, images_of: Rasterizer | None) -> None:
         """Allocate everything but what depends on the number of pairs."""
         splat_count = self._count * len(self.cameras)
         pixel_count = int(self._layout.first_pixels[-1])
@@ -151,13 +169,12 @@ class Rasterizer:
         self._order = wp.zeros(2 * splat_count, dtype=int)
         self._counts = wp.zeros(splat_count, dtype=int)
         self._ends = wp.zeros(splat_count, dtype=int)
-        self._drawn = Images()
-        for name in ("alpha", "transmittance", "depth", "median_depth"):
-            setattr(self._drawn, name, wp.zeros(pixel_count, dtype=float))
-        for name in ("gaussians", "ends", "medians"):
-            setattr(self._drawn, name, wp.zeros(pixel_count, dtype=int))
-        self._drawn.states = wp.zeros(0 if self.device.is_cuda else pixel_count, dtype=wp.vec4)
-        self._channel_images = channel_rows(pixel_count, channel_count, self.device)
+        if images_of is None:
+            self._drawn = _zero_images(pixel_count, has_states=not self.device.is_cuda)
+            self._channel_images = channel_rows(pixel_count, channel_count, self.device)
+        else:
+            self._drawn = _first_pixels_of(images_of._drawn, pixel_count)
+            self._channel_images = [Rows.of(rows.matrix[:pixel_count]) for rows in images_of._channel_images]
         self.images = RasterImages(
             tuple(image.matrix for image in self._channel_images),
             self._drawn.alpha,
@@ -680,6 +697,26 @@ def _zero_splats(count: int) -> Splats:
         setattr(splats, name, wp.zeros(count, dtype=dtype))
     splats.normals = wp.zeros(count, dtype=wp.vec3)
     return splats
+
+
+def _zero_images(pixel_count: int, *, has_states: bool) -> Images:
+    """Allocate images on the current device."""
+    images = Images()
+    for name in ("alpha", "transmittance", "depth", "median_depth"):
+        setattr(images, name, wp.zeros(pixel_count, dtype=float))
+    for name in ("gaussians", "ends", "medians"):
+        setattr(images, name, wp.zeros(pixel_count, dtype=int))
+    images.states = wp.zeros(pixel_count if has_states else 0, dtype=wp.vec4)
+    return images
+
+
+def _first_pixels_of(images: Images, pixel_count: int) -> Images:
+    """Return the beginning of images, in the same memory."""
+    part = Images()
+    for name in ("alpha", "transmittance", "depth", "median_depth", "gaussians", "ends", "medians", "states"):
+        whole = getattr(images, name)
+        setattr(part, name, whole[:pixel_count] if len(whole) else whole)
+    return part
 
 
 def _band(tiles: tuple[int, int]) -> Band:

@@ -13,10 +13,14 @@ wp.set_module_options({"enable_backward": False})
 def weigh_pixels_kernel(
     first: int, drawn: wp.array2d[float], weights: wp.array2d[float], out_pixels: wp.array2d[float]
 ):
+    """Columns that are drawn beyond those of the weights count nothing."""
     item = first + wp.tid()
     row = item / drawn.shape[1]
     c = item % drawn.shape[1]
-    out_pixels[row, c] = weights[row, c] * drawn[row, c]
+    value = float(0.0)
+    if c < weights.shape[1]:
+        value = weights[row, c] * drawn[row, c]
+    out_pixels[row, c] = value
 
 
 @wp.kernel
@@ -27,14 +31,15 @@ def weigh_residuals_kernel(
     weights: wp.array2d[float],
     out_pixels: wp.array2d[float],
 ):
-    """What is masked away may hold anything."""
+    """What is masked away may hold anything; columns beyond those of the weights count nothing."""
     item = first + wp.tid()
     row = item / drawn.shape[1]
     c = item % drawn.shape[1]
-    weight = weights[row, c]
     value = float(0.0)
-    if weight > 0.0:
-        value = weight * (drawn[row, c] - targets[row, c])
+    if c < weights.shape[1]:
+        weight = weights[row, c]
+        if weight > 0.0:
+            value = weight * (drawn[row, c] - targets[row, c])
     out_pixels[row, c] = value
 
 
