@@ -113,7 +113,7 @@ class TestKnownSpheres:
         assert abs(found.report["prior_mean"] - truth) < 0.1
 
     def test_stated_errors_cover_what_many_places_are_off(self, device):
-        """Neighbours are wrong together: 1600 Gaussians are 100 places of 16, whose shares have deviations of binomials."""
+        """Neighbours are wrong together: 1600 Gaussians are 100 places of 16, whose shares are binomial."""
         at = sphere_points(1600)[0]
         truth = 0.5 + 0.25 * np.sin(2.0 * at[:, 0] + at[:, 1]) * np.cos(2.0 * at[:, 2])
         positions, profile = profile_of(SKY, truth, device, count=1600, view_count=16, noise=0.03)
