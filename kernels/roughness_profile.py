@@ -95,14 +95,12 @@ def lobe_shares_kernel(
 @wp.func
 def share_at(shares: wp.vec4, roughness: float) -> float:
     """Interpolate linearly among `SHARE_ROUGHNESS`."""
-    k = int(0)
-    if roughness > SHARE_ROUGHNESS[1]:
-        k = 1
-    if roughness > SHARE_ROUGHNESS[2]:
-        k = 2
-    f = (roughness - SHARE_ROUGHNESS[k]) / (SHARE_ROUGHNESS[k + 1] - SHARE_ROUGHNESS[k])
-    f = wp.clamp(f, 0.0, 1.0)
-    return shares[k] * (1.0 - f) + shares[k + 1] * f
+    share = shares[0]
+    for k in range(3):  # unrolled: an index that is not known when compiling would go through local memory
+        if roughness > SHARE_ROUGHNESS[k]:
+            f = wp.min((roughness - SHARE_ROUGHNESS[k]) / (SHARE_ROUGHNESS[k + 1] - SHARE_ROUGHNESS[k]), 1.0)
+            share = shares[k] * (1.0 - f) + shares[k + 1] * f
+    return share
 
 
 @wp.struct
