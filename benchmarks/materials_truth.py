@@ -247,7 +247,7 @@ def light_reference(
     found = irradiance(
         scene, lifted, normals, light, sample_count=rays, density="mis", ratio=True, offset=0.0, seed=REFERENCE_SEED
     )
-    return LightReference(lifted, normals, np.float64(found.value), np.float64(found.standard_error))
+    return LightReference(lifted, normals, found.value.astype(np.float64), found.standard_error.astype(np.float64))
 
 
 def light_errors(scene: Scene, reference: LightReference, light: SampledEnvironment, **how: Any) -> Row:
