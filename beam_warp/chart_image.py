@@ -23,6 +23,9 @@ WIDTH = 12.0
 RESOLUTION = 130
 NUMBER_SIZE = 9.0
 
+MOST_COLUMNS = 7
+"""Factors that the list of the frontier has room for."""
+
 LEGEND_ROW = 0.048
 """Height of a row of the legend, in heights of the axes."""
 
@@ -316,8 +319,10 @@ def draw_frontier_list(axes: Any, table: Table, metric: Metric, longest: int) ->
     axes.set_ylim(longest + 1.0, -0.5)
     frontier = table.frontier(metric)
     rivals = [row for row in table.rows_of(metric) if not table.is_apart(row, metric)]
-    varied = {axis.name for axis in varying_axes(table, rivals)}
-    columns = [axis for axis in table.subject.axes if axis.name in varied]
+    columns = varying_axes(table, rivals)
+    if len(columns) > MOST_COLUMNS:
+        # Of many factors only those that tell the listed settings apart; one that does not apply to some is no reason
+        columns = [axis for axis in columns if len({row.settings.get(axis.name) for row in frontier} - {None}) > 1]
     header = [
         "",
         *(axis.title for axis in columns),

@@ -116,8 +116,7 @@ def materials_study(
     )
     described = Subject(
         name="materials",
-        title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians, "
-        f"{device_name(target)}",
+        title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians",
         axes=axes,
         metrics=(
             Metric(
@@ -144,6 +143,7 @@ def materials_study(
             "Reference": bench.reference.note,
             "Time": f"fastest to slowest of {chosen.repeats} calls, from images and Gaussians in memory to materials; "
             "without compilation and preparing the light",
+            "Device": device_name(target),
             "Error bars": "95 %, bootstrap over blocks of pixels or Gaussians",
             "Plan": "one factor at a time around the defaults, the first level of each axis; density and ratio crossed",
             "Versions": f"beam-warp {__version__}, Warp {wp.__version__}",

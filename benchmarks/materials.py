@@ -249,17 +249,18 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, na
     """Yield scores with and without the bounce, at the true points and at those that views show."""
     light = bench.light_of(perfect.capture)
     rough = {"0.5": np.full(len(perfect.cloud), 0.5, np.float32), "true": perfect.true_roughness(bench.device)}
-    rays = bench.effort.perfect_rays[0]
-    plan = [
-        (exact, roughness, MaterialOptions(bounce=bounce, sample_count=rays))
-        for exact, roughness in ((True, "true"), (True, "0.5"), (False, "true"))
-        for bounce in (True, False)
-    ] + [(True, "true", MaterialOptions(sample_count=count)) for count in bench.effort.perfect_rays[1:]]
-    for exact, roughness, options in plan:
-        points = perfect.points(exact=exact)
+    spread = perfect.images_spread_back()
+    for row in perfect_rows(bench.effort.perfect_rays):
+        points = perfect.points(row.offset, exact=row.exact)
         started = time.perf_counter()
         measured = measure_materials(
-            perfect.cloud, perfect.scene, points, rough[roughness], light, options=options, views=perfect.evidence
+            perfect.cloud,
+            perfect.scene,
+            points,
+            rough[row.roughness],
+            light,
+            options=MaterialOptions(bounce=row.bounce, sample_count=row.rays),
+            views=perfect.evidence if row.observed == "difference" else spread,
         )
         solved = solve_base_color(
             perfect.cloud.with_arrays(normal_confidence=points.confidence), measured.evidence, light.mean_irradiance
@@ -271,36 +272,65 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, na
             measured.ambient_occlusion_error[:, None],
             ~points.seen,
         )
-        found = Materials(solved.base_color, openness[:, 0].astype(np.float32), rough[roughness])
-        bounce = "with the bounce" if options.bounce else "direct only"
-        label = f"{'true' if exact else 'seen'} points, roughness {roughness}, {options.sample_count} rays, {bounce}"
+        found = Materials(solved.base_color, openness[:, 0].astype(np.float32), rough[row.roughness])
         yield {
-            "name": label,
-            "points": "true" if exact else "seen",
-            "roughness": roughness,
-            "rays": options.sample_count,
-            "bounce": options.bounce,
+            "name": row.name,
+            "points": "true" if row.exact else "seen",
+            **{key: value for key, value in vars(row).items() if key != "exact"},
             "seconds": seconds,
             **truth.score(perfect.cloud, found),
-            "picture": bench.picture(truth, perfect.cloud, found, "perfect", name, label),
+            "picture": bench.picture(truth, perfect.cloud, found, "perfect", name, row.name),
         }
+
+
+@dataclass(frozen=True)
+class PerfectRow:
+    """How materials on the true surface are measured: at its points or those that views show, and so on."""
+
+    exact: bool = True
+    roughness: str = "true"
+    rays: int = 64
+    bounce: bool = True
+    offset: Any = "auto"
+    observed: str = "difference"
+
+    @property
+    def name(self) -> str:
+        """In tables."""
+        words = [f"{'true' if self.exact else 'seen'} points", f"roughness {self.roughness}", f"{self.rays} rays"]
+        words.append("with the bounce" if self.bounce else "direct only")
+        if self.offset != "auto":
+            words.append(f"offset {1000.0 * self.offset:g} mm")
+        if self.observed != "difference":
+            words.append("images spread back")
+        return ", ".join(words)
+
+
+def perfect_rows(rays: Sequence[int]) -> list[PerfectRow]:
+    """Return what is measured on the true surface: the default with and without the bounce first."""
+    default = PerfectRow(rays=rays[0])
+    return [
+        *(replace(row, bounce=bounce) for row in (default, replace(default, exact=False)) for bounce in (True, False)),
+        replace(default, roughness="0.5"),
+        replace(default, observed="images"),
+        *(replace(default, offset=offset) for offset in (0.001, 0.002, 0.02)),
+        *(replace(default, rays=count) for count in rays[1:]),
+    ]
 
 
 def perfect_reached(row: Row) -> Row:
     """Return which targets are met: with the truth's coverage, since silhouettes are the Gaussians'."""
 
-    def best(bounce: bool) -> Row:
-        return next(
-            r for r in row["rows"] if r["bounce"] is bounce and r["points"] == "true" and r["roughness"] == "true"
-        )
+    def first(bounce: bool) -> Row:
+        return next(r for r in row["rows"] if r["bounce"] is bounce and r["points"] == "true")
 
     wanted = TARGETS["perfect"]
-    direct_only = best(False)["base_color"]["true_coverage_psnr"]
+    direct_only = first(False)["base_color"]["true_coverage_psnr"]
     low, high = wanted["base_color_psnr_direct_only"]
     # Phrased so that NaN fails.
     return {
         "ambient_occlusion": bool(
-            best(True)["ambient_occlusion"]["true_coverage_psnr"] >= wanted["ambient_occlusion_psnr"]
+            first(True)["ambient_occlusion"]["true_coverage_psnr"] >= wanted["ambient_occlusion_psnr"]
         ),
         **{
             f"irradiance, {measure}": {
@@ -310,7 +340,7 @@ def perfect_reached(row: Row) -> Row:
             for measure in ("relative_rmse", "rmse_over_mean")
         },
         "base_color_with_bounce": bool(
-            best(True)["base_color"]["true_coverage_psnr"] >= wanted["base_color_psnr_with_bounce"]
+            first(True)["base_color"]["true_coverage_psnr"] >= wanted["base_color_psnr_with_bounce"]
         ),
         "direct_only_lands_where_expected": bool(low <= direct_only <= high),
     }

@@ -75,10 +75,10 @@ def draw_perfect(part: Row, device: str, path: Path) -> Path:
                 labels.append(f"{name}: {entry['name']}")
                 values.append(entry[channel]["true_coverage_psnr"])
                 colors.append("C0" if entry["bounce"] else "C1")
-        _bars(axes, labels, values, colors)
+        _bars(axes, labels if axes is panels[1] else [""] * len(labels), values, colors)
         for line in lines:
             axes.axvline(line, color="0.3", linestyle=":")
-        axes.set(title=f"{title}, PSNR with the truth's coverage [dB]", xlim=(0.9 * min(values), None))
+        axes.set(title=f"{title}, true coverage, PSNR [dB]", xlim=(0.9 * min(values), None))
     figure.suptitle(f"Gaussians sampled from the true surface, {device}; orange is direct light only, dots are wanted")
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -91,7 +91,7 @@ def draw_ablation(part: Row, device: str, path: Path) -> Path:
     captures = part["captures"]
     longest = max(len(capture["rows"]) for capture in captures.values())
     figure, panels = plt.subplots(
-        len(captures), 4, figsize=(19, 1.2 + 0.27 * longest * len(captures)), layout="constrained", squeeze=False
+        len(captures), 5, figsize=(22, 1.2 + 0.27 * longest * len(captures)), layout="constrained", squeeze=False
     )
     wanted = part["targets"]
     for line, (name, capture) in zip(panels, captures.items(), strict=True):
@@ -102,7 +102,8 @@ def draw_ablation(part: Row, device: str, path: Path) -> Path:
             (line[0], "AO [dB]", [r["ambient_occlusion"]["psnr"] for r in rows], wanted["ambient_occlusion"][:1]),
             (line[1], "base colour [dB]", [r["base_color"]["psnr"] for r in rows], wanted["base_color"][:1]),
             (line[2], "scale", [float(np.mean(r["base_color"]["scale"])) for r in rows], wanted["scale"]),
-            (line[3], "seconds a frame", [r["seconds_per_frame"] for r in rows], []),
+            (line[3], "relit, traced [dB]", [_relit(r) for r in rows], wanted["relit"][:1]),
+            (line[4], "seconds a frame", [r["seconds_per_frame"] for r in rows], []),
         ):
             _bars(axes, labels if axes is line[0] else [""] * len(labels), values, colors)
             for mark in marks:
@@ -110,13 +111,18 @@ def draw_ablation(part: Row, device: str, path: Path) -> Path:
             axes.set_title(f"{name}: {title}", fontsize=10)
             if title.startswith("seconds"):
                 axes.set_xscale("log")
-            else:
-                low, high = min(values), max(values)
+            elif np.isfinite(values).any():
+                low, high = np.nanmin(values), np.nanmax(values)
                 axes.set_xlim(low - 0.1 * (high - low) - 0.01, high + 0.12 * (high - low) + 0.01)
     figure.suptitle(f"One idea at a time, reconstructions, {device}; in the subject's box, unscaled; dots are wanted")
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
+
+
+def _relit(row: Row) -> float:
+    """Return the mean PSNR of traced relighting over lights; NaN where a row was not relit."""
+    return float(row.get("relit", {}).get("traced", {}).get("mean", {}).get("psnr", np.nan))
 
 
 def draw_cost(part: Row, device: str, path: Path) -> Path:
@@ -126,16 +132,19 @@ def draw_cost(part: Row, device: str, path: Path) -> Path:
     figure, panels = plt.subplots(1, 4, figsize=(19, 5), layout="constrained", width_ratios=(1.7, 1, 1, 1))
     names = [name for name, row in parts.items() if "stages" in row]
     stages = list(dict.fromkeys(stage for name in names for stage in parts[name]["stages"]))
+    colors = plt.get_cmap("tab20").colors
     for place, name in enumerate(names):
         begin = 0.0
         for number, stage in enumerate(stages):
             seconds = parts[name]["stages"].get(stage, 0.0)
-            panels[0].barh(place, seconds, left=begin, color=f"C{number % 10}", label=None if place else stage)
+            panels[0].barh(place, seconds, left=begin, color=colors[number % 20])
             begin += seconds
         peak = parts[name].get("peak_device_bytes")
         panels[0].text(begin, place, f" {begin:.3g} s" + (f", {peak / 2**30:.1f} GiB" if peak else ""), va="center")
         panels[0].plot([parts[name]["target_seconds"]] * 2, [place - 0.4, place + 0.4], color="0.2", linestyle=":")
-    panels[0].legend([plt.Rectangle((0, 0), 1, 1, color=f"C{k % 10}") for k in range(len(stages))], stages, fontsize=8)
+    panels[0].legend(
+        [plt.Rectangle((0, 0), 1, 1, color=colors[k % 20]) for k in range(len(stages))], stages, fontsize=7
+    )
     panels[0].set_yticks(range(len(names)), names)
     panels[0].invert_yaxis()
     panels[0].margins(x=0.25)
@@ -212,6 +221,8 @@ def _bars(axes: Any, labels: Sequence[str], values: Sequence[float], colors: Seq
     """Draw horizontal bars from the top, each with its value."""
     axes.barh(range(len(values)), values, color=colors)
     for place, value in enumerate(values):
+        if not np.isfinite(value):
+            continue
         axes.text(value, place, f" {value:.3g}", va="center", fontsize=7)
     axes.set_yticks(range(len(values)), labels, fontsize=7)
     axes.invert_yaxis()

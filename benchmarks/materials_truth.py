@@ -26,6 +26,7 @@ from beam_warp.evaluation import (
 )
 from beam_warp.images import linear_to_srgb, read_image, write_png
 from beam_warp.incident_light import irradiance
+from beam_warp.materials_study import without_color
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize_values
 from beam_warp.reconstruction_scores import read_truth_mesh
@@ -208,6 +209,11 @@ class PerfectFrame:
             )
         return SurfacePoints.seen_by(self.cloud, evidence, self.scene, offset)
 
+    def images_spread_back(self) -> ViewEvidence:
+        """Return what views show if images are spread back as they are."""
+        cameras, device = [view.camera for view in self.views], str(self.scene.device)
+        return view_evidence(without_color(self.cloud), cameras, self.views, options=SHARP, device=device)
+
     def true_roughness(self, device: Any) -> NDArray[np.float32]:
         """Return the truth's roughness as its test views show it; the nearest neighbour's where they do not."""
         records = [r for r in self.capture.select(split="test", frames=[self.frame]) if r.truth_path is not None]
@@ -247,7 +253,7 @@ def light_reference(
     found = irradiance(
         scene, lifted, normals, light, sample_count=rays, density="mis", ratio=True, offset=0.0, seed=REFERENCE_SEED
     )
-    return LightReference(lifted, normals, np.float64(found.value), np.float64(found.standard_error))
+    return LightReference(lifted, normals, found.value.astype(np.float64), found.standard_error.astype(np.float64))
 
 
 def light_errors(scene: Scene, reference: LightReference, light: SampledEnvironment, **how: Any) -> Row:
