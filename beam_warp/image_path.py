@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.assets import DISPLAY_SRGB, WORLD_AXES, GaussianCloud
+from beam_warp.bake_resolution import reduced_options, reduced_target, reduction_factor
 from beam_warp.baking import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.captured_views import CapturedView
 from beam_warp.checks import (
@@ -222,19 +223,25 @@ def decompose_by_images(
     stages = _Stages(scene.device)
     with stages("upload"):
         gaussians = upload_gaussians(cloud, scene.device, values=rough[:, None])
+    drawn_as = raster_options or RasterOptions()
+    factor = reduction_factor(cloud, [view.camera for view in views], near=drawn_as.near)
     targets = []
     shown = 0
     for i, view in enumerate(views):
         cropped = crop_to_subject(view)
         # Views of one frame, and frames, have independent noise.
         number = (frame * len(views) + i) % 2**32
-        found = _measure_view(scene, gaussians, cropped, light, chosen, raster_options, number, kind, stages)
-        targets.append(found.target)
+        found = _measure_view(scene, gaussians, cropped, light, chosen, drawn_as, number, kind, stages)
+        with stages("bake"):
+            targets.append(reduced_target(found.target, factor, scene.device))
         shown += found.surface_count
         if progress is not None:
             progress(i + 1, len(views))
-    baked, filled = _bake(cloud, gaussians, targets, chosen, raster_options, before, stages, scene.device)
+    reduced = reduced_options(drawn_as, factor)
+    baked, filled = _bake(cloud, gaussians, targets, chosen, reduced, before, stages, scene.device)
     notes = [_DENOISER_NOTES[kind]] if chosen.denoiser == "auto" or kind == "none" else []
+    if factor > 1:
+        notes.append(f"baked from means of {factor} x {factor} pixels, narrower than the Gaussians seen there")
     if not shown:
         notes.append("no view shows a surface: every value is a prior")
     return ImageMaterials(
@@ -300,7 +307,7 @@ def _measure_view(
     view: CapturedView,
     light: SampledEnvironment,
     options: ImagePathOptions,
-    raster_options: RasterOptions | None,
+    raster_options: RasterOptions,
     number: int,
     denoiser: Denoiser,
     stages: _Stages,
@@ -361,7 +368,7 @@ def _bake(
     gaussians: GaussianArrays,
     targets: list[BakeTarget],
     options: ImagePathOptions,
-    raster_options: RasterOptions | None,
+    raster_options: RasterOptions,
     previous: NDArray[np.float32] | None,
     stages: _Stages,
     device: Any,

@@ -1,16 +1,19 @@
 """Baking: the bounded least-squares problem against a dense solver, what it recovers, its pulls, Adam beside it."""
 
+import re
 from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.optimize import lsq_linear
 from shapes import cloud_of, random_cloud, sphere_points, tiles
 
 from beam_warp import Camera, baking
 from beam_warp.baking import BakeOptions, BakeTarget, bake
-from beam_warp.devices import resolve_device
+from beam_warp.devices import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.rasterizer import Rasterizer
 from beam_warp.rasterizing import rasterize_values, upload_gaussians
 
 
@@ -221,6 +224,44 @@ class TestRepeats:
         monkeypatch.setattr(baking, "GROUP_PIXELS", 500)
         parts = made.bake(prior=made.prior, ridge=0.01, passes=100, tolerance=1e-6).values
         np.testing.assert_allclose(parts, whole, atol=2e-5)
+
+
+def device_bytes(made, views, where, **options):
+    """Most bytes that a bake of targets on the device allocates there, its targets and weights included."""
+    told = []
+    with wp.ScopedMemoryTracker("bake", report_func=told.append) as tracker:
+        tracker.clear()  # of what was tracked before
+        held = [BakeTarget(v.camera, *(upload(a, float, where) for a in (v.targets, v.weights))) for v in views]
+        bake(upload_gaussians(made, where), held, options=BakeOptions(passes=2, **options), device=where)
+    number, unit = re.search(rf"Peak usage:.*?{where.alias}\s+([\d.]+) (\w+)", told[0], re.DOTALL).groups()
+    return float(number) * 1024 ** ["B", "KB", "MB", "GB"].index(unit)
+
+
+class TestMemory:
+    """The formula in the docstring of `bake`, against what Warp counts."""
+
+    @pytest.mark.parametrize("solver", ["cg", "adam"])
+    @pytest.mark.parametrize(("size", "count", "group"), [(160, 50, 2**23), (160, 50, 2 * 160**2), (16, 4000, 2**23)])
+    def test_bytes_are_what_is_said(self, device, monkeypatch, size, count, group, solver):
+        monkeypatch.setattr(baking, "GROUP_PIXELS", group)
+        where = resolve_device(device)
+        cloud = random_cloud(np.random.default_rng(0), count, scale=(-2.5, 0.3))
+        views = [
+            BakeTarget(camera, *np.ones((2, size, size, 4), np.float32))
+            for camera in cameras(cloud, [(size, size)] * 6)
+        ]
+        pairs = 0
+        for view in views:
+            drawer = Rasterizer(count, [view.camera], device=where)
+            drawer.draw(upload_gaussians(cloud, where))
+            pairs += drawer.pair_count()
+        together = 1 if solver == "adam" else min(6, group // size**2)
+        pixels, splats, tiles = 6 * size**2, 6 * count, 6 * (-(-size // 16)) ** 2
+        said = 32 * pixels + (44 + 16 * where.is_cpu) * together * size**2
+        said += 104 * splats + 16 * together * count + 50 * pairs + 12 * tiles + 224 * count
+        found = device_bytes(cloud, views, where, solver=solver, steps=6)
+        # above it: small tables, blocks of sums, room of the sorts; below it: arrays of a solver that the other lacks
+        assert 0.9 * said < found < 1.05 * said + 2**17
 
 
 class TestRefusals:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shapes import cloud_of, disc_points, sphere_points, tiles
 
-from beam_warp import Camera, Scene, denoising
+from beam_warp import Camera, Scene, denoising, image_path
 from beam_warp.axes import change_axes
 from beam_warp.captured_views import CapturedView
 from beam_warp.environment_sampling import SampledEnvironment
@@ -118,6 +118,30 @@ class TestKnownMaterials:
         wanted = height**2 / (radius**2 + height**2)
         # the lift of 0.05 and the disc's soft edge of a spacing take 0.08 and 0.05 off
         assert abs(found.ambient_occlusion[: len(floor)][middle][seen].mean() - wanted) < 0.13
+
+
+class TestResolution:
+    def test_pixels_far_finer_than_splats_are_baked_in_blocks(self, device, monkeypatch):
+        """Splats of five pixels: the note says so, and what is drawn of the result is as of a bake of all pixels."""
+        made = Ball(device, count=40)
+        found = made.decompose()
+        assert any(note.startswith("baked from means of 2 x 2 pixels") for note in found.notes)
+        monkeypatch.setattr(image_path, "reduction_factor", lambda *_, **__: 1)
+        whole = made.decompose()
+        # evidence counts the images' own pixels either way
+        assert found.color_evidence.sum() == pytest.approx(whole.color_evidence.sum(), rel=0.02)
+        apart, wrong = [], []
+        for camera in around(3):
+            coarse, fine, truth = (
+                rasterize_values(made.cloud, camera, colors, device=device).values
+                for colors in (found.base_color, whole.base_color, made.truth)
+            )
+            apart.append(((coarse - fine) ** 2).mean())
+            wrong.append(((fine - truth) ** 2).mean())
+        assert np.mean(apart) < 0.02 * np.mean(wrong)  # 0.1 dB
+
+    def test_pixels_as_wide_as_splats_are_baked_as_they_are(self, device):
+        assert not any("baked from" in note for note in Ball(device, views=1).decompose().notes)
 
 
 class TestGuards:

@@ -110,6 +110,7 @@ RANKS = {
     "beam_warp.image_residues": 10,
     "beam_warp.denoising": 6,
     "beam_warp.baking": 7,
+    "beam_warp.bake_resolution": 8,
     "beam_warp.image_path": 11,
     "beam_warp.evaluation": 9,
     "beam_warp.contact_sheet": 10,

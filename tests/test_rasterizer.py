@@ -286,6 +286,44 @@ def test_prepared_cameras_are_the_cameras(device, rng):
             np.testing.assert_array_equal(one, other)
 
 
+def test_rasterisers_share_their_images(device, rng):
+    """Two that draw into one's images, by turns: the bits of rasterisers of their own, back-projected ones too."""
+    made = cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    pixels = rng.uniform(0, 1, (50 * 40 + 7 * 33, 4)).astype(np.float32)
+    views = [[around(50, 40), around(7, 33)], [around(40, 36, 80.0)], [around(1, 1, 150.0)]]
+    owner = Rasterizer(200, views[0], value_count=3, device=device)
+    arrays = upload_gaussians(made, owner.device, values=values)
+    drawers = [owner, *(Rasterizer(200, v, value_count=3, device=device, images_of=owner) for v in views[1:])]
+    fresh = [Rasterizer(200, v, value_count=3, device=device) for v in views]
+    for drawer in (*drawers, *fresh):
+        drawer.draw(arrays)
+    for drawer, alone in zip(drawers, fresh, strict=True):
+        count = drawer.first_pixels[-1]
+        held = upload(pixels[:count], float, drawer.device)
+        sums = []
+        for one in (drawer, alone):
+            one.redraw_values()
+            room = wp.zeros((200 * len(one.cameras), 4), dtype=float, device=one.device)
+            one.back_project(held, room)
+            sums.append(room.numpy())
+        np.testing.assert_array_equal(*sums)
+        for one, other in zip(images(drawer), images(alone), strict=True):
+            assert len(one) == count
+            np.testing.assert_array_equal(one, other)
+    assert owner.images.alpha.ptr == drawers[1].images.alpha.ptr
+    for other in ({"cameras": [around(60, 50)], "value_count": 3}, {"cameras": views[1], "value_count": 5}):
+        with pytest.raises(InvalidOptionError, match="images_of must have at least"):
+            Rasterizer(200, **other, device=device, images_of=owner)
+
+
+def images(drawer):
+    """What was drawn, as NumPy."""
+    found = drawer.images
+    arrays = [*found.channels, found.alpha, found.depth, found.median_depth, drawer.gaussian_ids]
+    return [array.numpy() for array in arrays]
+
+
 def test_prepared_cameras_of_other_sizes_are_refused(device, rng):
     drawer, other = Rasterizer(1, [around(33, 17)], device=device), Rasterizer(1, [around(17, 33)], device=device)
     with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
