@@ -231,7 +231,7 @@ def decompose(bench: Bench, stress: MaterialStress) -> tuple[BaseColor, list[Fin
     measured = measure_materials(
         stress.cloud, scene, points, stress.roughness, light, options=MaterialOptions(), views=evidence
     )
-    normals = np.where(points.seen[:, None], evidence.normals.numpy(), np.float32([0.0, 0.0, 1.0]))
+    normals = np.where(points.seen[:, None], evidence.normals.numpy(), np.array([0.0, 0.0, 1.0], np.float32))
     cloud = stress.cloud.with_arrays(normals=normals, normal_confidence=points.confidence)
     return solve_base_color(cloud, measured.evidence, light.mean_irradiance), findings
 

@@ -251,7 +251,9 @@ def one_side(studio: MaterialStudio) -> MaterialStress:
 def saturated(studio: MaterialStudio) -> MaterialStress:
     """Photographs that end at a value that much of the subject exceeds."""
     stress = studio.plain
-    values = np.concatenate([view.color[view.alpha > 0.99].max(axis=-1) for view in stress.views])
+    values = np.concatenate(
+        [view.color[view.alpha > 0.99].max(axis=-1) for view in stress.views if view.alpha is not None]
+    )
     gain = np.float32(1.0 / np.quantile(values, SATURATED_QUANTILE))
     views = tuple(replace(view, color=np.minimum(view.color * gain, 1.0)) for view in stress.views)
     assert stress.cloud.radiance is not None
@@ -338,7 +340,7 @@ def two_views(studio: MaterialStudio) -> MaterialStress:
 @material_case("black environment", "0 / 0", "refused")
 def black_light(studio: MaterialStudio) -> MaterialStress:
     """A light that sheds none."""
-    return replace(studio.plain, environment=EnvironmentMap(np.zeros((16, 32, 3))), refused=True)
+    return replace(studio.plain, environment=EnvironmentMap(np.zeros((16, 32, 3), np.float32)), refused=True)
 
 
 @material_case("Gaussians nobody sees", "colours that no view constrained are measured", "flagged unseen, and filled")
@@ -392,11 +394,11 @@ def _material(vertices: ArrayLike, faces: ArrayLike) -> MaterialMesh:
     points = np.asarray(vertices, np.float64)
     waves = np.sin(points @ np.array([[5.0, 2.0, -3.0], [-2.0, 4.0, 5.0], [4.0, -5.0, 2.0]]).T + [0.3, 1.7, 4.0])
     return MaterialMesh(
-        vertices=points,
-        faces=np.asarray(faces),
-        normals=vertex_normals(points, faces),
-        base_color=0.45 + 0.3 * waves,
-        roughness=np.full(len(points), ROUGHNESS),
+        vertices=points.astype(np.float32),
+        faces=np.asarray(faces, np.int32),
+        normals=vertex_normals(points, faces).astype(np.float32),
+        base_color=(0.45 + 0.3 * waves).astype(np.float32),
+        roughness=np.full(len(points), ROUGHNESS, np.float32),
     )
 
 
@@ -443,9 +445,9 @@ def _sheet(count: int) -> MaterialMesh:
     sides = np.repeat([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], index.size, axis=0)
     colors = np.repeat([[0.7, 0.1, 0.08], [0.08, 0.2, 0.7]], index.size, axis=0)
     return MaterialMesh(
-        vertices=vertices,
-        faces=np.concatenate([front, front[:, ::-1] + index.size]),
-        normals=sides,
-        base_color=colors,
-        roughness=np.full(len(vertices), ROUGHNESS),
+        vertices=vertices.astype(np.float32),
+        faces=np.concatenate([front, front[:, ::-1] + index.size]).astype(np.int32),
+        normals=sides.astype(np.float32),
+        base_color=colors.astype(np.float32),
+        roughness=np.full(len(vertices), ROUGHNESS, np.float32),
     )
