@@ -122,7 +122,7 @@ def observability(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance
 
 def _has_evidence(evidence: ColorEvidence) -> NDArray[np.bool_]:
     """Return which Gaussians have any view that base colour follows from, in every channel."""
-    return (np.asarray(evidence.denominator) > 0.0).all(axis=1)
+    return np.all(np.asarray(evidence.denominator) > 0.0, axis=1)
 
 
 def fill_from_neighbors(

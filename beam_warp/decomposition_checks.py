@@ -179,24 +179,23 @@ def require_match(match: SilhouetteMatch) -> None:
         )
 
 
-def largest_value(view: CapturedView, color_space: str | None) -> float:
-    """Return the largest scene-linear value that an image can hold; infinite where nothing limits it.
+def largest_value(views: Sequence[CapturedView], color_space: str | None) -> float:
+    """Return the largest scene-linear value that images can hold; infinite where nothing limits it.
 
-    Display-referred files end at white. A scene-linear file that was made from one, or from a sensor that saturated,
-    shows by many pixels at exactly the largest value.
+    Display-referred files end at white. Scene-linear ones that were made from such, or by a sensor that saturated, show
+    it by many pixels of several views at exactly the same largest value.
 
     Args:
-        view: What the image shows.
-        color_space: Of the image file.
+        views: What images show.
+        color_space: Of the image files.
     """
     if color_space == DISPLAY_SRGB:
         return 1.0
-    largest = float(view.color.max(initial=0.0))
-    subject = _subject(view)
-    if not largest > 0.0 or not subject.any():
-        return float("inf")
-    at_top = view.color.max(axis=-1)[subject] >= largest * (1.0 - SAME)
-    return largest if at_top.mean() >= CUT_PART else float("inf")
+    shown = [view.color.max(axis=-1)[_subject(view)] for view in views]
+    shown = [values for values in shown if len(values)]
+    largest = max((float(values.max()) for values in shown), default=0.0)
+    cut = sum(float((values == largest).mean()) >= CUT_PART for values in shown)
+    return largest if largest > 0.0 and cut >= min(2, len(shown)) else float("inf")
 
 
 def judge_clipping(views: Sequence[CapturedView], ceiling: float) -> list[Finding]:

@@ -14,6 +14,8 @@ from beam_warp.analytic_occlusion import SHAPES, OcclusionOutcome
 from beam_warp.capture_stability import SILENT_LOSS_DB, CaptureOutcome, markdown_table
 from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 from beam_warp.image_findings import EXPOSURE_STOPS as INSPECTED_STOPS
+from beam_warp.material_stability import FLAGGED, SILENT_PART, STATED, WRONG, MaterialOutcome
+from beam_warp.material_stability import markdown_table as material_table
 from beam_warp.stability import Outcome
 from beam_warp.stress_cases import CASES
 from beam_warp.view_gains import EXPOSURE_STOPS
@@ -85,6 +87,32 @@ Without texture and at self-contact nothing is detected, and nothing need be: th
 """
 
 
+MATERIALS_TITLE = "## Materials"
+
+MATERIALS_TEXT = """\
+A ball of soft colours (and a sheet, and a ball with creases) under a light, with something wrong, and what becomes of
+its base colours. A path tracer for meshes says what every vertex sends towards every camera; Gaussians on the vertices,
+drawn with those colours, are its photographs. What is measured from these is compared with the mesh's own base colours:
+light transport is another's than the one that is tried, and nothing is left to the chance of a reconstruction.
+
+**Error** is the absolute error of base colour over channels, of the Gaussians that the case is about and of all others;
+**stated** the median standard error that comes with it; **within 2 stated** the part of errors that are no larger than
+two of those, 95 % or more where the statement is honest. **Wrong without a word** are Gaussians without a flag that are
+off by more than {wrong:g} and by more than {stated:g} stated standard errors, in a capture of which nothing was found.
+
+A case fails if what must be found was not, if less than {flagged:.0%} of what it is about is flagged as it must be, if
+anything else is found, if more than {silent:.0%} are wrong without a word, or if it ends in anything but materials or a
+refusal where that is asked for.
+
+- Before anything is measured (`beam_warp.decomposition_checks`): a black environment is refused; `ldr-environment`,
+  `clipped-images`, `capture-mismatch`.
+- From a first look at what views show (`beam_warp.light_check`): `environment-turned`, mirrored ones too;
+  `environment-unexplained`; `environment-exposure`; `light-unchecked` with fewer than 4 views.
+- Of every Gaussian: its flags, and the standard error. Of a mirror-like patch whose roughness is not known neither flag
+  nor finding tells: what its views disagree by is in the stated error.
+"""
+
+
 @dataclass(frozen=True)
 class StabilityResult:
     """Everything that one or several runs found.
@@ -93,21 +121,26 @@ class StabilityResult:
         outcomes: Of the stress cases.
         occlusion: Of the shapes with known ambient occlusion.
         captures: Of the captures on which reconstructions fail.
+        materials: Of the subjects and lights on which the measurement of materials fails.
     """
 
     outcomes: tuple[Outcome, ...] = ()
     occlusion: tuple[OcclusionOutcome, ...] = ()
     captures: tuple[CaptureOutcome, ...] = ()
+    materials: tuple[MaterialOutcome, ...] = ()
 
     @property
     def passed(self) -> bool:
         """Whether every verdict is good."""
-        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion, *self.captures))
+        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion, *self.captures, *self.materials))
 
     def joined(self, other: StabilityResult) -> StabilityResult:
         """Return both results as one, this one's first."""
         return StabilityResult(
-            self.outcomes + other.outcomes, self.occlusion + other.occlusion, self.captures + other.captures
+            self.outcomes + other.outcomes,
+            self.occlusion + other.occlusion,
+            self.captures + other.captures,
+            self.materials + other.materials,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -118,6 +151,7 @@ class StabilityResult:
             "cases": [outcome.as_dict() for outcome in self.outcomes],
             "occlusion": [outcome.as_dict() for outcome in self.occlusion],
             "captures": [outcome.as_dict() for outcome in self.captures],
+            "materials": [outcome.as_dict() for outcome in self.materials],
         }
 
 
@@ -134,6 +168,7 @@ def read_result(path: Path) -> StabilityResult:
             tuple(_record(Outcome, row) for row in record["cases"]),
             tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
             tuple(_record(CaptureOutcome, row) for row in record.get("captures", [])),  # older ones have none
+            tuple(MaterialOutcome.from_dict(row) for row in record.get("materials", [])),
         )
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
@@ -155,7 +190,7 @@ def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
     return kind(**values)
 
 
-def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome]) -> list[str]:
+def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome | MaterialOutcome]) -> list[str]:
     """Return the devices that occur, in order."""
     return list(dict.fromkeys(outcome.device for outcome in outcomes))
 
@@ -176,13 +211,30 @@ def markdown(result: StabilityResult, command: str, before: str = "") -> str:
     Args:
         result: Of any number of devices and hierarchies.
         command: That makes the page, for its text.
-        before: The page as it is: tracing or captures stay as they are there if the result has none.
+        before: The page as it is: parts that the result has nothing of stay as they are there.
     """
-    kept = before.split(CAPTURES_TITLE)
-    tracing = _tracing(result, command) if result.outcomes or not before else kept[0].rstrip() + "\n"
-    if result.captures:
-        return tracing + "\n" + _captures(result.captures)
-    return tracing + ("\n" + CAPTURES_TITLE + kept[1] if len(kept) > 1 else "")
+    rest, *materials = before.split(MATERIALS_TITLE)
+    tracing, *captures = rest.split(CAPTURES_TITLE)
+    parts = [
+        _tracing(result, command) if result.outcomes or not before else tracing,
+        _captures(result.captures) if result.captures else "".join(CAPTURES_TITLE + text for text in captures),
+        _materials(result.materials) if result.materials else "".join(MATERIALS_TITLE + text for text in materials),
+    ]
+    return "\n".join(part.rstrip() + "\n" for part in parts if part)
+
+
+def _materials(outcomes: Sequence[MaterialOutcome]) -> str:
+    """Return the part about materials, a table for each device."""
+    text = MATERIALS_TEXT.format(wrong=WRONG, stated=STATED, flagged=FLAGGED, silent=SILENT_PART)
+    lines = [MATERIALS_TITLE, "", text]
+    for device in devices_of(outcomes):
+        rows = [outcome for outcome in outcomes if outcome.device == device]
+        facts = (
+            f"{device}: {rows[0].gaussians:,} Gaussians, {rows[0].views} views; measured in "
+            f"{sum(outcome.seconds for outcome in rows):.0f} s in all."
+        )
+        lines += [facts, "", material_table(rows)]
+    return "\n".join(lines)
 
 
 def _captures(outcomes: Sequence[CaptureOutcome]) -> str:

@@ -176,30 +176,42 @@ def test_nothing_overlaps_nothing(views):
 
 
 def test_display_referred_images_end_at_white(views):
-    assert largest_value(views[0], DISPLAY_SRGB) == 1.0
+    assert largest_value(views, DISPLAY_SRGB) == 1.0
 
 
 def test_a_ceiling_of_linear_images_is_seen(views):
     """A ramp has one brightest column; cut at half, half of it is at the ceiling."""
     ramp = np.broadcast_to(np.linspace(0.0, 2.0, SIZE)[None, :, None], (SIZE, SIZE, 3))
-    whole = replace(views[0], color=ramp, alpha=None)
-    cut = replace(views[0], color=np.minimum(ramp, 1.0), alpha=None)
-    assert largest_value(cut, LINEAR_REC709) == 1.0
-    assert largest_value(cut, None) == 1.0
-    black = replace(views[1], color=np.zeros((SIZE, SIZE, 3)), alpha=None)
-    assert largest_value(black, None) == float("inf")
-    [finding] = judge_clipping([cut, black], 1.0)
+    first, second = (replace(view, color=np.minimum(ramp, 1.0), alpha=None) for view in views[:2])
+    black = replace(views[2], color=np.zeros((SIZE, SIZE, 3)), alpha=None)
+    assert largest_value([first, black, second], LINEAR_REC709) == 1.0
+    assert largest_value([first], None) == 1.0
+    [finding] = judge_clipping([first, black], 1.0)
     assert finding.code == "clipped-images"
     assert "1 image of 2 is cut at 1" in finding.what
     assert finding.where == "view_0 50%"
-    assert judge_clipping([whole], float("inf")) == []
+    assert judge_clipping([first], float("inf")) == []
 
 
-def test_a_smooth_image_has_no_ceiling(views):
+def test_what_is_bright_in_one_view_is_no_ceiling(views):
+    """A plain wall has one value all over, and another view shows another."""
+    walls = [
+        replace(view, color=np.full((SIZE, SIZE, 3), level), alpha=None)
+        for view, level in zip(views[:3], (1, 2, 3), strict=True)
+    ]
+    assert largest_value(walls, None) == float("inf")
     noise = np.random.default_rng(0).uniform(0.0, 0.9, (SIZE, SIZE, 3)).astype(np.float32)
-    smooth = replace(views[0], color=noise, alpha=None)
+    smooth = [replace(view, color=noise + 0.01 * index, alpha=None) for index, view in enumerate(views)]
     assert largest_value(smooth, None) == float("inf")
-    assert judge_clipping([smooth], 1.0) == []
+    assert judge_clipping(smooth, 1.0) == []
+
+
+def test_nothing_shown_has_no_ceiling(views):
+    black = [replace(view, color=np.zeros((SIZE, SIZE, 3))) for view in views]
+    assert largest_value(black, None) == float("inf")
+    none = [replace(view, alpha=np.zeros((SIZE, SIZE))) for view in views]
+    assert largest_value(none, None) == float("inf")
+    assert judge_clipping(none, 1.0) == []
 
 
 def test_white_background_is_not_the_subject(views):

@@ -1,4 +1,4 @@
-"""``beam stability``: scenes on which ray tracers fail and captures on which reconstructions do, on this machine."""
+"""``beam stability``: what tracing, reconstruction and the measurement of materials fail on, on this machine."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stability:
-    """Trace scenes on which ray tracers fail, reconstruct captures on which reconstructions fail; tell what was found.
+    """Trace, reconstruct and decompose what others fail on; tell what was found and what came out.
 
     Every ray is compared with float64. Exit code 1 if one is off by more than rounding explains, or if a capture was
-    reconstructed badly and nothing was said. One page for several devices: run it on each with --json, and on the last
-    with --beside.
+    reconstructed badly, or materials measured badly, and nothing was said. One page for several devices: run it on
+    each with --json, and on the last with --beside.
 
     Example: beam stability --out stability.md
     """
 
     only: Annotated[
-        Literal["tracing", "reconstruction"] | None, arg(help="Only one of both; a page that is there keeps the other.")
+        Literal["tracing", "reconstruction", "materials"] | None,
+        arg(help="Only one of them; a page that is there keeps the others."),
     ] = None
     out: Annotated[Path | None, arg(metavar="FILE", help="Also write the results as a Markdown page.")] = None
     beside: Annotated[
@@ -51,10 +52,12 @@ def stability(args: Stability) -> int:
     others = [read_result(path) for path in args.beside]
     result = StabilityResult()
     with progress(args.quiet or args.json) as report:
-        if args.only != "reconstruction":
+        if args.only in (None, "tracing"):
             result = result.joined(_trace(args, report))
-        if args.only != "tracing":
+        if args.only in (None, "reconstruction"):
             result = result.joined(_reconstruct(args, report))
+        if args.only in (None, "materials"):
+            result = result.joined(_decompose(args, report))
     if args.out is not None:
         joined = result
         for other in others:
@@ -104,6 +107,20 @@ def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
         return StabilityResult(captures=tuple(outcomes))
 
 
+def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
+    """Measure materials."""
+    from beam_warp.material_stability import run_material_cases
+    from beam_warp.stability_report import StabilityResult
+    from beam_warp.stress_materials import MATERIAL_CASES, MaterialStudio
+
+    outcomes = run_material_cases(
+        MaterialStudio(args.device),
+        MATERIAL_CASES,
+        progress=lambda done, total: report("materials", done, total),
+    )
+    return StabilityResult(materials=tuple(outcomes))
+
+
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
     lines = [
@@ -113,7 +130,7 @@ def _faults(result: StabilityResult) -> list[str]:
     ]
     lines += [
         f"failed: {outcome.case} on {outcome.device}: {'; '.join(outcome.faults)}"
-        for outcome in result.captures
+        for outcome in (*result.captures, *result.materials)
         if not outcome.passed
     ]
     return lines + [
@@ -129,6 +146,24 @@ def _print_tables(result: StabilityResult) -> None:
         _print_tracing(result)
     if result.captures:
         _print_captures(result)
+    if result.materials:
+        _print_materials(result)
+
+
+def _print_materials(result: StabilityResult) -> None:
+    """Print one row a case."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from beam_warp.material_stability import TITLES, cells
+    from beam_warp.stability_report import devices_of
+
+    titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
+    table = Table(*titles, title=f"materials on {', '.join(devices_of(result.materials))}")
+    for outcome in result.materials:
+        *found, verdict = cells(outcome)
+        table.add_row(outcome.case, *found, verdict if outcome.passed else f"[red]{verdict}[/red]")
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
 def _print_captures(result: StabilityResult) -> None:

@@ -7,7 +7,15 @@ import pytest
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from beam_warp import analytic_occlusion, capture_stability, stability, stress_captures, stress_cases
+from beam_warp import (
+    analytic_occlusion,
+    capture_stability,
+    material_stability,
+    stability,
+    stress_captures,
+    stress_cases,
+    stress_materials,
+)
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
@@ -23,6 +31,8 @@ def few_cases(monkeypatch):
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
     assert capture_stability.CAPTURE_CASES  # imported before: tables name all of them
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
+    assert material_stability.MATERIAL_CASES
+    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [])
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
 
@@ -144,6 +154,61 @@ def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [broken])
     assert run("--only", "reconstruction", "--quiet") == 1
     assert "failed: black camera on cpu: not detected: black-image of train_03" in capsys.readouterr().err
+
+
+@pytest.fixture
+def one_light(monkeypatch):
+    """A case that is refused before it is measured, so that it takes no time."""
+    case = next(case for case in material_stability.MATERIAL_CASES if case.name == "black environment")
+    studio = stress_materials.MaterialStudio("cpu", camera_count=2, size=8, samples=1, subdivisions=1)
+    monkeypatch.setattr(stress_materials, "MaterialStudio", lambda device: studio)
+    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [case])
+    return case
+
+
+def test_materials_alone(one_light, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    captures = "## Captures on which reconstructions fail\n\nkept\n"
+    page.write_text(f"# Stability\n\nrays\n\n{captures}", encoding="utf-8")
+    assert run("--only", "materials", "--out", page) == 0
+    out, _ = capsys.readouterr()
+    assert "materials on cpu" in out
+    assert "coaxial disc" not in out
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith(f"# Stability\n\nrays\n\n{captures}\n## Materials\n")
+    row = next(line for line in text.splitlines() if line.startswith("| black environment |"))
+    assert "refused: environment must shed light" in row
+    assert row.endswith("| ok |")
+
+
+def test_other_parts_keep_materials(one_light, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("# Stability\n\nrays of before\n\n## Materials\n\nkept\n", encoding="utf-8")
+    assert run("--only", "tracing", "--out", page, "--quiet") == 0
+    text = page.read_text(encoding="utf-8")
+    assert "rays of before" not in text
+    assert text.endswith("| ok |\n\n## Materials\n\nkept\n")
+
+
+def test_materials_of_another_device_stand_below(one_light, tmp_path, capsys):
+    assert run("--only", "materials", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    record["materials"][0] |= {"device": "Some GPU", "faults": ["must be refused, and was not"]}
+    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
+    page = tmp_path / "page.md"
+    assert run("--only", "materials", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 0
+    text = page.read_text(encoding="utf-8")
+    assert text.index("cpu: 42 Gaussians") < text.index("Some GPU: 42 Gaussians")
+    assert "| must be refused, and was not |" in text
+
+
+def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
+    def build(studio):
+        return dataclasses.replace(one_light.build(studio), refused=False)
+
+    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [dataclasses.replace(one_light, build=build)])
+    assert run("--only", "materials", "--quiet") == 1
+    assert "failed: black environment on cpu: refused: environment must shed light" in capsys.readouterr().err
 
 
 def test_results_that_are_none_are_refused(tmp_path, capsys):
