@@ -74,9 +74,13 @@ class CaptureImages:
         with ThreadPoolExecutor(LOADING_THREADS) as pool:
             return list(pool.map(lambda record: record.view(), self._records[index]))
 
+    def is_display_referred(self, index: int) -> bool:
+        """Return whether images of a frame have a scale of their own, and an upper end, rather than that of light."""
+        return any(_is_display_referred(record) for record in self._records[index])
+
     def ceiling(self, index: int) -> float:
         """Return the largest value that the images of a frame can hold: display-referred files end at white."""
-        return 1.0 if any(_is_display_referred(record) for record in self._records[index]) else float("inf")
+        return 1.0 if self.is_display_referred(index) else float("inf")
 
     def digest(self, index: int, digests: CaptureDigests) -> str:
         """Return what the images of a frame are, cameras included, as one word."""
@@ -129,6 +133,11 @@ class FrameInputs:
                 f"radiance must be given to decompose materials, got none at frame {number}. "
                 "Import Gaussians with captured colour."
             )
+
+    def forget(self) -> None:
+        """Let go of what was worked out: it lies on the device, and comes again when it is asked for."""
+        for name in ("scene", "views", "points", "surface"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def scene(self) -> Scene:

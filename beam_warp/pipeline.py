@@ -60,7 +60,8 @@ class RunOptions:
         roughness: Perceptual roughness of everything, a texture, or ``"estimate"``: found from the specular residue
             over views and frames.
         exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
-            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear.
+            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear. With a capture,
+            its images decide, because they are what is explained.
         persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
             frames at once; sequences that carry ids state it themselves.
         device: Warp device; None takes the first CUDA device, or the CPU.
@@ -261,6 +262,8 @@ class _Job:
                 "version": __version__,
                 "device": "cuda" if self.device.is_cuda else "cpu",
                 "options": options_as_dict(self.options),
+                "raster": None if self._images is None else asdict(self._images.raster),
+                "evidence": ColorEvidence.ARRAYS,
                 "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
             },
             sort_keys=True,
@@ -270,10 +273,14 @@ class _Job:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
             return require_number("exposure", self.options.exposure, -32.0, 32.0)
-        if self.first.cloud.radiance_color_space != DISPLAY_SRGB:
+        display = self.first.cloud.radiance_color_space == DISPLAY_SRGB
+        if self._images is not None:
+            display = self._images.is_display_referred(0)
+        if not display:
             return 0.0
         path = self.folder / "exposure.h5"
-        key = _digest(self._described(), environment.radiance, *self.first.cloud.arrays().values())
+        described = f"{self._described()} {self._digest_of_images(0)}"
+        key = _digest(described, environment.radiance, *self.first.cloud.arrays().values())
         if frame_key(path) != key:
             first = self.first
             scene, points, roughness = first.scene, first.points, self._roughness(first)
@@ -297,8 +304,10 @@ class _Job:
     def measure(self, number: int) -> None:
         """Measure a frame into the store, unless it is there already."""
         frame = self.first if number == 0 else self._inputs(number)
-        seen = "" if self._images is None else self._images.digest(number, self._digests)
-        key = _digest(f"{self.key} {number} {frame.cloud.radiance_color_space} {seen}", *frame.cloud.arrays().values())
+        text = f"{self.key} {number} {frame.cloud.radiance_color_space} {self._digest_of_images(number)}"
+        if self._follows(number):
+            text += f" {frame_key(self.path(number - 1))}"
+        key = _digest(text, *frame.cloud.arrays().values())
         if frame_key(self.path(number)) == key:
             self.resumed += 1
             return
@@ -315,6 +324,15 @@ class _Job:
         }
         with self.timer("store"):
             write_frame(self.path(number), key, arrays)
+        frame.forget()
+
+    def _digest_of_images(self, number: int) -> str:
+        """Return what the images of a frame are, as one word."""
+        return "" if self._images is None else self._images.digest(number, self._digests)
+
+    def _follows(self, number: int) -> bool:
+        """Return whether what is found of a frame depends on what was found of the one before."""
+        return self.options.images is not None and self.persistent and number > 0
 
     def _by_rays(self, frame: FrameInputs) -> dict[str, NDArray[Any]]:
         """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
@@ -348,7 +366,7 @@ class _Job:
         assert self.options.images is not None
         assert self._images is not None
         previous = None
-        if self.persistent and frame.number > 0:
+        if self._follows(frame.number):
             previous = read_frame(self.path(frame.number - 1), ("base_color",))["base_color"]
         scene, roughness = frame.scene, self._roughness(frame)
         with self.timer("read images"):
