@@ -26,6 +26,7 @@ from beam_warp.checks import require_number
 from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidOptionError
 from beam_warp.exposure import estimate_exposure
 from beam_warp.frame_inputs import CaptureImages, FrameInputs, RoughnessTexture, filled_occlusion
 from beam_warp.frame_store import frame_key, make_folders, read_frame, write_frame
@@ -65,6 +66,9 @@ class RunOptions:
         persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
             frames at once; sequences that carry ids state it themselves.
         device: Warp device; None takes the first CUDA device, or the CPU.
+
+    Raises:
+        InvalidOptionError: The exposure is out of range.
     """
 
     materials: MaterialOptions = field(default_factory=MaterialOptions)
@@ -73,6 +77,11 @@ class RunOptions:
     exposure: float | Literal["auto"] = "auto"
     persistent: bool = False
     device: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check what is not checked where it is stated."""
+        if self.exposure != "auto":
+            require_number("exposure", self.exposure, -32.0, 32.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +147,7 @@ def run(
 
     Raises:
         InvalidArrayError: A frame has no captured radiance.
-        InvalidOptionError: The capture lacks a frame of the sequence.
+        InvalidOptionError: The capture lacks a frame of the sequence, or there is none for the image path.
         OutputError: The folder cannot be made or written.
         BeamError: An input or option breaks its contract.
 
@@ -148,8 +157,12 @@ def run(
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
     folder = Path(out)
-    frames, digests = make_folders(folder, "frames", "digests")
     images = None if capture is None else CaptureImages(capture, sequence)
+    if chosen.images is not None and images is None:
+        raise InvalidOptionError(
+            "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
+        )
+    frames, digests = make_folders(folder, "frames", "digests")
     job = _Job(sequence, environment, frames, chosen, images, CaptureDigests(digests), progress)
     total = len(sequence)
     for frame in range(total):
@@ -272,7 +285,7 @@ class _Job:
     def _find_exposure(self, environment: EnvironmentMap, light: MaterialLight) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
-            return require_number("exposure", self.options.exposure, -32.0, 32.0)
+            return float(self.options.exposure)
         display = self.first.cloud.radiance_color_space == DISPLAY_SRGB
         if self._images is not None:
             display = self._images.is_display_referred(0)
