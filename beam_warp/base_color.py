@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.assets import GaussianCloud, Observability
-from beam_warp.materials import BURIED_VISIBILITY, ColorEvidence
+from beam_warp.materials import ColorEvidence
 
 UNLIT_PART = 0.01
 """A Gaussian is unlit below this part of the environment's mean unshadowed irradiance."""
@@ -32,6 +32,13 @@ FILL_NEIGHBORS = 8
 PAIRED = 512
 PAIR_GROUPS = 64
 """Gaussians whose pairs say how values differ with distance, and groups of as many pairs each by distance."""
+
+POOLED_VIEWS = 1.0
+"""Views of a typical Gaussian that count beside a Gaussian's own when it is asked how far views disagree: one view
+alone cannot tell, and two agree by chance."""
+
+UNKNOWN = (0.5, 12.0**-0.5)
+"""Base colour of which nothing is known, and its standard error: any in [0, 1] is as likely."""
 
 MISSING = Observability.UNLIT | Observability.UNSEEN
 """What base colour cannot be measured of."""
@@ -61,7 +68,7 @@ def solve_base_color(
 
     rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
     badly one rho explains all views and frames, and the error of the light: its noise and that of the normal it
-    falls on, averaged over frames.
+    falls on, averaged over frames. Where nothing at all was measured, all are `UNKNOWN`.
 
     Args:
         cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
@@ -79,38 +86,62 @@ def solve_base_color(
     weight = np.where(missing, 0.0, cloud.opacities)
     clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)
+    if missing.all():
+        base_color, error = (np.full_like(base_color, value) for value in UNKNOWN)
     flags[missing] |= np.uint8(Observability.FILLED)
     return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
 
 
 def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the unbounded solution and its standard error, ``(N, 3)`` each; 0 where there is no evidence."""
+    """Return the unbounded solution and its standard error, ``(N, 3)`` each; 0 where there is no evidence.
+
+    With v views of variance t^2 each, the variance of their mean is t^2 / v. What one Gaussian's views say of t^2 is
+    joined with what is typical (the median over Gaussians), which counts for `POOLED_VIEWS` more views: an empirical
+    Bayes estimate, as Smyth 2004 moderates variances of few samples.
+    """
     numerator, denominator, observed = (
         np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
     )
-    safe = np.where(denominator > 0.0, denominator, 1.0)
-    raw = np.where(denominator > 0.0, numerator / safe, 0.0)
+    known = denominator > 0.0
+    safe = np.where(known, denominator, 1.0)
+    raw = np.where(known, numerator / safe, 0.0)
     bounded = np.clip(raw, 0.0, 1.0)
     residual = np.maximum(observed - 2.0 * bounded * numerator + bounded**2 * denominator, 0.0)
-    degrees = np.maximum(np.asarray(evidence.views, np.float64) - 1.0, 1.0)[:, None]
-    noise = np.sqrt(np.asarray(evidence.noise, np.float64))[:, None] / evidence.frames
-    return raw, np.sqrt(residual / safe / degrees + (bounded * noise) ** 2)
+    views = np.asarray(evidence.views, np.float64)[:, None]
+    degrees = np.maximum(views - 1.0, 0.0)
+    scatter = residual / safe * views  # squared residuals of views, in base colour
+    told = known.all(axis=1) & (degrees[:, 0] >= 1.0)
+    # the median of a chi-squared variable over its mean, Wilson and Hilferty 1931
+    middle = degrees[told] * (1.0 - 2.0 / (9.0 * degrees[told])) ** 3
+    typical = np.median(scatter[told] / middle, axis=0) if told.any() else np.zeros(3)
+    variance = (scatter + POOLED_VIEWS * typical) / (degrees + POOLED_VIEWS) / np.maximum(views, 1.0)
+    noise = np.asarray(evidence.noise, np.float64) / measured_frames(evidence) ** 2
+    return raw, np.where(known, np.sqrt(variance + bounded**2 * noise[:, None]), 0.0)
+
+
+def measured_frames(evidence: ColorEvidence) -> NDArray[np.float64]:
+    """Return in how many frames each Gaussian was measured, at least 1, ``(N,)``: the others add nothing to sums."""
+    return np.maximum(evidence.frames - np.asarray(evidence.unseen, np.float64), 1.0)
 
 
 def observability(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float) -> NDArray[np.uint8]:
-    """Return why Gaussians are less than measured: `Observability` flags, ``(N,)``."""
+    """Return why Gaussians are less than measured: `Observability` flags, ``(N,)``.
+
+    Unlit is what was measured and found dark; of what no view shows, or shows in no pixel that counts, that is not
+    known.
+    """
     assert cloud.normal_confidence is not None
-    frames = evidence.frames
-    irradiance = np.asarray(evidence.irradiance).mean(axis=1) / frames
-    openness = np.asarray(evidence.openness) / frames
-    unseen = ~(openness > BURIED_VISIBILITY) | ~(np.asarray(evidence.unseen) < frames)
-    saturated = np.asarray(evidence.saturated) / frames > SATURATED_PART
-    # What was cut, or seen at grazing angles alone, is without evidence for that reason and not for want of light.
-    grazing = ~unseen & ~saturated & ~(np.asarray(evidence.facing) / frames > FACING_PART)
-    unexplained = ~_has_evidence(evidence) & ~saturated & ~grazing
+    measured = measured_frames(evidence)
+    irradiance = np.asarray(evidence.irradiance).mean(axis=1) / measured
+    hidden = ~(np.asarray(evidence.unseen) < evidence.frames)
+    saturated = np.asarray(evidence.saturated) / evidence.frames > SATURATED_PART
+    unlit = ~hidden & ~(irradiance > UNLIT_PART * mean_irradiance)
+    # What was cut, or seen at grazing angles alone, is without evidence for that reason.
+    grazing = ~hidden & ~saturated & ~(np.asarray(evidence.facing) / measured > FACING_PART)
+    unseen = hidden | (~unlit & ~saturated & ~grazing & ~_has_evidence(evidence))
     flags = np.zeros(len(irradiance), np.uint8)
     for mask, flag in (
-        (~(irradiance > UNLIT_PART * mean_irradiance) | unexplained, Observability.UNLIT),
+        (unlit, Observability.UNLIT),
         (unseen, Observability.UNSEEN),
         (saturated, Observability.SATURATED),
         (~(cloud.normal_confidence > UNCERTAIN_NORMAL), Observability.UNCERTAIN_NORMAL),

@@ -80,10 +80,17 @@ class CaptureImages:
         with ThreadPoolExecutor(LOADING_THREADS) as pool:
             return list(pool.map(lambda record: record.view(), self._records[index]))
 
+    def is_display_referred(self, index: int) -> bool:
+        """Return whether images of a frame have a scale of their own, and an upper end, rather than that of light."""
+        return any(_color_space(record) == DISPLAY_SRGB for record in self._records[index])
+
     def ceiling(self, index: int, views: Sequence[CapturedView]) -> float:
         """Return the largest value that the images of a frame can hold."""
         spaces = [_color_space(record) for record in self._records[index]]
-        return min(largest_value(view, space) for view, space in zip(views, spaces, strict=True))
+        return min(
+            largest_value([view for view, of in zip(views, spaces, strict=True) if of == space], space)
+            for space in set(spaces)
+        )
 
     def digest(self, index: int, digests: CaptureDigests) -> str:
         """Return what the images of a frame are, cameras included, as one word."""
@@ -136,6 +143,11 @@ class FrameInputs:
                 f"radiance must be given to decompose materials, got none at frame {number}. "
                 "Import Gaussians with captured colour."
             )
+
+    def forget(self) -> None:
+        """Let go of what was worked out: it lies on the device, and comes again when it is asked for."""
+        for name in ("scene", "views", "points", "surface"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def scene(self) -> Scene:

@@ -27,6 +27,7 @@ from beam_warp.checks import require_number
 from beam_warp.contact_sheet import Relighting, contact_sheet
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
+from beam_warp.errors import InvalidOptionError
 from beam_warp.exposure import estimate_exposure
 from beam_warp.frame_inputs import CaptureImages, FrameInputs, RoughnessTexture, filled_occlusion
 from beam_warp.frame_store import frame_key, make_folders, read_frame, write_frame
@@ -68,10 +69,14 @@ class RunOptions:
         roughness: Perceptual roughness of everything, a texture, or ``"estimate"``: found from the specular residue
             over views and frames.
         exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
-            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear.
+            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear. With a capture,
+            its images decide, because they are what is explained.
         persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
             frames at once; sequences that carry ids state it themselves.
         device: Warp device; None takes the first CUDA device, or the CPU.
+
+    Raises:
+        InvalidOptionError: The exposure is out of range.
     """
 
     materials: MaterialOptions = field(default_factory=MaterialOptions)
@@ -80,6 +85,11 @@ class RunOptions:
     exposure: float | Literal["auto"] = "auto"
     persistent: bool = False
     device: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check what is not checked where it is stated."""
+        if self.exposure != "auto":
+            require_number("exposure", self.exposure, -32.0, 32.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +155,7 @@ def run(
 
     Raises:
         InvalidArrayError: A frame has no captured radiance.
-        InvalidOptionError: The capture lacks a frame of the sequence.
+        InvalidOptionError: The capture lacks a frame of the sequence, or there is none for the image path.
         OutputError: The folder cannot be made or written.
         BeamError: An input or option breaks its contract.
 
@@ -155,8 +165,12 @@ def run(
     chosen = options or RunOptions()
     resolve_device(chosen.device)  # before a folder is made that would then stay empty
     folder = Path(out)
-    frames, digests = make_folders(folder, "frames", "digests")
     images = None if capture is None else CaptureImages(capture, sequence)
+    if chosen.images is not None and images is None:
+        raise InvalidOptionError(
+            "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
+        )
+    frames, digests = make_folders(folder, "frames", "digests")
     job = _Job(sequence, environment, frames, chosen, images, CaptureDigests(digests), progress)
     job.check()
     total = len(sequence)
@@ -273,6 +287,8 @@ class _Job:
                 "version": __version__,
                 "device": "cuda" if self.device.is_cuda else "cpu",
                 "options": options_as_dict(self.options),
+                "raster": None if self._images is None else asdict(self._images.raster),
+                "evidence": ColorEvidence.ARRAYS,
                 "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
             },
             sort_keys=True,
@@ -281,11 +297,15 @@ class _Job:
     def _find_exposure(self, environment: EnvironmentMap, light: MaterialLight) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
-            return require_number("exposure", self.options.exposure, -32.0, 32.0)
-        if self.first.cloud.radiance_color_space != DISPLAY_SRGB:
+            return float(self.options.exposure)
+        display = self.first.cloud.radiance_color_space == DISPLAY_SRGB
+        if self._images is not None:
+            display = self._images.is_display_referred(0)
+        if not display:
             return 0.0
         path = self.folder / "exposure.h5"
-        key = _digest(self._described(), environment.radiance, *self.first.cloud.arrays().values())
+        described = f"{self._described()} {self._digest_of_images(0)}"
+        key = _digest(described, environment.radiance, *self.first.cloud.arrays().values())
         if frame_key(path) != key:
             first = self.first
             scene, points = first.scene, first.points
@@ -371,6 +391,8 @@ class _Job:
         """Measure a frame into the store, unless it is there already."""
         frame = self.first if number == 0 else self._inputs(number)
         key = self._frame_key(number, frame)
+        if self._follows(number):
+            key = _digest(f"{key} {frame_key(self.path(number - 1))}")
         if frame_key(self.path(number)) == key:
             self.resumed += 1
             return
@@ -387,6 +409,15 @@ class _Job:
         }
         with self.timer("store"):
             write_frame(self.path(number), key, arrays)
+        frame.forget()
+
+    def _digest_of_images(self, number: int) -> str:
+        """Return what the images of a frame are, as one word."""
+        return "" if self._images is None else self._images.digest(number, self._digests)
+
+    def _follows(self, number: int) -> bool:
+        """Return whether what is found of a frame depends on what was found of the one before."""
+        return self.options.images is not None and self.persistent and number > 0
 
     def _by_rays(self, frame: FrameInputs) -> dict[str, NDArray[Any]]:
         """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
@@ -420,7 +451,7 @@ class _Job:
         assert self.options.images is not None
         assert self._images is not None
         previous = None
-        if self.persistent and frame.number > 0:
+        if self._follows(frame.number):
             previous = read_frame(self.path(frame.number - 1), ("base_color",))["base_color"]
         scene, roughness = frame.scene, self._roughness(frame)
         with self.timer("read images"):

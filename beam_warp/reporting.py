@@ -55,6 +55,11 @@ def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
             f"{statistics['clipped_part']:.0%} of what is opaque has base colour cut at 1: the environment is too dim, "
             "or comes from other sides than the light of the capture; see --exposure and --rotate"
         )
+    if statistics["gaussians"] and statistics["flags"]["FILLED"] == statistics["gaussians"]:
+        warnings.append(
+            "no base colour could be measured: no Gaussian is both lit and seen; check that the environment is not "
+            "black and that the capture is the one that the Gaussians were reconstructed from"
+        )
     if statistics["flags"]["UNCERTAIN_NORMAL"] > UNCERTAIN_WARNING * statistics["gaussians"]:
         warnings.append("most normals are uncertain: the Gaussians do not form a surface; relighting is a guess")
     return warnings

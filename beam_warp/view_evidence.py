@@ -48,6 +48,9 @@ LEAST_SHARE = 0.01
 """Part of the pixels that it would cover without others before it that they must show: layers let something through,
 and with enough pixels that adds up."""
 
+LEAST_AGREEMENT = 1e-3
+"""Length of the mean of the normals below which it has no direction: both sides of a sheet are seen alike."""
+
 PIXELS_AT_ONCE = 2**21
 """Most pixels drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
 
@@ -165,6 +168,7 @@ def view_evidence(
     totals = sums.numpy()
     weight, cut = totals[:, 6].copy(), totals[:, 7]
     seen = weight >= np.maximum(LEAST_WEIGHT, LEAST_SHARE * _coverage(cloud, cameras, origin))
+    seen &= np.linalg.norm(totals[:, 3:6], axis=1) > LEAST_AGREEMENT * weight
     positions, normals = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
     agreement = wp.empty(count, dtype=float, device=target)
     launch_finish_surface(

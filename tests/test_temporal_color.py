@@ -8,6 +8,7 @@ from beam_warp.materials import ColorEvidence
 from beam_warp.temporal_color import FALSE_DISCOVERIES, ChangeTest, with_changes
 
 COUNT, FRAMES = 4000, 8
+VIEWS = 1e6
 
 
 def evidence(colors, error, *, stated=None, unseen=None):
@@ -19,11 +20,12 @@ def evidence(colors, error, *, stated=None, unseen=None):
     return ColorEvidence(
         numerator=colors * ones,
         denominator=ones,
-        observed=colors**2 + (said**2)[:, None],  # residual / denominator / (views - 1) = said^2
+        observed=colors**2
+        + VIEWS * (said**2)[:, None],  # so many views that their scatter is known: said^2 of the mean
         irradiance=ones,
         openness=np.ones(count),
         noise=zeros,
-        views=np.full(count, 2.0),
+        views=np.full(count, VIEWS),
         facing=np.ones(count),
         saturated=zeros,
         unseen=zeros if unseen is None else unseen.astype(float),

@@ -47,10 +47,10 @@ def ball(rng):
     return colored(cloud_of(tiles(points, points, spacing)), rng.uniform(0.1, 0.9, (3000, 3)))
 
 
-def captured(cloud, cameras, change=lambda color: color):
+def captured(cloud, cameras, change=lambda color: color, device="cpu"):
     views = []
     for k, camera in enumerate(cameras):
-        buffer = rasterize(cloud, camera, channels=(RADIANCE,), device="cpu")
+        buffer = rasterize(cloud, camera, channels=(RADIANCE,), device=device)
         color = change(buffer.channels[RADIANCE] * buffer.alpha[..., None]).astype(np.float32)
         views.append(CapturedView(name=str(k), camera=camera, color=color, alpha=buffer.alpha))
     return views
@@ -105,7 +105,7 @@ class TestSurface:
 class TestColors:
     def test_a_perfect_fit_shows_its_own_colour(self, ball, device):
         cameras = around()
-        found = view_evidence(ball, cameras, captured(ball, cameras), device=device)
+        found = view_evidence(ball, cameras, captured(ball, cameras, device=device), device=device)
         colors = found.colors.numpy()
         shown = colors[..., 3] > 0.1
         truth = np.broadcast_to(0.5 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
