@@ -396,10 +396,12 @@ def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]
 
 def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
     """Put what is wrong into words; of a light that does not fit at all neither turn nor exposure mean anything."""
-    if (has_gloss and check.gloss_best < LEAST_GLOSS) or check.spread_best > UNREMOVED * check.spread_undivided:
+    put_in = check.spread_best > UNREMOVED * check.spread_undivided
+    if (has_gloss and check.gloss_best < LEAST_GLOSS) or put_in:
         return [
             Finding(
-                "warning",
+                # Small images blur gloss away under the right light too: then it is worth knowing, no more.
+                "warning" if put_in else "note",
                 "environment-unexplained",
                 "environment does not explain the capture under any turn: correlation of gloss "
                 f"{check.gloss_best:.2f}, {LEAST_GLOSS:g} or more with the right one; spread of base colours "

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -579,13 +579,22 @@ class _Job:
             },
         )
 
+    def _said(self, severity: str) -> list[str]:
+        """Return the findings of a severity as lines for people."""
+        lines = []
+        for finding in self._findings:
+            place = f" ({finding['where']})" if finding["where"] else ""
+            if finding["severity"] == severity:
+                lines.append(f"{finding['what']}{place}. {finding['remedy']}".strip())
+        return lines
+
     def report(self) -> dict[str, Any]:
         """Return what was done, found and spent; JSON-able."""
         measured = len(self.sequence) - self.resumed
         samples = self.options.materials.sample_count
         seconds = self.timer.seconds.get("materials", 0.0)
         rays = measured * len(self.first.cloud) * samples * 2
-        notes = [*self.sequence.metadata.get("notes", "").splitlines(), *self._notes]
+        notes = [*self.sequence.metadata.get("notes", "").splitlines(), *self._notes, *self._said("note")]
         return {
             "input": {"frames": len(self.sequence), "gaussians": len(self.first.cloud), "notes": notes},
             "device": device_facts(self.device),
@@ -599,14 +608,8 @@ class _Job:
             "seconds": dict(self.timer.seconds),
             "light_and_occlusion_rays_per_second": rays / seconds if seconds > 0.0 and measured else None,
             "findings": self._findings,
-            "warnings": [*map(_warning, self._findings), *warnings_about(self._statistics)],
+            "warnings": [*self._said("warning"), *warnings_about(self._statistics)],
         }
-
-
-def _warning(finding: Mapping[str, Any]) -> str:
-    """Return a stored finding as a line for people."""
-    place = f" ({finding['where']})" if finding["where"] else ""
-    return f"{finding['what']}{place}. {finding['remedy']}".strip()
 
 
 def _roughness_source(source: float | RoughnessTexture | str) -> str:

@@ -48,7 +48,7 @@ NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
 @pytest.mark.parametrize(
     ("why", "flags"),
     [
-        ({}, Observability.UNLIT | Observability.FILLED),
+        ({}, Observability.UNSEEN | Observability.FILLED),
         ({"saturated": {2: 1.0}, "facing": {2: 0.0}}, Observability.SATURATED | Observability.FILLED),
         ({"facing": {2: 0.0}}, Observability.GRAZING | Observability.FILLED),
         ({"irradiance": {2: 0.0}}, Observability.UNLIT | Observability.FILLED),
