@@ -5,7 +5,7 @@ import pytest
 from shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import Observability
-from beam_warp.base_color import UNKNOWN, least_squares, solve_base_color
+from beam_warp.base_color import SPECULAR_PART, UNKNOWN, least_squares, solve_base_color
 from beam_warp.materials import ColorEvidence
 
 IRRADIANCE = 3.0
@@ -75,8 +75,18 @@ class TestStandardError:
         for _ in range(8):
             total = total + hidden(10, slice(0, 5))
         _, error = least_squares(total)
-        np.testing.assert_allclose(error[:5], 0.4 * 0.1, rtol=1e-6)
-        np.testing.assert_allclose(error[5:], 0.4 * 0.1 / 3.0, rtol=1e-6)
+        once = (0.4 + SPECULAR_PART) * 0.1  # of what is diffuse and of the highlight that is subtracted
+        np.testing.assert_allclose(error[:5], once, rtol=1e-6)
+        np.testing.assert_allclose(error[5:], once / 3.0, rtol=1e-6)
+
+    def test_of_black_is_that_of_the_highlight(self, rng):
+        """A light wrong by 20 %: black under a highlight of 0.05 comes out wrong by 0.01."""
+        error = rng.normal(0.0, 0.2, 4000)
+        shown = 0.05 * (1.0 + error)  # radiance, all of it specular; the model subtracts 0.05
+        raw, _ = least_squares(evidence(np.tile((shown - 0.05)[None, :, None], (4, 1, 3)), noise=0.2))
+        assert np.sqrt((raw**2).mean()) == pytest.approx(0.01, rel=0.05)  # 4000 samples: 1.1 %
+        _, stated = least_squares(evidence(np.zeros((4, 10, 3)), noise=0.2))
+        np.testing.assert_allclose(stated, 0.01, rtol=1e-6)
 
 
 class TestFlags:
