@@ -1,127 +1,103 @@
-"""From evidence to base colour: standard errors that few views and few frames cannot make small, and honest flags."""
+"""What base colour is given where it cannot be measured, and why it says that it could not."""
 
 import numpy as np
 import pytest
-from shapes import cloud_of, sphere_points, tiles
 
-from beam_warp import Observability
-from beam_warp.base_color import SPECULAR_PART, UNKNOWN, least_squares, solve_base_color
+from beam_warp.assets import GaussianCloud, Observability
+from beam_warp.base_color import SATURATED_PART, fill_from_neighbors, solve_base_color
 from beam_warp.materials import ColorEvidence
 
-IRRADIANCE = 3.0
 
-
-def bare(count):
-    points, _ = sphere_points(count)
-    cloud = cloud_of(tiles(points, points, 0.1))
-    return cloud.with_arrays(normal_confidence=np.ones(count, np.float32))
-
-
-def evidence(targets, *, noise=0.0, **changed):
-    """Of views of equal weight under light of radiance 1, whose targets are ``(V, N, 3)``."""
-    views, count = targets.shape[:2]
+def evidence(count, **changes):
+    """Evidence of one frame on a base colour of one half, by ten equally good views."""
     arrays = {
-        "numerator": targets.sum(0),
-        "denominator": np.full((count, 3), float(views)),
-        "observed": (targets**2).sum(0),
-        "irradiance": np.full((count, 3), IRRADIANCE),
+        "numerator": np.full((count, 3), 5.0),
+        "denominator": np.full((count, 3), 10.0),
+        "observed": np.full((count, 3), 2.5),
+        "irradiance": np.full((count, 3), np.pi),
         "openness": np.ones(count),
-        "noise": np.full(count, noise**2),
-        "views": np.full(count, float(views)),
+        "noise": np.zeros(count),
+        "views": np.full(count, 10.0),
         "facing": np.ones(count),
         "saturated": np.zeros(count),
         "unseen": np.zeros(count),
     }
-    return ColorEvidence(**(arrays | changed))
-
-
-def hidden(count, rows):
-    """A frame in which some Gaussians are not measured, and the others are as dull as can be."""
-    zero = {name: np.zeros((count, 3)) for name in ("numerator", "denominator", "observed")}
-    whole = evidence(np.full((4, count, 3), 0.4), noise=0.1)
-    arrays = {name: getattr(whole, name).copy() for name in ColorEvidence.ARRAYS}
-    for name in (*zero, "irradiance", "openness", "noise", "views", "facing"):
-        arrays[name][rows] = 0.0
-    arrays["unseen"][rows] = 1.0
+    for name, rows in changes.items():
+        for row, value in rows.items():
+            arrays[name][row] = value
     return ColorEvidence.from_arrays(arrays)
 
 
-class TestStandardError:
-    @pytest.mark.parametrize("views", [2, 3, 8, 32])
-    def test_it_is_that_of_a_mean_of_views(self, rng, views):
-        """Views off by 0.05 each: the mean's error is 0.05 / sqrt(views), and the stated one says so on average."""
-        targets = 0.5 + rng.normal(0.0, 0.05, (views, 4000, 3))
-        raw, error = least_squares(evidence(targets))
-        np.testing.assert_allclose(raw, targets.mean(0), atol=1e-12)
-        # 12,000 variances of one degree or more are known to sqrt(2 / 12,000); Wilson and Hilferty are 4 % off at one
-        assert np.sqrt((error**2).mean()) / (0.05 / np.sqrt(views)) == pytest.approx(1.0, abs=0.05)
-        assert ((np.abs(raw - 0.5) < 2.0 * error).mean(0) > 0.90).all()  # Student's t of 2 degrees has 82 %
-
-    def test_one_view_alone_is_as_uncertain_as_views_are_elsewhere(self, rng):
-        """A single view has no residual; its error is what views typically differ by, not 0."""
-        many = evidence(0.5 + rng.normal(0.0, 0.05, (16, 1000, 3)))
-        arrays = {name: getattr(many, name).copy() for name in ColorEvidence.ARRAYS}
-        one = 0.5 + rng.normal(0.0, 0.05, (200, 3))
-        arrays["numerator"][:200], arrays["denominator"][:200], arrays["observed"][:200] = one, 1.0, one**2
-        arrays["views"][:200] = 1.0
-        _, error = least_squares(ColorEvidence.from_arrays(arrays))
-        # the median of 800 estimates of 15 degrees each: 1.25 sqrt(2 / 15 / 800) of a variance, thrice that to be safe
-        np.testing.assert_allclose(error[:200], 0.05, rtol=0.03)
-
-    def test_light_that_is_noisy_in_every_frame_averages_out_over_those_that_are_measured(self):
-        """Nine frames, one of which shows the first half: its noise is that of one frame, not a ninth of it."""
-        frame = evidence(np.full((4, 10, 3), 0.4), noise=0.1)
-        total = frame
-        for _ in range(8):
-            total = total + hidden(10, slice(0, 5))
-        _, error = least_squares(total)
-        once = (0.4 + SPECULAR_PART) * 0.1  # of what is diffuse and of the highlight that is subtracted
-        np.testing.assert_allclose(error[:5], once, rtol=1e-6)
-        np.testing.assert_allclose(error[5:], once / 3.0, rtol=1e-6)
-
-    def test_of_black_is_that_of_the_highlight(self, rng):
-        """A light wrong by 20 %: black under a highlight of 0.05 comes out wrong by 0.01."""
-        error = rng.normal(0.0, 0.2, 4000)
-        shown = 0.05 * (1.0 + error)  # radiance, all of it specular; the model subtracts 0.05
-        raw, _ = least_squares(evidence(np.tile((shown - 0.05)[None, :, None], (4, 1, 3)), noise=0.2))
-        assert np.sqrt((raw**2).mean()) == pytest.approx(0.01, rel=0.05)  # 4000 samples: 1.1 %
-        _, stated = least_squares(evidence(np.zeros((4, 10, 3)), noise=0.2))
-        np.testing.assert_allclose(stated, 0.01, rtol=1e-6)
+def line(count):
+    """Gaussians a metre apart on a line."""
+    positions = np.zeros((count, 3))
+    positions[:, 0] = np.arange(count)
+    return GaussianCloud(
+        positions=positions,
+        orientations=np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 4)),
+        scales=np.ones((count, 3)),
+        opacities=np.ones(count),
+        normal_confidence=np.ones(count),
+    )
 
 
-class TestFlags:
-    def test_what_one_frame_of_many_shows_is_measured(self):
-        total = evidence(np.full((4, 10, 3), 0.4), noise=0.1)
-        for _ in range(150):
-            total = total + hidden(10, slice(0, 5))
-        solved = solve_base_color(bare(10), total, IRRADIANCE)
-        assert (solved.observability == 0).all()
-        np.testing.assert_allclose(solved.base_color, 0.4, rtol=1e-6)
+NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
+"""No view of the third Gaussian counts."""
 
-    def test_each_says_what_is_the_matter(self):
-        plain = evidence(np.full((4, 5, 3), 0.4))
-        arrays = {name: getattr(plain, name).copy() for name in ColorEvidence.ARRAYS}
-        arrays["irradiance"][0] = 0.001 * IRRADIANCE  # dark
-        arrays["unseen"][1] = 1.0  # not shown
-        for name in ("irradiance", "denominator", "numerator", "observed"):
-            arrays[name][1] = 0.0
-        for name in ("denominator", "numerator", "observed"):
-            arrays[name][2] = 0.0  # lit, but every pixel of it was cut
-        arrays["saturated"][2] = 1.0
-        arrays["facing"][3] = 0.001
-        found = solve_base_color(bare(5), ColorEvidence.from_arrays(arrays), IRRADIANCE).observability
-        filled = Observability.FILLED
-        assert [Observability(int(flags)) for flags in found] == [
-            Observability.UNLIT | filled,
-            Observability.UNSEEN | filled,
-            Observability.UNSEEN | Observability.SATURATED | filled,
-            Observability.GRAZING,
-            Observability.OBSERVED,
-        ]
 
-    def test_where_nothing_is_known_nothing_is_claimed(self):
-        solved = solve_base_color(bare(6), hidden(6, slice(None)), IRRADIANCE)
-        np.testing.assert_array_equal(solved.base_color, np.float32(UNKNOWN[0]))
-        np.testing.assert_array_equal(solved.standard_error, np.float32(UNKNOWN[1]))
-        assert (solved.observability & np.uint8(Observability.FILLED) != 0).all()
-        assert solved.clipped_part == 0.0
+@pytest.mark.parametrize(
+    ("why", "flags"),
+    [
+        ({}, Observability.UNSEEN | Observability.FILLED),
+        ({"saturated": {2: 1.0}, "facing": {2: 0.0}}, Observability.SATURATED | Observability.FILLED),
+        ({"facing": {2: 0.0}}, Observability.GRAZING | Observability.FILLED),
+        ({"irradiance": {2: 0.0}}, Observability.UNLIT | Observability.FILLED),
+    ],
+)
+def test_what_is_without_evidence_says_why(why, flags):
+    """Cut pixels leave no view, and none that faces the surface; that is neither want of light nor a grazing view."""
+    solved = solve_base_color(line(5), evidence(5, **NOTHING, **why), np.pi)
+    assert solved.observability.tolist() == [0, 0, int(flags), 0, 0]
+    np.testing.assert_allclose(solved.base_color, 0.5)
+
+
+def test_partly_cut_is_measured():
+    solved = solve_base_color(line(3), evidence(3, saturated={1: SATURATED_PART + 0.1}), np.pi)
+    assert solved.observability.tolist() == [0, int(Observability.SATURATED), 0]
+
+
+def test_error_of_what_is_filled_grows_with_distance():
+    """Values rise by a tenth a metre: filled d metres beyond their end, they are off by d tenths, and say so at least.
+
+    Pairs are no farther apart than the line is long, so that beyond that the error stays.
+    """
+    known, beyond = 40, np.arange(1, 21)
+    positions = np.zeros((known + len(beyond), 3), np.float32)
+    positions[:, 0] = np.concatenate([np.arange(known), known - 1 + beyond])
+    values = 0.1 * positions[:, :1].astype(np.float64)
+    missing = np.arange(len(positions)) >= known
+    filled, error = fill_from_neighbors(positions, values, np.zeros_like(values), missing)
+    assert (np.diff(error[missing, 0]) >= -1e-12).all()
+    # Of the pairs that share a group the root mean square is taken: it may fall short of the farthest by a group.
+    assert (error[missing, 0] > 0.1 * beyond - 0.1).all()
+    assert (np.abs(filled - values)[missing, 0] < 2.0 * error[missing, 0]).all()
+    np.testing.assert_array_equal(filled[~missing], values[~missing])
+    assert not error[~missing].any()
+
+
+def test_error_of_what_is_filled_among_its_like_is_theirs():
+    """Where nothing varies, nothing is added to the neighbours' own error."""
+    positions = np.random.default_rng(0).uniform(size=(600, 3)).astype(np.float32)
+    values, errors = np.full((600, 3), 0.4), np.full((600, 3), 0.02)
+    filled, error = fill_from_neighbors(positions, values, errors, np.arange(600) % 7 == 0)
+    np.testing.assert_allclose(filled, 0.4)
+    np.testing.assert_allclose(error, 0.02)
+
+
+@pytest.mark.parametrize("known", [0, 1, 2])
+def test_few_neighbors(known):
+    positions = np.arange(12, dtype=np.float32).reshape(4, 3)
+    values, errors = np.full((4, 2), 0.3), np.full((4, 2), 0.1)
+    filled, error = fill_from_neighbors(positions, values, errors, np.arange(4) >= known)
+    np.testing.assert_allclose(filled, 0.3)
+    np.testing.assert_allclose(error, 0.1)
