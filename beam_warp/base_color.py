@@ -37,6 +37,10 @@ POOLED_VIEWS = 1.0
 """Views of a typical Gaussian that count beside a Gaussian's own when it is asked how far views disagree: one view
 alone cannot tell, and two agree by chance."""
 
+SPECULAR_PART = 0.05
+"""What an open dielectric reflects specularly over what a white diffuser would send: an error of the light is one of
+the highlight that is subtracted too, so that black is not known better than this part of it."""
+
 UNKNOWN = (0.5, 12.0**-0.5)
 """Base colour of which nothing is known, and its standard error: any in [0, 1] is as likely."""
 
@@ -116,7 +120,9 @@ def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray
     typical = np.median(scatter[told] / middle, axis=0) if told.any() else np.zeros(3)
     variance = (scatter + POOLED_VIEWS * typical) / (degrees + POOLED_VIEWS) / np.maximum(views, 1.0)
     noise = np.asarray(evidence.noise, np.float64) / measured_frames(evidence) ** 2
-    return raw, np.where(known, np.sqrt(variance + bounded**2 * noise[:, None]), 0.0)
+    # rho = L_o / (E d) - s / d for light E times shares d and s: an error of E moves it by (rho + s / d) / E
+    light = (bounded + SPECULAR_PART) ** 2 * noise[:, None]
+    return raw, np.where(known, np.sqrt(variance + light), 0.0)
 
 
 def measured_frames(evidence: ColorEvidence) -> NDArray[np.float64]:

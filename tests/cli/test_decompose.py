@@ -126,7 +126,7 @@ class TestMistakes:
     def test_frames_that_the_capture_lacks(self, mistake, figure, small, tmp_path):
         other = tmp_path / "other.usda"
         write(GaussianSequence.from_clouds([read(figure)[0]], metadata={"capture_frames": "7"}), other)
-        mistake(other, "--capture", small, "--roughness", 0.5, says="got none of frame 7 (it has 0 to 1)")
+        mistake(other, "--capture", small, "--roughness", 0.5, says="got none of frame 7")
 
 
 def test_help_has_examples(capsys):
