@@ -132,7 +132,8 @@ class FrameInputs:
         self.original = original
         self.cloud = change_axes(original, WORLD_AXES)
         self._images = images
-        self._device, self._offset, self._seed = device, offset, seed
+        self._device, self._seed = device, seed
+        self._offset: float | Literal["auto"] = offset
         self._timer, self._progress = timer, progress
         if len(self.cloud) == 0:
             raise InvalidArrayError(
@@ -224,7 +225,7 @@ class FrameInputs:
         normals = points.normals.numpy()
         filled, _ = fill_from_neighbors(self.cloud.positions, normals, np.zeros_like(normals), ~points.seen)
         length = np.linalg.norm(filled, axis=1, keepdims=True)
-        upright = np.broadcast_to(np.float32([0.0, 0.0, 1.0]), filled.shape)
+        upright = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), filled.shape)
         unit = np.where(length > 1e-6, filled / np.maximum(length, 1e-6), upright).astype(np.float32)
         return SurfaceNormals(unit, points.confidence, np.zeros(len(unit), bool))
 

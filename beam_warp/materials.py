@@ -318,7 +318,7 @@ def lit_points(
     Raises:
         InvalidArrayError: The cloud has no captured radiance.
     """
-    _require_radiance(cloud)
+    radiance = _require_radiance(cloud)
     device, count = light.device, len(rows)
     at = upload(np.asarray(rows, np.int32), int, device)
     observed = Observations()
@@ -326,7 +326,7 @@ def lit_points(
         observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
         observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
         launch_sample_radiance(
-            upload(cloud.radiance, wp.vec3, device),
+            upload(radiance, wp.vec3, device),
             at,
             int(cloud.radiance_color_space == DISPLAY_SRGB),
             points.normals[at].contiguous(),
@@ -449,11 +449,12 @@ def light_batches(
         progress(done, len(measured.rows))
 
 
-def _require_radiance(cloud: GaussianCloud) -> None:
+def _require_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
     if cloud.radiance is None:
         raise InvalidArrayError(
             "radiance must be given to decompose materials, got None. Import Gaussians with captured colour."
         )
+    return cloud.radiance
 
 
 def mean_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
@@ -470,7 +471,7 @@ def mean_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[n
         weight = colors[..., 3].sum(axis=0)
         shown = np.einsum("vn,vnc->nc", colors[..., 3], colors[..., :3])
         mean = np.where((weight > 0.0)[:, None], shown / np.maximum(weight, 1e-12)[:, None], mean)
-    return np.maximum(mean, 0.0).astype(np.float32)
+    return np.asarray(np.maximum(mean, 0.0), np.float32)
 
 
 def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
@@ -478,7 +479,7 @@ def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
     assert cloud.radiance is not None
     if cloud.radiance_color_space != DISPLAY_SRGB:
         return np.zeros(len(cloud), np.float32)  # scene-linear colour has no top
-    return (0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1).astype(np.float32)
+    return np.asarray((0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1), np.float32)
 
 
 def _empty(structure: Any, count: int, device: Any) -> Any:

@@ -416,7 +416,8 @@ def _moments(log_distribution: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
 def _cluster_sums(misfit: NDArray[np.float64], cluster: NDArray[np.integer[Any]], count: int) -> NDArray[np.float64]:
     """Add up the misfits of each cluster's Gaussians, in their order: ``(3, N, G)`` to ``(3, count, G)``."""
-    return np.stack([np.stack([np.bincount(cluster, column, count) for column in part.T], axis=1) for part in misfit])
+    sums = [np.stack([np.bincount(cluster, column, count) for column in part.T], axis=1) for part in misfit]
+    return np.stack(sums).astype(np.float64)
 
 
 def _sums_around(tree: cKDTree, clusters: NDArray[np.float64], count: int) -> NDArray[np.float64]:

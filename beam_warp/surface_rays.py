@@ -76,10 +76,10 @@ def ray_batches(
         return []
     rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
-    if isinstance(offset, wp.array):
-        offsets = offset[rows].contiguous()
-    else:
+    if isinstance(offset, (float, int, str)):
         offsets = ray_offsets(scene, positions, directions, offset)
+    else:
+        offsets = offset[rows].contiguous()
     rays_at_once = RAYS_AT_ONCE_ON_CUDA if device.is_cuda else RAYS_AT_ONCE
     step = min(max(1, rays_at_once // sample_count), points_at_once or count)
     batches = []

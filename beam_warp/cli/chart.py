@@ -351,15 +351,16 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
             f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
         )
     images = CaptureImages(capture, sequence)
+    views = images.views(args.frame)
     return MaterialsSubject(
         change_axes(sequence[args.frame], "rfu"),
-        images.views(args.frame),
+        views,
         environment,
         images.raster,
         capture,
         numbers_of_frames(sequence.metadata, len(sequence))[args.frame],
         args.asset.parent.name or args.asset.name,
-        images.ceiling(args.frame),
+        images.ceiling(args.frame, views),
     )
 
 
