@@ -53,7 +53,7 @@ def ray_batches(
     scene: Scene,
     points: wp.array,
     normals: wp.array,
-    offset: float | Literal["auto"] | wp.array,
+    offset: float | Literal["auto"] | Any,
     sample_count: int,
     *,
     points_at_once: int | None = None,
@@ -76,7 +76,7 @@ def ray_batches(
         return []
     rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
-    if isinstance(offset, (float, int, str)):
+    if offset == "auto" or isinstance(offset, (float, int)):
         offsets = ray_offsets(scene, positions, directions, offset)
     else:
         offsets = offset[rows].contiguous()
