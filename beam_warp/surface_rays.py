@@ -76,10 +76,11 @@ def ray_batches(
         return []
     rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
-    if offset == "auto" or isinstance(offset, (float, int)):
-        offsets = ray_offsets(scene, positions, directions, offset)
+    given: Any = offset
+    if isinstance(given, wp.array):
+        offsets = given[rows].contiguous()
     else:
-        offsets = offset[rows].contiguous()
+        offsets = ray_offsets(scene, positions, directions, given)
     rays_at_once = RAYS_AT_ONCE_ON_CUDA if device.is_cuda else RAYS_AT_ONCE
     step = min(max(1, rays_at_once // sample_count), points_at_once or count)
     batches = []
