@@ -32,11 +32,13 @@ if TYPE_CHECKING:
     from beam_warp.image_losses import L1Loss as L1Loss
     from beam_warp.image_losses import NormalLoss as NormalLoss
     from beam_warp.image_losses import SsimLoss as SsimLoss
+    from beam_warp.image_path import ImagePathOptions as ImagePathOptions
     from beam_warp.incident_light import Irradiance as Irradiance
     from beam_warp.incident_light import irradiance as irradiance
     from beam_warp.initialization import initial_gaussians as initial_gaussians
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
+    from beam_warp.material_scores import score_materials as score_materials
     from beam_warp.materials import MaterialOptions as MaterialOptions
     from beam_warp.meshing import mesh_of_gaussians as mesh_of_gaussians
     from beam_warp.pipeline import RunOptions as RunOptions
@@ -76,7 +78,9 @@ _HOMES = {
     "GaussianSequence": "assets",
     "Irradiance": "incident_light",
     "L1Loss": "image_losses",
+    "ImagePathOptions": "image_path",
     "MaterialOptions": "materials",
+    "score_materials": "material_scores",
     "NormalLoss": "image_losses",
     "Observability": "assets",
     "Parameters": "adam",
