@@ -182,7 +182,9 @@ class MaterialScores:
         mean: dict[str, Any] = {
             **{name: score.as_dict() for name, score in self.mean_channels().items()},
             "relit": _as_records(relit),
-            "relit_mean": {name: ImageScore.mean(list(lights.values())).as_dict() for name, lights in relit.items()},
+            "relit_mean": {
+                name: ImageScore.mean(list(lights.values())).as_dict() for name, lights in relit.items() if lights
+            },
             "relit_scaled": _as_records(self.mean_relit(scaled=True)),
             "base_color_scale": self.mean_view_scale,
             **{

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -313,3 +314,10 @@ def test_the_filter_that_an_asset_states():
     for wrong in ({"raster_antialiased": "maybe"}, {"raster_low_pass": "soft"}, {"raster_low_pass": "-1"}):
         with pytest.raises(InvalidOptionError):
             stated_raster(wrong)
+
+    def test_a_capture_without_relit_images_is_scored_all_the_same(self, asset, mirror):
+        """There is no light to take a mean over: nothing is stated, and the record is valid JSON."""
+        plain = replace(mirror, records=tuple(replace(record, relit_paths={}) for record in mirror.records))
+        record = score(asset, plain, "cpu", relighters={"deferred": DeferredRelighter()}).as_dict()
+        assert record["mean"]["relit_mean"] == {}
+        json.dumps(record, allow_nan=False)
