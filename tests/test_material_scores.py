@@ -315,9 +315,10 @@ def test_the_filter_that_an_asset_states():
         with pytest.raises(InvalidOptionError):
             stated_raster(wrong)
 
-    def test_a_capture_without_relit_images_is_scored_all_the_same(self, asset, mirror):
-        """There is no light to take a mean over: nothing is stated, and the record is valid JSON."""
-        plain = replace(mirror, records=tuple(replace(record, relit_paths={}) for record in mirror.records))
-        record = score(asset, plain, "cpu", relighters={"deferred": DeferredRelighter()}).as_dict()
-        assert record["mean"]["relit_mean"] == {}
-        json.dumps(record, allow_nan=False)
+
+def test_a_capture_without_relit_images_is_scored_all_the_same(asset, mirror):
+    """There is no light to take a mean over: nothing is stated, and the record is valid JSON."""
+    plain = replace(mirror, records=tuple(replace(record, relit_paths={}) for record in mirror.records))
+    record = score(asset, plain, "cpu", relighters={"deferred": DeferredRelighter()}).as_dict()
+    assert record["mean"]["relit_mean"] == {}
+    json.dumps(record, allow_nan=False)
