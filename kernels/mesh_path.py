@@ -1,99 +1,28 @@
 """Path tracing of a mesh under a distant environment: radiance on pixels, and radiance that leaves surface points.
 
 At every vertex of a path the environment is sampled directly and the BRDF is sampled on, and the two are combined by
-multiple importance sampling with the power heuristic (Veach 1997). BRDF: Lambert weighted by 1 - E_spec(n.v), which
-conserves energy, plus the dielectric GGX lobe of `beam_warp.kernels.brdf`.
+multiple importance sampling with the power heuristic (Veach 1997). What a point scatters: see
+`beam_warp.kernels.scattering`.
 """
 
 import warp as wp
 
-from beam_warp.kernels.brdf import ALPHA_FLOOR, specular_albedo, specular_brdf
 from beam_warp.kernels.environment_sampling import (
     EnvironmentDistribution,
     environment_radiance,
     square_to_environment,
     square_to_environment_pdf,
 )
-from beam_warp.kernels.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.mesh_surface import MeshSurface, SurfacePoint, closest_hit, is_open, surface_point
 from beam_warp.kernels.pixel_sampling import PIXEL_CHUNK, PixelRays, pixel_direction, sample_pair
-from beam_warp.kernels.sampling import square_to_cosine_hemisphere, stream_of, tangent_frame
+from beam_warp.kernels.sampling import stream_of, tangent_frame
+from beam_warp.kernels.scattering import brdf_cosine, brdf_direction, brdf_pdf, power_heuristic, shading_of
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
-
 PAIRS_PER_VERTEX = wp.constant(3)
 """Pairs of random numbers at a vertex of a path: light, BRDF direction, choice of lobe."""
-
-GRAZING_COSINE = wp.constant(1.0e-3)
-"""A shading normal that leans away from the viewer is turned back until it faces him by this cosine."""
-
-
-@wp.struct
-class Shading:
-    """A surface point seen from one direction."""
-
-    normal: wp.vec3
-    view: wp.vec3
-    diffuse: wp.vec3  # base colour (1 - E_spec) / pi
-    roughness: float
-    alpha: float
-    specular_share: float  # probability of sampling the specular lobe
-
-
-@wp.func
-def shading_of(point: SurfacePoint, view: wp.vec3, albedo_table: wp.array2d[wp.vec2]) -> Shading:
-    shading = Shading()
-    n = point.normal
-    away = GRAZING_COSINE - wp.dot(n, view)
-    if away > 0.0:
-        n = wp.normalize(n + away * view)
-    specular = specular_albedo(albedo_table, wp.dot(n, view), point.roughness)
-    shading.normal = n
-    shading.view = view
-    shading.diffuse = point.base_color * ((1.0 - specular) / PI)
-    shading.roughness = point.roughness
-    shading.alpha = wp.max(point.roughness * point.roughness, ALPHA_FLOOR)
-    c = point.base_color
-    diffuse = (c[0] + c[1] + c[2]) / 3.0 * (1.0 - specular)
-    # Neither lobe is starved: a share of 0.1 bounds the weight of any sample by ten times its lobe's own.
-    shading.specular_share = wp.clamp(specular / (specular + diffuse), 0.1, 0.9)
-    return shading
-
-
-@wp.func
-def brdf_cosine(shading: Shading, light: wp.vec3) -> wp.vec3:
-    """BRDF times n.l, for light above the surface."""
-    specular = specular_brdf(shading.normal, shading.view, light, shading.roughness)
-    return (shading.diffuse + wp.vec3(specular)) * wp.dot(shading.normal, light)
-
-
-@wp.func
-def brdf_pdf(shading: Shading, frame: wp.mat33, light: wp.vec3) -> float:
-    """Density of `brdf_direction` [1/sr], for light above the surface."""
-    view = wp.transpose(frame) * shading.view
-    local = wp.transpose(frame) * light
-    return (
-        shading.specular_share * square_to_visible_reflection_pdf(view, local, shading.alpha)
-        + (1.0 - shading.specular_share) * local[2] / PI
-    )
-
-
-@wp.func
-def brdf_direction(shading: Shading, frame: wp.mat33, choice: float, u: float, v: float) -> wp.vec3:
-    local = square_to_cosine_hemisphere(u, v)
-    if choice < shading.specular_share:
-        local = square_to_visible_reflection(wp.transpose(frame) * shading.view, shading.alpha, u, v)
-    return frame * local
-
-
-@wp.func
-def power_heuristic(pdf: float, other: float) -> float:
-    """pdf^2 / (pdf^2 + other^2), for pdf above 0; written so that squares cannot overflow."""
-    ratio = other / pdf
-    return 1.0 / (1.0 + ratio * ratio)
 
 
 @wp.func
@@ -113,7 +42,7 @@ def path_radiance(
     point = start
     view = start_view
     for bounce in range(bounce_count + 1):
-        shading = shading_of(point, view, albedo_table)
+        shading = shading_of(point.normal, view, point.base_color, point.roughness, albedo_table)
         frame = tangent_frame(shading.normal)
         pair = 1 + bounce * PAIRS_PER_VERTEX
 
