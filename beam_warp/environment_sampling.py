@@ -14,8 +14,10 @@ from beam_warp.environments import EnvironmentMap
 from beam_warp.kernels.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.incident_light import LightMoments
 from beam_warp.kernels.product_sampling import EnvironmentBlocks
+from beam_warp.kernels.product_tree import ProductTree
 
 BLOCK_ROWS, BLOCK_COLUMNS = 16, 32
+GROUP_ROWS, GROUP_COLUMNS = 4, 8
 LARGEST_HEIGHT = 512
 """Taller maps are reduced to this height, energy kept: a texel is then 0.35 degrees, two thirds of the sun."""
 
@@ -137,6 +139,37 @@ def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentB
     blocks.row_cdf = upload(row_cdf.astype(np.float32), float, device)
     blocks.column_cdf = upload(column_cdf.astype(np.float32), float, device)
     return blocks
+
+
+def product_tree(environment: EnvironmentMap, device: Any) -> ProductTree:
+    """Group the blocks of an environment, for points that cannot keep a weight for each of them.
+
+    Args:
+        environment: Resampled, energy kept, if blocks do not divide its size.
+        device: Warp device.
+    """
+    tree = ProductTree()
+    tree.blocks = environment_blocks(environment, device)
+    side = BLOCK_ROWS // GROUP_ROWS
+    power = tree.blocks.block_power.numpy().astype(np.float64)
+    middles = tree.blocks.block_direction.numpy().astype(np.float64)
+    angles = np.arcsin(np.clip(tree.blocks.block_sine.numpy().astype(np.float64), 0.0, 1.0))
+
+    def grouped(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(512, ...) -> (32, 16, ...)."""
+        split = rows.reshape(GROUP_ROWS, side, GROUP_COLUMNS, side, *rows.shape[1:])
+        return np.moveaxis(split, 2, 1).reshape(GROUP_ROWS * GROUP_COLUMNS, side * side, *rows.shape[1:])
+
+    powers, members, radii = grouped(power), grouped(middles), grouped(angles)
+    total = powers.sum(axis=1)
+    weight = np.where(total[:, None] > 0.0, powers, 1.0)
+    middle = (weight[..., None] * members).sum(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    # A block reaches at most its own angle beyond its middle.
+    reach = (np.arccos(np.clip(np.einsum("gmk,gk->gm", members, middle), -1.0, 1.0)) + radii).max(axis=1)
+    tree.groups = upload(np.column_stack([middle, total]).astype(np.float32), wp.vec4, device)
+    tree.group_sine = upload(np.sin(np.minimum(reach, np.pi / 2.0)).astype(np.float32), float, device)
+    return tree
 
 
 def environment_distribution(environment: EnvironmentMap, device: Any) -> EnvironmentDistribution:

@@ -7,19 +7,28 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from beam_warp.devices import upload
 from beam_warp.kernels.lights import DIRECTIONAL, POINT, SPOT, Lights
 from beam_warp.lights import DirectionalLight, Light, PointLight, SpotLight
 
 
-def upload_lights(lights: Sequence[Light], device: Any) -> Lights:
-    """Return the struct that kernels take; an empty one has rows of nothing and a count of 0."""
+def upload_lights(lights: Sequence[Light], device: Any, origin: ArrayLike = (0.0, 0.0, 0.0)) -> Lights:
+    """Return the struct that kernels take; an empty one has rows of nothing and a count of 0.
+
+    Args:
+        lights: Any number of lights.
+        device: A Warp device.
+        origin: World position that the struct's positions are relative to [m].
+    """
     rows = [_row(light) for light in lights] or [_row(PointLight(position=(0, 0, 0), intensity=(0, 0, 0)))]
     kinds, positions, directions, powers, sizes, cones, shadowed = zip(*rows, strict=True)
     arrays = Lights()
     arrays.kinds = upload(np.array(kinds, np.int32), int, device)
-    arrays.positions = upload(np.array(positions, np.float32), wp.vec3, device)
+    arrays.positions = upload(
+        (np.array(positions) - np.asarray(origin, np.float64)).astype(np.float32), wp.vec3, device
+    )
     arrays.directions = upload(np.array(directions, np.float32), wp.vec3, device)
     arrays.powers = upload(np.array(powers, np.float32), wp.vec3, device)
     arrays.sizes = upload(np.array(sizes, np.float32), float, device)

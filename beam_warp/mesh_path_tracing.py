@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from beam_warp.camera_rays import pixel_rays
 from beam_warp.cameras import Camera
 from beam_warp.checks import (
     require_array,
@@ -25,7 +26,6 @@ from beam_warp.ggx import specular_albedo_table
 from beam_warp.kernels.mesh_channels import MeshChannels, launch_trace_channels
 from beam_warp.kernels.mesh_path import launch_trace_outgoing, launch_trace_pixels
 from beam_warp.kernels.mesh_surface import MeshSurface
-from beam_warp.kernels.pixel_sampling import PixelRays
 from beam_warp.material_mesh import MaterialMesh
 
 MOST_SAMPLES = 2**20
@@ -134,7 +134,7 @@ def trace_radiance(
         mesh.surface,
         environment_distribution(environment, mesh.device),
         upload(specular_albedo_table(), wp.vec2, mesh.device),
-        _pixel_rays(camera),
+        pixel_rays(camera),
         seed,
         sample_count,
         bounce_count,
@@ -176,7 +176,7 @@ def trace_channels(
     for name, dtype in (("base_color", wp.vec3), ("roughness", float), ("normal", wp.vec3), ("depth", float)):
         setattr(channels, name, wp.zeros(pixels, dtype=dtype, device=mesh.device))
     channels.ambient_occlusion = wp.zeros(pixels, dtype=float, device=mesh.device)
-    launch_trace_channels(mesh.surface, _pixel_rays(camera), seed, sample_count, visibility_count, channels)
+    launch_trace_channels(mesh.surface, pixel_rays(camera), seed, sample_count, visibility_count, channels)
     shape = (camera.height, camera.width)
     return TracedChannels(
         base_color=channels.base_color.numpy().reshape(*shape, 3),
@@ -245,14 +245,3 @@ def outgoing_radiance(
         out,
     )
     return out.numpy()
-
-
-def _pixel_rays(camera: Camera) -> PixelRays:
-    """Describe a camera to the kernels."""
-    rays = PixelRays()
-    rays.origin = wp.vec3(*camera.position)
-    rays.camera_to_world = wp.mat33(camera.camera_to_world[:3, :3].astype(np.float32))
-    rays.focal = wp.vec2(camera.focal_x, camera.focal_y)
-    rays.center = wp.vec2(camera.center_x, camera.center_y)
-    rays.width = camera.width
-    return rays

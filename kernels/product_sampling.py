@@ -85,6 +85,36 @@ def accumulate_block_weights_kernel(
 
 
 @wp.func
+def direction_in_block(blocks: EnvironmentBlocks, block: int, u: float, v: float) -> EnvironmentSample:
+    """A direction drawn in a block by its texels' power, and its density within the block."""
+    sample = EnvironmentSample()
+    height = blocks.radiance.shape[0]
+    width = blocks.radiance.shape[1]
+    rows = height / BLOCK_ROWS
+    columns = width / BLOCK_COLUMNS
+    row = first_above(blocks.row_cdf, block, 0, rows, u)
+    u_texel = remap(u, entry_before(blocks.row_cdf, block, 0, row), blocks.row_cdf[block, row])
+    y = block / BLOCK_COLUMNS * rows + row
+    begin = block % BLOCK_COLUMNS * columns
+    column = first_above(blocks.column_cdf, y, begin, columns, v)
+    v_texel = remap(v, entry_before(blocks.column_cdf, y, begin, column), blocks.column_cdf[y, begin + column])
+    x = begin + column
+    luminance = blocks.luminance[y, x]
+    if not (luminance > 0.0):
+        return sample
+
+    upper = wp.cos(float(y) / float(height) * PI)
+    lower = wp.cos(float(y + 1) / float(height) * PI)
+    z = upper + (lower - upper) * u_texel
+    radius = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    phi = (0.5 - (float(x) + v_texel) / float(width)) * 2.0 * PI
+    sample.direction = wp.vec3(radius * wp.cos(phi), radius * wp.sin(phi), z)
+    sample.radiance = blocks.radiance[y, x]
+    sample.pdf = luminance / blocks.block_power[block]
+    return sample
+
+
+@wp.func
 def square_to_product(
     blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, u: float, v: float
 ) -> EnvironmentSample:
@@ -93,11 +123,6 @@ def square_to_product(
     total = cumulative[point, BLOCK_COUNT - 1]
     if not (total > 0.0):
         return sample
-    height = blocks.radiance.shape[0]
-    width = blocks.radiance.shape[1]
-    rows = height / BLOCK_ROWS
-    columns = width / BLOCK_COLUMNS
-
     # Block row: the cumulative weight at the end of each row of blocks; then the block within the row.
     target = u * total
     low = int(0)
@@ -121,27 +146,9 @@ def square_to_product(
     if not (block_end > block_begin):
         return sample  # rounding put the target on an empty block
 
-    # Texel row and column within the block, then the direction within the texel.
-    row = first_above(blocks.row_cdf, block, 0, rows, u_row)
-    u_texel = remap(u_row, entry_before(blocks.row_cdf, block, 0, row), blocks.row_cdf[block, row])
-    y = block_row * rows + row
-    begin = block_column * columns
-    column = first_above(blocks.column_cdf, y, begin, columns, v_column)
-    v_texel = remap(v_column, entry_before(blocks.column_cdf, y, begin, column), blocks.column_cdf[y, begin + column])
-    x = begin + column
-    luminance = blocks.luminance[y, x]
-    if not (luminance > 0.0):
-        return sample
-
-    upper = wp.cos(float(y) / float(height) * PI)
-    lower = wp.cos(float(y + 1) / float(height) * PI)
-    z = upper + (lower - upper) * u_texel
-    radius = wp.sqrt(wp.max(1.0 - z * z, 0.0))
-    phi = (0.5 - (float(x) + v_texel) / float(width)) * 2.0 * PI
-    sample.direction = wp.vec3(radius * wp.cos(phi), radius * wp.sin(phi), z)
+    sample = direction_in_block(blocks, block, u_row, v_column)
     # pdf = P(block) luminance / block_power: solid angles cancel.
-    sample.radiance = blocks.radiance[y, x]
-    sample.pdf = (block_end - block_begin) / total * (luminance / blocks.block_power[block])
+    sample.pdf = (block_end - block_begin) / total * sample.pdf
     return sample
 
 

@@ -133,6 +133,8 @@ RANKS = {
     "beam_warp.demo_figure": 5,
     "beam_warp.demo_environments": 5,
     "beam_warp.mesh_path_tracing": 6,
+    "beam_warp.camera_rays": 4,
+    "beam_warp.path_rendering": 9,
     "beam_warp.demo_gaussians": 7,
     "beam_warp.demo_capture": 8,
     "beam_warp.stress_captures": 9,
