@@ -3,8 +3,8 @@
 A camera's ray meets Gaussians in the order of their largest response. Hits that follow each other without a gap are one
 layer of a surface; the layer that stops the ray is drawn with the probability that blending gives it, and it scatters
 as one surface: the mean normal, material and place of its hits. A layer that faces away is drawn where those before it
-leak; the one before it that faces the camera then takes its place. Rays from surfaces are stopped by one Gaussian, drawn
-with the same probability: what they see is averaged over many of them anyway.
+leak; the one before it that faces the camera then takes its place. Rays from surfaces are stopped by one Gaussian,
+drawn with the same probability: what they see is averaged over many of them anyway.
 """
 
 from typing import Any
