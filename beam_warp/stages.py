@@ -186,7 +186,11 @@ class Stage:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed and what could not be done so far, each once; more may come as frames are read."""
-        said = [*self.given_notes, *(note for asset in self.assets for note in asset.notes)]
+        said = [
+            *self.given_notes,
+            *getattr(self.camera, "notes", ()),
+            *(note for asset in self.assets for note in asset.notes),
+        ]
         stated = {json.dumps(_raster(asset), sort_keys=True): asset.name for asset in self.assets}
         if len(stated) > 1:
             said.append(
