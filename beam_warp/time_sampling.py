@@ -104,26 +104,23 @@ class TimeSampler:
     def at_moment(self, moment: Moment) -> GaussianCloud:
         """Return the cloud at a place that `moment` found."""
         if moment.frame == moment.following:
-            return self._read(moment.frame)
+            return self._read(moment.frame)[0]
         if self.blend == "nearest":
-            return self._read(moment.nearest)
-        first, second = self._read(moment.frame), self._read(moment.following)
+            return self._read(moment.nearest)[0]
+        first, second = self._read(moment.frame, moment.following)
         reason = self._hindrance(first, second)
         if reason:
             self._notes.setdefault(f"{reason}: the nearer frame is shown between frames")
             return first if moment.nearest == moment.frame else second
         return blend_clouds(first, second, moment.fraction)
 
-    def _read(self, frame: int) -> GaussianCloud:
-        """Return a frame, kept or read."""
-        held = self._held
-        for number, cloud in held:
-            if number == frame:
-                self._held = ((number, cloud), *(entry for entry in held if entry[0] != number))
-                return cloud
-        cloud = self.sequence[frame]
-        self._held = ((frame, cloud), *held[:1])
-        return cloud
+    def _read(self, *frames: int) -> list[GaussianCloud]:
+        """Return one or two frames, kept or read; they are the ones kept then, one of them with the newer of before."""
+        held = dict(self._held)
+        found = {frame: held[frame] if frame in held else self.sequence[frame] for frame in frames}
+        others = [entry for entry in self._held if entry[0] not in found]
+        self._held = (*found.items(), *others)[:2]
+        return list(found.values())
 
     def _hindrance(self, first: GaussianCloud, second: GaussianCloud) -> str:
         """Say why two frames cannot be blended; nothing if they can."""
@@ -180,8 +177,8 @@ def _blend(name: str, start: NDArray[Any], end: NDArray[Any], share: float) -> N
 
 
 def _between_logarithms(start: NDArray[Any], end: NDArray[Any], share: float) -> NDArray[Any]:
-    """Return geometric means; beside a 0, whose logarithm is none, arithmetic ones."""
-    flat = (start <= 0.0) | (end <= 0.0)
+    """Return geometric means; arithmetic ones beside a 0, whose logarithm is none, and of equals, which stay."""
+    flat = (start <= 0.0) | (end <= 0.0) | (start == end)
     first, second = np.where(flat, 1.0, start).astype(np.float64), np.where(flat, 1.0, end).astype(np.float64)
     geometric = np.exp((1.0 - share) * np.log(first) + share * np.log(second))
     return np.where(flat, start + np.float32(share) * (end - start), geometric).astype(np.float32)

@@ -1,8 +1,8 @@
 """Cameras of USD stages, over time, in the internal world.
 
-USD cameras look along -z with y up, and see through an aperture in tenths of the stage's unit, as their focal length is:
-only ratios matter. Where an image has another shape than the aperture, nothing of the aperture is cut off: the image
-sees more above and below, or at its sides (USD's aspect-ratio policy ``expandAperture``).
+USD cameras look along -z with y up, and see through an aperture in tenths of the stage's unit, as their focal length
+is: only ratios matter. Where an image has another shape than the aperture, nothing of the aperture is cut off: the
+image sees more above and below, or at its sides (USD's aspect-ratio policy ``expandAperture``).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from beam_warp.axes import axes_matrix
 from beam_warp.cameras import Camera
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidOptionError
+from beam_warp.schema import register
 from beam_warp.schema.dependencies import layer_files
 from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.placement import placement_of
@@ -169,6 +170,7 @@ def read_usd_camera(path: Path, *, prim_path: str | None = None, trusted: bool =
     source = require_asset_file(path)
     if not trusted:
         require_opens(source)
+    register()
     try:
         stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
         every: Any = Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
