@@ -20,9 +20,10 @@ from beam_warp.camera_paths import (
     read_camera_path,
 )
 from beam_warp.cameras import Camera
+from beam_warp.checks import require_number
 from beam_warp.converters.numbering import numbered_files
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import AssetFormatError, InvalidOptionError, SchemaVersionError
+from beam_warp.errors import AssetFormatError, SchemaVersionError
 from beam_warp.json_fields import Fields, placed, read_json, shown
 from beam_warp.lights import Light, lights_from_json, read_lights
 from beam_warp.schema.placement import Placement
@@ -69,18 +70,18 @@ def stage_contents(document: Any, folder: Path, name: str = "stage") -> dict[str
     fields = Fields(document, where, known)
     if document.get(KEY) != VERSION or isinstance(document.get(KEY), bool):
         raise fields.error(KEY, str(VERSION), "State the version of the format there.")
-    assets = tuple(_asset(entry, f"{where} assets[{i}]", folder) for i, entry in enumerate(fields.items("assets")))
-    meshes = [_mesh(entry, f"{where} meshes[{i}]", folder) for i, entry in enumerate(fields.items("meshes"))]
-    return {
-        "assets": assets,
-        "meshes": tuple(mesh for mesh, _ in meshes),
-        "lights": _lights(fields, folder),
-        "environment": _environment(fields.value("environment"), f"{where} environment", folder),
-        "camera": _camera(fields.value("camera"), f"{where} camera", folder),
+    contents: dict[str, Any] = {
         "fps": fields.number("fps") if "fps" in fields else None,
         "duration": fields.number("duration") if "duration" in fields else None,
-        "given_notes": tuple(note for _, notes in meshes for note in notes),
+        "lights": _lights(fields, folder),
+        "camera": _camera(fields.value("camera"), f"{where} camera", folder),
+        "environment": _environment(fields.value("environment"), f"{where} environment", folder),
     }
+    meshes = [_mesh(entry, f"{where} meshes[{i}]", folder) for i, entry in enumerate(fields.items("meshes"))]
+    contents["meshes"] = tuple(mesh for mesh, _ in meshes)
+    contents["given_notes"] = tuple(note for _, notes in meshes for note in notes)
+    listed = enumerate(fields.items("assets"))  # last, since they are what takes time
+    return contents | {"assets": tuple(_asset(entry, f"{where} assets[{i}]", folder) for i, entry in listed)}
 
 
 def read_stage_asset(
@@ -165,9 +166,7 @@ def _mesh(record: Any, where: str, folder: Path) -> tuple[ShotMesh | Ground, tup
         angles = require_rotation("rotate", place.get("rotate", 0.0))
         turn = Rotation.from_euler("xyz", (0.0, 0.0, angles) if isinstance(angles, float) else angles, degrees=True)
         shift = np.array(require_vector("translate", place.get("translate", (0.0, 0.0, 0.0))))
-        scale = place.get("scale", 1.0)
-        if not 1e-6 <= scale <= 1e6:
-            raise InvalidOptionError(f"scale must be a number in [1e-06, 1e+06], got {scale}. Choose one in range.")
+        scale = require_number("scale", place.get("scale", 1.0), 1e-6, 1e6)
         return read_stage_mesh(path, placement=Placement(scale, turn.as_matrix(), shift), **options)
 
 
@@ -216,7 +215,7 @@ def _environment(record: Any, where: str, folder: Path) -> StageEnvironment | No
         else:
             light = EnvironmentMap.constant(fields.numbers("radiance", 3))
         if "exposure" in fields:
-            light = light.exposed(fields.number("exposure"))
+            light = light.exposed(require_number("exposure", fields.number("exposure"), -64.0, 64.0))
         return StageEnvironment(map=light, **rates)
 
 
