@@ -36,8 +36,9 @@ def matrix_of(quaternion: ArrayLike) -> NDArray[np.float64]:
 
 def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Hamilton product of one quaternion ``(4,)`` with many ``(N, 4)``: their rotations, then its."""
-    vector = left[3] * right[:, :3] + right[:, 3:] * left[:3] + np.cross(left[:3], right[:, :3])
-    return np.column_stack([vector, left[3] * right[:, 3] - right[:, :3] @ left[:3]])
+    x, y, z, w = left
+    matrix = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+    return right @ matrix.T
 
 
 def slerp(first: ArrayLike, second: ArrayLike, fraction: float) -> NDArray[np.float64]:
@@ -57,11 +58,15 @@ def slerp(first: ArrayLike, second: ArrayLike, fraction: float) -> NDArray[np.fl
     Source: Shoemake 1985. The angle comes from the arctangent of chords, which keeps its digits where cosines are flat.
     """
     start, end = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    end = np.where(np.einsum("ij,ij->i", start, end)[:, None] < 0.0, -end, end)
-    chord, opposite = np.linalg.norm(end - start, axis=1), np.linalg.norm(end + start, axis=1)
-    turns = 2.0 * np.arctan2(chord, opposite) / np.pi  # at most 1/2, so that the sine below is zero only with its angle
-    whole = np.sinc(turns)
-    near = (1.0 - fraction) * np.sinc((1.0 - fraction) * turns) / whole
-    far = fraction * np.sinc(fraction * turns) / whole
+    end = end * np.where(np.einsum("ij,ij->i", start, end) < 0.0, -1.0, 1.0)[:, None]
+    chord, opposite = end - start, end + start
+    angle = 2.0 * np.arctan2(_lengths(chord), _lengths(opposite))
+    angle = np.maximum(angle, 1e-8)  # below, the weights are those of a line to all digits
+    near, far = np.sin((1.0 - fraction) * angle), np.sin(fraction * angle)
     turned = near[:, None] * start + far[:, None] * end
-    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    return turned / _lengths(turned)[:, None]
+
+
+def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths of vectors ``(N, 4)``."""
+    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
