@@ -37,10 +37,26 @@ KEY = "beam-stage"
 
 VERSION = 1
 
-_ASSET_FIELDS = ("translate", "rotate", "scale", "on_ground", "centered", "start", "speed", "loop", "blend")
-_GROUND_FIELDS = tuple(field.name for field in fields_of(Ground))
-_MESH_FIELDS = ("translate", "rotate", "scale", "base_color", "roughness", "catches_shadows", "smooth")
-_ORBIT_FIELDS = tuple(field.name for field in fields_of(OrbitPath) if field.name != "subject")
+FIELDS = ("fps", "duration", "assets", "meshes", "lights", "environment", "camera")
+
+_PLACE = ("translate", "rotate", "scale")
+
+ASSET_FIELDS = (
+    *("path", "name", "source_axes", "drop_invalid", *_PLACE),
+    *("on_ground", "centered", "start", "speed", "loop", "blend"),
+)
+
+MESH_FIELDS = ("path", *_PLACE, "base_color", "roughness", "catches_shadows", "smooth")
+
+GROUND_FIELDS = ("ground", *(field.name for field in fields_of(Ground)))
+
+ENVIRONMENT_FIELDS = ("path", "radiance", "rotate", "degrees_per_second", "exposure")
+
+FIXED_FIELDS = ("type", "position", "target", "camera_to_world", "fov")
+
+ORBIT_FIELDS = ("type", *(field.name for field in fields_of(OrbitPath) if field.name != "subject"))
+
+FILE_FIELDS = ("type", "path", "prim")
 
 
 def read_stage_file(path: Path) -> dict[str, Any]:
@@ -62,12 +78,11 @@ def stage_contents(document: Any, folder: Path, name: str = "stage") -> dict[str
         MissingFileError: A file is not there.
     """
     where = f"{name}:"
-    known = (KEY, "fps", "duration", "assets", "meshes", "lights", "environment", "camera")
     if isinstance(document, dict):
         version = document.get(KEY)
         if isinstance(version, int) and not isinstance(version, bool) and version > VERSION:
             raise SchemaVersionError(f"{where} {KEY} must be {VERSION}, got {version}. Upgrade beam-warp.")
-    fields = Fields(document, where, known)
+    fields = Fields(document, where, (KEY, *FIELDS))
     if document.get(KEY) != VERSION or isinstance(document.get(KEY), bool):
         raise fields.error(KEY, str(VERSION), "State the version of the format there.")
     contents: dict[str, Any] = {
@@ -116,8 +131,7 @@ def source_files(path: Path) -> list[Path]:
 
 def _asset(record: Any, where: str, folder: Path) -> StageAsset:
     """Return one asset of JSON; a text alone is its path."""
-    known = ("path", "name", "source_axes", "drop_invalid", *_ASSET_FIELDS)
-    fields = Fields({"path": record} if isinstance(record, str) else record, where, known)
+    fields = Fields({"path": record} if isinstance(record, str) else record, where, ASSET_FIELDS)
     path = fields.path("path", folder, folders=True)
     options: dict[str, Any] = _placing(fields)
     for name in ("start", "speed"):
@@ -150,8 +164,7 @@ def _mesh(record: Any, where: str, folder: Path) -> tuple[ShotMesh | Ground, tup
     """Return one mesh of JSON, or the ground; a text alone is its path."""
     if isinstance(record, dict) and "ground" in record:
         return _ground(record, where), ()
-    known = ("path", *_MESH_FIELDS)
-    fields = Fields({"path": record} if isinstance(record, str) else record, where, known)
+    fields = Fields({"path": record} if isinstance(record, str) else record, where, MESH_FIELDS)
     path = fields.path("path", folder)
     options: dict[str, Any] = {}
     if "base_color" in fields:
@@ -172,7 +185,7 @@ def _mesh(record: Any, where: str, folder: Path) -> tuple[ShotMesh | Ground, tup
 
 def _ground(record: dict[str, Any], where: str) -> Ground:
     """Return the ground of JSON."""
-    fields = Fields(record, where, ("ground", *_GROUND_FIELDS))
+    fields = Fields(record, where, GROUND_FIELDS)
     if fields.flag("ground") is not True:
         raise fields.error("ground", "true", "Leave the whole object out for no ground.")
     given: dict[str, Any] = {}
@@ -202,8 +215,7 @@ def _environment(record: Any, where: str, folder: Path) -> StageEnvironment | No
     """Return distant light of JSON; a text alone is its path."""
     if record is None:
         return None
-    known = ("path", "radiance", "rotate", "degrees_per_second", "exposure")
-    fields = Fields({"path": record} if isinstance(record, str) else record, where, known)
+    fields = Fields({"path": record} if isinstance(record, str) else record, where, ENVIRONMENT_FIELDS)
     if ("path" in fields) == ("radiance" in fields):
         raise AssetFormatError(
             f"{where} must have a path or a radiance, got {'both' if 'path' in fields else 'neither'}. Give one."
@@ -232,18 +244,20 @@ def _camera(record: Any, where: str, folder: Path) -> CameraPath | None:
     if kind == "keyframes":
         return keyframe_path(record, where)
     if kind == "file":
-        fields = Fields(record, where, ("type", "path", "prim"))
+        fields = Fields(record, where, FILE_FIELDS)
         prim = fields.text("prim") if "prim" in fields else None
         path = fields.path("path", folder)
         with fields.placed():
             return read_camera_path(path, prim_path=prim)
     if kind == "orbit":
-        fields = Fields(record, where, ("type", *_ORBIT_FIELDS))
+        fields = Fields(record, where, ORBIT_FIELDS)
         given: dict[str, Any] = {"center": fields.numbers("center", 3)} if "center" in fields else {}
-        given |= {name: fields.number(name) for name in _ORBIT_FIELDS if name != "center" and name in fields}
+        given |= {
+            name: fields.number(name) for name in ORBIT_FIELDS if name not in ("type", "center") and name in fields
+        }
         with fields.placed():
             return OrbitPath(**given)
-    fields = Fields(record, where, ("type", "position", "target", "camera_to_world", "fov"))
+    fields = Fields(record, where, FIXED_FIELDS)
     keyframe = {name: fields.value(name) for name in ("position", "target", "camera_to_world") if name in fields}
     fov = fields.number("fov") if "fov" in fields else DEFAULT_FOV
     with fields.placed():

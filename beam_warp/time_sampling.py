@@ -155,7 +155,7 @@ def blend_clouds(first: GaussianCloud, second: GaussianCloud, fraction: float) -
     changes = {
         name: _blend(name, array, ends[name], share)
         for name, array in first.arrays().items()
-        if not _is_same(array, ends[name])
+        if not (_is_same(array, ends[name]) or np.array_equal(array, ends[name]))
     }
     return first.with_arrays(**changes) if changes else first
 
