@@ -44,14 +44,14 @@ class CaptureDigests:
         fresh = {str(path): [*stamp, digest] for path, (stamp, digest) in found.items() if stamp is not None}
         if fresh != known:
             _remember(memory, fresh)
-        described = [
+        content = [
             described(
                 {name: value for name, value in fields_of(record) if name not in UNREAD_FIELDS},
                 lambda path: [path.suffix.lower(), found[path][1]],
             )
             for record in records
         ]
-        return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=16).hexdigest()
+        return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def files_of(record: CaptureRecord) -> list[Path]:

@@ -61,7 +61,7 @@ class StageAsset:
         speed: How fast it plays; 2 is twice as fast.
         loop: Start again after the last frame, and play before ``start`` as well; else the end frames are held.
         blend: Which frames are blended at times between them; see `TimeSampler`.
-        files: What the sequence is read from, if it is from files: one for each frame, or all for every frame.
+        files: What the sequence is read from, if it is from files: those of every frame, or once for all frames.
 
     Raises:
         InvalidArrayError: The translation or rotation is not 3 finite numbers.
@@ -79,7 +79,7 @@ class StageAsset:
     speed: float = 1.0
     loop: bool = False
     blend: Blend = "identified"
-    files: tuple[Path, ...] = ()
+    files: tuple[tuple[Path, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Check every field, and that there is something to light."""
@@ -122,6 +122,10 @@ class StageAsset:
         cloud = self._sampler.at_moment(moment)
         self.__dict__["_held"] = (moment, cloud)
         return cloud
+
+    def files_of(self, frame: int) -> tuple[Path, ...]:
+        """Return the files that a frame is read from; none if it is in memory."""
+        return self.files[min(frame, len(self.files) - 1)] if self.files else ()
 
     @cached_property
     def subject(self) -> NDArray[np.float64]:

@@ -37,6 +37,12 @@ KEY = "beam-stage"
 
 VERSION = 1
 
+RATES = (1e-3, 1e6)
+"""Images a second that a stage may have."""
+
+DURATIONS = (1e-6, 1e9)
+"""Seconds that a stage may last."""
+
 FIELDS = ("fps", "duration", "assets", "meshes", "lights", "environment", "camera")
 
 _PLACE = ("translate", "rotate", "scale")
@@ -85,9 +91,11 @@ def stage_contents(document: Any, folder: Path, name: str = "stage") -> dict[str
     fields = Fields(document, where, (KEY, *FIELDS))
     if document.get(KEY) != VERSION or isinstance(document.get(KEY), bool):
         raise fields.error(KEY, str(VERSION), "State the version of the format there.")
-    contents: dict[str, Any] = {
-        "fps": fields.number("fps") if "fps" in fields else None,
-        "duration": fields.number("duration") if "duration" in fields else None,
+    contents: dict[str, Any] = {}
+    with fields.placed():
+        for name, (low, high) in (("fps", RATES), ("duration", DURATIONS)):
+            contents[name] = require_number(name, fields.number(name), low, high) if name in fields else None
+    contents |= {
         "lights": _lights(fields, folder),
         "camera": _camera(fields.value("camera"), f"{where} camera", folder),
         "environment": _environment(fields.value("environment"), f"{where} environment", folder),
@@ -115,18 +123,18 @@ def read_stage_asset(
         BeamError: It cannot be read, or is not relightable.
     """
     sequence = converters.read(path, source_axes=source_axes, drop_invalid=drop_invalid)
-    return StageAsset(sequence=sequence, name=name or path.name, files=tuple(source_files(path)), **place)
+    return StageAsset(sequence=sequence, name=name or path.name, files=source_files(path), **place)
 
 
-def source_files(path: Path) -> list[Path]:
-    """Return the files that decide what is read from a path: numbered ones, or all layers of a USD stage."""
+def source_files(path: Path) -> tuple[tuple[Path, ...], ...]:
+    """Return the files that decide each frame of an asset: numbered ones, or once the layers of a USD stage."""
     if path.is_dir():
-        return numbered_files(path)
+        return tuple((file,) for file in numbered_files(path))
     if path.suffix.lower() in USD_SUFFIXES:
         from beam_warp.schema.dependencies import layer_files  # brings OpenUSD along
 
-        return layer_files(path)
-    return [path]
+        return (tuple(layer_files(path)),)
+    return ((path,),)
 
 
 def _asset(record: Any, where: str, folder: Path) -> StageAsset:

@@ -23,7 +23,7 @@ from beam_warp.lights import Light, lights_to_json
 from beam_warp.shots import Shot, ShotMesh
 from beam_warp.stage_assets import StageAsset, joined
 from beam_warp.stage_environments import StageEnvironment
-from beam_warp.stage_files import read_stage_asset, read_stage_file
+from beam_warp.stage_files import DURATIONS, RATES, read_stage_asset, read_stage_file
 from beam_warp.stage_meshes import Ground, joined_meshes
 
 DEFAULT_RATE = 30.0
@@ -69,9 +69,9 @@ class Stage:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         moving = [asset for asset in self.assets if len(asset.sequence) > 1]
         rate = moving[0].sequence.frames_per_second if moving else DEFAULT_RATE
-        object.__setattr__(self, "fps", require_number("fps", rate if self.fps is None else self.fps, 1e-3, 1e6))
+        object.__setattr__(self, "fps", require_number("fps", rate if self.fps is None else self.fps, *RATES))
         length = self._natural_duration(moving) if self.duration is None else self.duration
-        object.__setattr__(self, "duration", require_number("duration", length, 1e-6, 1e9))
+        object.__setattr__(self, "duration", require_number("duration", length, *DURATIONS))
         camera = OrbitPath() if self.camera is None else self.camera
         if isinstance(camera, OrbitPath):
             camera = camera.lasting(self.seconds)
@@ -320,9 +320,8 @@ class Stage:
                 array_digest(*(array for _, array in sorted(cloud.arrays().items())))
                 for cloud in (asset.sequence[frame] for frame in frames)
             ]
-        if len(asset.files) == len(asset.sequence):
-            return [self._file_digest(asset.files[frame]) for frame in frames]
-        return [self._file_digest(file) for file in asset.files]
+        files = dict.fromkeys(file for frame in frames for file in asset.files_of(frame))
+        return [self._file_digest(file) for file in files]
 
     def _file_digest(self, path: Path) -> str:
         """Return the digest of a file's content."""

@@ -490,12 +490,18 @@ class TestDigest:
     def test_layers_of_a_usd_asset_count(self, tmp_path):
         converters.write(moving(2, axes="rub"), tmp_path / "a.usda")
         scene = Stage.of([tmp_path / "a.usda"], camera=STILL)
-        before = scene.digest()
+        before = scene.digest(), scene.digest(0.1)
         layer = tmp_path / "a.frames.usdc"
         data = bytearray(layer.read_bytes())
         data[-1] ^= 1
         layer.write_bytes(data)
-        assert scene.digest() != before
+        assert scene.digest() != before[0]
+        assert scene.digest(0.1) != before[1]
+        layer.write_bytes(bytes(data[:-1]) + bytes([data[-1] ^ 1]))
+        assert (scene.digest(), scene.digest(0.1)) == before
+        root = tmp_path / "a.usda"
+        root.write_text(root.read_text() + "# seen\n")
+        assert scene.digest(0.1) != before[1]
 
     def test_a_file_that_is_gone(self, folder):
         scene = read(folder, FULL)
@@ -526,6 +532,8 @@ class TestMistakes:
             (("beam-stage",), True, "stage.json: beam-stage must be 1, got true."),
             (("asets",), [], "stage.json: must have no field but beam-stage, fps, duration, assets,"),
             (("fps",), "30", "stage.json: fps must be a finite number, got '30'. Write one."),
+            (("fps",), -3, "stage.json: fps must be a number in [0.001, 1e+06], got -3.0."),
+            (("duration",), 0, "stage.json: duration must be a number in [1e-06, 1e+09], got 0.0."),
             (("duration",), [1], "stage.json: duration must be a finite number, got [1]."),
             (("assets",), {}, "stage.json: assets must be a list, got {}. Put it in [ ]."),
             (("assets", 1), 5, "stage.json: assets[1] must be an object, got 5. Write it in { }."),
