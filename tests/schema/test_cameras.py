@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.cameras import Camera
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+from beam_warp.schema import register
 from beam_warp.schema.cameras import read_usd_camera
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -16,6 +17,7 @@ LENS = {"focalLength": 50.0, "horizontalAperture": 36.0, "verticalAperture": 24.
 
 def author(path, *, up="Y", meters=0.01, prims=("/World/Camera",), rate=24.0, times=None, **lens):
     """A stage with cameras that have the attributes given by name; dicts are time samples."""
+    register()  # before OpenUSD loads its schemas: other tests of this process need ours
     stage = Usd.Stage.CreateNew(str(path))
     if up:
         UsdGeom.SetStageUpAxis(stage, up)
