@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from beam_warp.reconstruction_steps import FitAndTrack as FitAndTrack
     from beam_warp.scene import Scene as Scene
     from beam_warp.schema.validator import validate as validate
+    from beam_warp.stages import Stage as Stage
     from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
     from beam_warp.surfaces import estimate_normals as estimate_normals
     from beam_warp.tracing import visibility as visibility
@@ -92,6 +93,7 @@ _HOMES = {
     "RunResult": "pipeline",
     "Scene": "scene",
     "SsimLoss": "image_losses",
+    "Stage": "stages",
     "SurfaceHits": "surface_tracing",
     "SurfaceNormals": "surfaces",
     "TraceOptions": "tracing",

@@ -7,7 +7,8 @@ and USD with z up, ``ruf`` Unity (left-handed) and ``fru`` Unreal (left-handed).
 
 from __future__ import annotations
 
-from itertools import permutations, product
+from itertools import permutations
+from itertools import product as cartesian
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from beam_warp.assets import GaussianCloud
 from beam_warp.checks import require_number
 from beam_warp.errors import InvalidOptionError
+from beam_warp.quaternions import product, quaternion_of
 from beam_warp.spherical_harmonics import sh_transform
 
 _DIRECTIONS = {
@@ -28,7 +30,7 @@ _DIRECTIONS = {
 }
 """Each letter's direction in the reference frame (right, up, forward), which is itself left-handed."""
 
-AXIS_CODES = tuple("".join(code) for pairs in permutations(("rl", "ud", "fb")) for code in product(*pairs))
+AXIS_CODES = tuple("".join(code) for pairs in permutations(("rl", "ud", "fb")) for code in cartesian(*pairs))
 """All 48 codes."""
 
 TARGETS = {"usd": ("rub", 1.0), "unity": ("ruf", 1.0), "unreal": ("fru", 100.0)}
@@ -81,28 +83,6 @@ def _flip_and_rotation(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     return flip, flip[:, None] * matrix
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit quaternion xyzw of a proper rotation, by its largest component (Shepperd 1978)."""
-    trace = np.trace(rotation)
-    squares = np.append(1.0 + 2.0 * np.diag(rotation) - trace, 1.0 + trace)  # four times the squared components
-    largest = int(np.argmax(squares))
-    quaternion = np.empty(4)
-    if largest == 3:
-        quaternion[:3] = [rotation[i - 1, i - 2] - rotation[i - 2, i - 1] for i in range(3)]
-    else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        quaternion[j], quaternion[k] = rotation[i, j] + rotation[j, i], rotation[i, k] + rotation[k, i]
-        quaternion[3] = rotation[k, j] - rotation[j, k]
-    quaternion[largest] = squares[largest]
-    return quaternion / np.linalg.norm(quaternion)
-
-
-def _multiply(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Hamilton product of one quaternion with many, xyzw."""
-    vector = left[3] * right[:, :3] + right[:, 3:] * left[:3] + np.cross(left[:3], right[:, :3])
-    return np.column_stack([vector, left[3] * right[:, 3] - right[:, :3] @ left[:3]])
-
-
 def change_axes(cloud: GaussianCloud, target: str, *, scale: float = 1.0) -> GaussianCloud:
     """Express a cloud in other axes, and in other units if a consumer wants them.
 
@@ -135,7 +115,7 @@ def change_axes(cloud: GaussianCloud, target: str, *, scale: float = 1.0) -> Gau
     }
     if target != cloud.axes:
         flip, rotation = _flip_and_rotation(matrix)
-        orientations = _multiply(_quaternion(rotation), cloud.orientations.astype(np.float64))
+        orientations = product(quaternion_of(rotation), cloud.orientations.astype(np.float64))
         orientations[:, :3] *= np.prod(flip) * flip
         changes["orientations"] = orientations.astype(np.float32)
         if cloud.normals is not None:

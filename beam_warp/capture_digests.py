@@ -3,33 +3,25 @@
 A digest covers everything that a record states (camera, lens, names) and the *content* of its files, so a capture may
 be moved or copied. Reading gigabytes again to learn that nothing has changed would be slow; so, as version control
 does, the content is read again only when a file's path, size, times or inode are others than when it was last read.
-A file that changed less than `RACE_SECONDS` before it was read could change once more without showing, and is never
-remembered.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import os
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from beam_warp.captures import CaptureRecord
 from beam_warp.errors import MissingFileError
+from beam_warp.file_digests import content_digest, described, fields_of
 
 UNREAD_FIELDS = frozenset({"truth_path", "relit_paths"})
 """Fields of a record that reconstruction never reads."""
-
-RACE_SECONDS = 2.0
-"""Coarsest time step of usual file systems (FAT)."""
 
 
 class CaptureDigests:
@@ -48,23 +40,23 @@ class CaptureDigests:
         memory = self._folder / f"frame_{frame:06d}.json"
         known = _remembered(memory)
         paths = sorted({path for record in records for path in files_of(record)})
-        found = dict(zip(paths, pool.map(lambda path: _file_digest(path, known), paths), strict=True))
+        found = dict(zip(paths, pool.map(lambda path: content_digest(path, known), paths), strict=True))
         fresh = {str(path): [*stamp, digest] for path, (stamp, digest) in found.items() if stamp is not None}
         if fresh != known:
             _remember(memory, fresh)
-        described = [
-            _described(
-                {name: value for name, value in _fields(record) if name not in UNREAD_FIELDS},
+        content = [
+            described(
+                {name: value for name, value in fields_of(record) if name not in UNREAD_FIELDS},
                 lambda path: [path.suffix.lower(), found[path][1]],
             )
             for record in records
         ]
-        return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=16).hexdigest()
+        return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def files_of(record: CaptureRecord) -> list[Path]:
     """Return the files of a record that reconstruction reads."""
-    return [value for name, value in _fields(record) if isinstance(value, Path) and name not in UNREAD_FIELDS]
+    return [value for name, value in fields_of(record) if isinstance(value, Path) and name not in UNREAD_FIELDS]
 
 
 def require_files(records: Iterable[CaptureRecord]) -> None:
@@ -79,44 +71,6 @@ def require_files(records: Iterable[CaptureRecord]) -> None:
             f"images of the capture must exist, got none at {missing[0]} ({len(missing)} missing in all). "
             "Restore them, or leave their records out."
         )
-
-
-def _fields(record: Any) -> list[tuple[str, Any]]:
-    return [(field.name, getattr(record, field.name)) for field in dataclasses.fields(record)]
-
-
-def _described(value: Any, describe_file: Callable[[Path], Any]) -> Any:
-    """Return a value as JSON-able data, exactly; a type that is not known here is an error, never left out."""
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    if isinstance(value, Path):
-        return describe_file(value)
-    if isinstance(value, np.ndarray):
-        return [str(value.dtype), value.tolist()]
-    if dataclasses.is_dataclass(value):
-        return {name: _described(item, describe_file) for name, item in _fields(value)}
-    if isinstance(value, Mapping):
-        return {str(name): _described(item, describe_file) for name, item in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_described(item, describe_file) for item in value]
-    raise TypeError(f"a record's field must be plain data to be digested, got {type(value).__name__}")
-
-
-def _file_digest(path: Path, known: Mapping[str, list[Any]]) -> tuple[tuple[int, ...] | None, str]:
-    """Return what identifies the state of a file, None if it is too fresh to trust, and the digest of its content."""
-    try:
-        status = path.stat()
-        stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
-        remembered = known.get(str(path))
-        if remembered is not None and remembered[:-1] == list(stamp):
-            return stamp, remembered[-1]
-        started = time.time()
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
-    except OSError as error:
-        raise MissingFileError(f"image must be readable, got {path} ({error.strerror}). Check the path.") from error
-    settled = started - max(status.st_mtime, status.st_ctime) > RACE_SECONDS
-    return (stamp if settled else None), digest
 
 
 def _remembered(path: Path) -> dict[str, list[Any]]:

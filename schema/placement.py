@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from beam_warp.assets import sh_degree_of
 from beam_warp.errors import AssetFormatError
+from beam_warp.quaternions import product, quaternion_of
 from beam_warp.spherical_harmonics import sh_transform
 
 SIMILARITY_TOLERANCE = 1e-5
@@ -44,13 +44,13 @@ class Placement:
         spherical harmonics take the reflection itself.
         """
         moved = dict(arrays)
-        rotation = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
+        rotation = quaternion_of(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
         moved["positions"] = (
             self.scale * (arrays["positions"].astype(np.float64) @ self.orthogonal.T) + self.translation
         )
         moved["scales"] = self.scale * arrays["scales"].astype(np.float64)
-        if len(arrays["orientations"]):
-            moved["orientations"] = (rotation * Rotation.from_quat(arrays["orientations"])).as_quat()
+        turned = product(rotation, arrays["orientations"].astype(np.float64))
+        moved["orientations"] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         if "normals" in arrays:
             moved["normals"] = arrays["normals"].astype(np.float64) @ self.orthogonal.T
         if "radiance" in arrays:

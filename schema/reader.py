@@ -33,9 +33,9 @@ from beam_warp.schema.stage_queries import (
     sample_times,
     sequence_prim,
     splat_prims,
+    stage_axes,
+    stage_meters,
 )
-
-_AXES = {"Y": "rub", "Z": "rfu"}
 
 _MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"})
 """Arrays that a moving transform changes."""
@@ -102,7 +102,7 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
         source=source,
         times=frames,
         meters_per_unit=meters_per_unit,
-        axes=_axes(stage, source),
+        axes=stage_axes(stage, source),
         color_space=space or DISPLAY_SRGB,
         captured=metadata.get("radiance_meaning") != "baseColorOnly",
     )
@@ -314,19 +314,10 @@ def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) ->
 
 
 def _meters_per_unit(stage: Usd.Stage, source: Path, notes: list[str]) -> float:
-    meters = UsdGeom.GetStageMetersPerUnit(stage)
+    meters = stage_meters(stage, source)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         notes.append(f"one unit is taken as {meters:g} m, USD's default; the asset states none")
-    if not 0.0 < meters < np.inf:
-        raise AssetFormatError(f"{source} must have a positive metersPerUnit, got {meters:g}. Set it.")
     return meters
-
-
-def _axes(stage: Usd.Stage, source: Path) -> str:
-    up = str(UsdGeom.GetStageUpAxis(stage))
-    if up not in _AXES:
-        raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
-    return _AXES[up]
 
 
 def _unit(name: str, vectors: NDArray[np.float32], where: str) -> NDArray[np.float32]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
 from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.errors import AssetFormatError
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API
 from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, Channel
 
@@ -19,6 +21,33 @@ _COLOR_SPACES = {
     "lin_rec709_scene": LINEAR_REC709,
 }
 """Names that writers give to the two spaces that splats are trained in; OpenUSD itself has none for the first."""
+
+
+_AXES = {"Y": "rub", "Z": "rfu"}
+
+
+def stage_axes(stage: Usd.Stage, source: Path) -> str:
+    """Return the axes code of a stage's up axis.
+
+    Raises:
+        AssetFormatError: It is neither Y nor Z.
+    """
+    up = str(UsdGeom.GetStageUpAxis(stage))
+    if up not in _AXES:
+        raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
+    return _AXES[up]
+
+
+def stage_meters(stage: Usd.Stage, source: Path) -> float:
+    """Return the length of a stage's unit [m], USD's default if it states none.
+
+    Raises:
+        AssetFormatError: It is not positive.
+    """
+    meters = UsdGeom.GetStageMetersPerUnit(stage)
+    if not 0.0 < meters < np.inf:
+        raise AssetFormatError(f"{source} must have a positive metersPerUnit, got {meters:g}. Set it.")
+    return meters
 
 
 def splat_prims(stage: Usd.Stage) -> list[Usd.Prim]:

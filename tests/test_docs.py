@@ -1,7 +1,15 @@
 """What the documentation shows runs, and does what it says."""
 
 import re
+from dataclasses import fields
 from pathlib import Path
+
+import numpy as np
+
+from beam_warp import converters, stage_files
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.images import write_exr
+from beam_warp.lights import LIGHT_TYPES
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -9,6 +17,23 @@ DOCS = Path(__file__).parent.parent / "docs"
 def blocks(page):
     """The Python examples of a page."""
     return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def standing_cloud(x):
+    """Six relightable Gaussians on a frame that stands off the origin."""
+    places = np.array([(i, 3.0 + j, 1.0 + k) for i in (x, x + 1.0) for j, k in ((0, 0), (1, 0.5), (0.5, 2))])
+    return GaussianCloud(
+        positions=places,
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (6, 1)),
+        scales=np.full((6, 3), 0.1),
+        opacities=np.ones(6),
+        base_color=np.full((6, 3), 0.5),
+        roughness=np.full(6, 0.5),
+        ambient_occlusion=np.ones(6),
+        normals=np.tile([0.0, -1.0, 0.0], (6, 1)),
+        ids=np.arange(6),
+        axes="rfu",
+    )
 
 
 def test_the_fit_of_the_rasterizer_page(capsys):
@@ -34,3 +59,50 @@ def test_the_example_of_the_tracking_page():
     assert abs(length / 0.88 - 1.0).max() < 0.1 * 0.06 / 0.88
     assert scope["energy"].numpy()[0] > 0.0
     assert abs(scope["to_positions"].numpy().sum(axis=0) - 5000.0).max() < 0.1
+
+
+def test_the_example_of_the_stages_page(tmp_path, monkeypatch, capsys):
+    """The stage reads, and what it shows is what the page says of it."""
+    clouds = [standing_cloud(0.1 * frame) for frame in range(4)]
+    converters.write(GaussianSequence.from_clouds(clouds, frames_per_second=24.0), tmp_path / "walker.usdz")
+    still = GaussianSequence.from_clouds(clouds[:1])
+    converters.write(still, tmp_path / "statue.ply", converters.WriteOptions(profile="beam"))
+    write_exr(tmp_path / "studio.exr", {name: np.ones((4, 8), np.float32) for name in "RGB"})
+    (example,) = re.findall(r"```json\n(.*?)```", (DOCS / "stages.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "stage.json").write_text(example.replace("studio.hdr", "studio.exr"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    scope = {}
+    exec(compile(blocks("stages.md")[0], "docs/stages.md", "exec"), scope)
+    stage, lines = scope["stage"], capsys.readouterr().out.splitlines()
+    assert stage.frame_count == 96
+    assert len(lines) == 97
+    assert lines[0].startswith("0 12 [-2.  -4.   1.4] 45.0")
+    shot = stage.shot(2.0, 640, 360)
+    assert shot.environment_rotation == 75.0
+    np.testing.assert_allclose(shot.camera.position, [0.0, -3.5, 1.2])
+    np.testing.assert_allclose(shot.environment.radiance, 2.0**-0.5, rtol=1e-6)
+    assert shot.mesh.catches_shadows.all()
+    assert (shot.mesh.surface.vertices[:, 2] == 0.0).all()
+    middle, lowest = shot.cloud.positions[6:, :2].mean(axis=0), shot.cloud.positions[6:, 2].min()
+    np.testing.assert_allclose([*middle, lowest], [0.7, 0.2, 0.0], atol=1e-6)
+
+
+def test_the_stages_page_lists_every_field():
+    """The tables name the fields that are read, and no others."""
+    sections = re.split(r"^##+ ", (DOCS / "stages.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    listed = {}
+    for section in sections:
+        cells = [line.split("|")[1:3] for line in section.splitlines() if line.startswith("| ")]
+        listed[section.splitlines()[0]] = {
+            name for pair in cells for cell in pair for name in re.findall(r"`([^`]+)`", cell)
+        }
+    assert listed["The format"] == {stage_files.KEY, *stage_files.FIELDS}
+    assert listed["Assets"] - {"identified"} == set(stage_files.ASSET_FIELDS)
+    assert listed["Meshes"] - {'"auto"'} == {"ground", *stage_files.MESH_FIELDS, *stage_files.GROUND_FIELDS}
+    assert listed["Environment"] == set(stage_files.ENVIRONMENT_FIELDS)
+    kinds = {"fixed", "orbit", "keyframes", "file"}
+    cameras = {*stage_files.FIXED_FIELDS, *stage_files.ORBIT_FIELDS, *stage_files.FILE_FIELDS, "interpolation"}
+    assert listed["Camera"] == {*kinds, *cameras}
+    for name, kind in LIGHT_TYPES.items():
+        row = next(line for line in sections[-4].splitlines() if line.startswith(f"| `{name}`"))
+        assert set(re.findall(r"`(\w+)`", row)) == {name, *(field.name for field in fields(kind))}

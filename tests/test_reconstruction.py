@@ -339,7 +339,7 @@ class TestStaleness:
         folder = write_capture(tmp_path / "capture", (0, 1))
         capture = Capture.read(folder)
         later = time.time() + 100.0
-        monkeypatch.setattr("beam_warp.capture_digests.time.time", lambda: later)
+        monkeypatch.setattr("beam_warp.file_digests.time.time", lambda: later)
         reconstruct(capture, tmp_path / "out", FakeSteps())
         opened = []
         original = Path.open

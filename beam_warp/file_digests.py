@@ -1,0 +1,70 @@
+"""Digests of plain records and of the content of files.
+
+A file is read again only when its size, times or inode are others than when it was last read. One that changed less
+than `RACE_SECONDS` before it was read could change once more without showing, and is never remembered.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.errors import MissingFileError
+
+RACE_SECONDS = 2.0
+"""Coarsest time step of usual file systems (FAT)."""
+
+
+def fields_of(record: Any) -> list[tuple[str, Any]]:
+    """Return the names and values of a dataclass's fields."""
+    return [(field.name, getattr(record, field.name)) for field in dataclasses.fields(record)]
+
+
+def described(value: Any, describe_file: Callable[[Path], Any]) -> Any:
+    """Return a value as JSON-able data, exactly; a type that is not known here is an error, never left out."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Path):
+        return describe_file(value)
+    if isinstance(value, np.ndarray):
+        return [str(value.dtype), value.tolist()]
+    if dataclasses.is_dataclass(value):
+        return {name: described(item, describe_file) for name, item in fields_of(value)}
+    if isinstance(value, Mapping):
+        return {str(name): described(item, describe_file) for name, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [described(item, describe_file) for item in value]
+    raise TypeError(f"what is digested must be plain data, got {type(value).__name__}")
+
+
+def content_digest(path: Path, known: Mapping[str, list[Any]]) -> tuple[tuple[int, ...] | None, str]:
+    """Return what identifies the state of a file, None if it is too fresh to trust, and the digest of its content."""
+    try:
+        status = path.stat()
+        stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
+        remembered = known.get(str(path))
+        if remembered is not None and remembered[:-1] == list(stamp):
+            return stamp, remembered[-1]
+        started = time.time()
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    except OSError as error:
+        raise MissingFileError(f"input must be readable, got {path} ({error.strerror}). Check the path.") from error
+    settled = started - max(status.st_mtime, status.st_ctime) > RACE_SECONDS
+    return (stamp if settled else None), digest
+
+
+def array_digest(*arrays: NDArray[Any]) -> str:
+    """Return the digest of arrays: their types, shapes and bits."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(f"{array.dtype.str} {array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array).data if array.size else b"")
+    return digest.hexdigest()
