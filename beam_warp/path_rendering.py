@@ -41,7 +41,7 @@ from beam_warp.shots import RenderedImage, Shot, ShotMesh
 from beam_warp.tracing import EXACT
 
 PASS_SAMPLES = 16
-"""Samples of a pixel between two looks at its noise."""
+"""Samples of a pixel between two looks at its noise; fewer where there are too few in all for `FEWEST_PASSES`."""
 
 FEWEST_PASSES = 4
 """Before a pixel's noise is believed: fewer passes miss what is rare."""
@@ -52,9 +52,6 @@ chance."""
 
 DARKEST = 1e-3
 """Luminance below which noise counts as if there: the square root's slope has no bound at black."""
-
-GAP_IN_SCALES = 2.0
-"""Hits farther apart than this many times the median of Gaussians' largest scales are of different surfaces."""
 
 CHECKPOINT_SECONDS = 10.0
 """Time between two checkpoints."""
@@ -209,9 +206,8 @@ class _Geometry:
         scene = Scene.from_gaussians(cloud, str(device), mesh=triangles)
         materials = PathMaterials()
         materials.color_roughness, materials.normal_thickness = _material_rows(cloud, device)
-        seen = cloud.opacities > 1.0 / 255.0
-        largest = cloud.scales.max(axis=1)[seen] if seen.any() else np.ones(1)
-        materials.layer_gap = GAP_IN_SCALES * float(np.median(largest))
+        sizes = np.median(cloud.scales, axis=1) if len(cloud) else np.ones(len(NOTHING))
+        materials.sizes = upload(sizes.astype(np.float32), float, device)
         materials.surface = _mesh_surface(mesh, scene, device)
         catches = np.zeros(1, np.int32) if mesh is None else mesh.catches_shadows.astype(np.int32)
         materials.catches = upload(catches, int, device)
@@ -288,9 +284,11 @@ class PathProgress:
         """Whether every pixel has its samples, or its target error."""
         return not len(self._pixels) or self.sample_count >= self.options.samples
 
-    def advance(self, samples: int = PASS_SAMPLES) -> None:
+    def advance(self, samples: int | None = None) -> None:
         """Add samples to every pixel that is not done; beyond ``options.samples`` there are none to add."""
-        samples = min(require_count("samples", samples), self.options.samples - self.sample_count)
+        usual = max(1, min(PASS_SAMPLES, self.options.samples // FEWEST_PASSES))
+        wanted = usual if samples is None else require_count("samples", samples)
+        samples = min(wanted, self.options.samples - self.sample_count)
         if self.done:
             return
         launch_trace_paths(

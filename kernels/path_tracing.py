@@ -248,7 +248,7 @@ def path_sample(
     return result
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False, module="unique")
 def trace_paths_kernel(
     first: int,
     occluders: Any,

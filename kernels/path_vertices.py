@@ -26,6 +26,10 @@ LIFT = wp.constant(4.0)
 """How far rays start above a layer, in root mean squares of how far its Gaussians reach from it: as for measured
 materials (`beam_warp.surfaces`)."""
 
+GAP_IN_SIZES = wp.constant(2.0)
+"""Hits that follow each other by more than this many times the middle scale of the smaller Gaussian are of different
+surfaces: neighbours on one overlap, and are turned against each other by less than that."""
+
 
 @wp.struct
 class PathMaterials:
@@ -33,7 +37,7 @@ class PathMaterials:
 
     color_roughness: wp.array[wp.vec4]  # of Gaussians: base colour, roughness
     normal_thickness: wp.array[wp.vec4]  # unit normal, standard deviation along it [m]
-    layer_gap: float  # hits that follow each other by more are of another surface [m]
+    sizes: wp.array[float]  # middle scale of Gaussians [m]
     surface: MeshSurface  # one triangle of nothing where there is no mesh
     catches: wp.array[int]  # of triangles: 1 if they show nothing but the shadows on them
 
@@ -92,6 +96,7 @@ class Layer:
     t_squared: float
     thickness_squared: float
     last: float
+    last_size: float
     normal: wp.vec3
     color_roughness: wp.vec4
 
@@ -149,7 +154,8 @@ def first_vertex(
                 index = buffer.index[k]
                 t = buffer.t[k]
                 peak = ray_peak(occluders.gaussians, index, origin, direction)
-                if layer.weight > 0.0 and t - layer.last > materials.layer_gap:
+                size = materials.sizes[index]
+                if layer.weight > 0.0 and t - layer.last > GAP_IN_SIZES * wp.min(size, layer.last_size):
                     if chosen == 1:
                         transmittance = 0.0
                     else:
@@ -169,6 +175,7 @@ def first_vertex(
                     layer.normal += weight * wp.vec3(shape[0], shape[1], shape[2])
                     layer.color_roughness += weight * load_row(materials.color_roughness, index)
                     layer.last = t
+                    layer.last_size = size
                     transmittance *= 1.0 - peak.alpha
                     if 1.0 - transmittance > choice:
                         chosen = 1
