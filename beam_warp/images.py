@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.checks import require_array, require_choice, require_finite, require_number
-from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileError, OutputError
+from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError, OutputError
 from beam_warp.radiance_hdr import read_radiance_hdr
 
 MAX_SIDE = 32_768
@@ -330,6 +330,8 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.replace(path)
+    except BeamError:  # says already what is wrong
+        raise
     except (OSError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise OutputError(

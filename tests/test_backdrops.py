@@ -41,7 +41,7 @@ def test_rotation_by_whole_texels_is_that_of_the_map(rng):
 
 def test_poles_are_whole(smooth):
     seen = Backdrop(smooth).seen(camera((0, 0, 1), up=(0, 1, 0), fov=2.0))
-    # The corner of the image is 1.42 degrees from the pole, further than the half texel in which the map stays as it is.
+    # The corner of the image is 1.42 degrees from the pole, beyond the half texel in which the map stays as it is.
     np.testing.assert_allclose(seen, np.broadcast_to([2.0, 2.0, 3.0], seen.shape), atol=np.sin(np.radians(1.42)))
 
 
