@@ -133,15 +133,17 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOpt
         except BaseException:
             process.kill()
             process.wait()
+            with suppress(OSError):
+                process.stdin.close()
             raise
-        if process.wait() != 0 or not temporary.is_file():
+        if process.wait() != 0 or count == 0 or not temporary.is_file():
             said.seek(0)
             raise _failed(ffmpeg, said.read(), process.returncode)
     return count
 
 
 def _feed(pipe: IO[bytes], first: NDArray[np.uint8], images: Iterable[NDArray[np.uint8]]) -> int:
-    """Write every frame; an ffmpeg that has ended is left for its exit code to explain."""
+    """Write every frame and return their number; 0 if ffmpeg ended before: its exit code explains."""
     try:
         pipe.write(_even(first).tobytes())
         count = 1
