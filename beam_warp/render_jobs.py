@@ -124,7 +124,10 @@ class RenderJob:
                 self._draw(frame, path, tally)
                 self._report("render", len(tally.rendered), len(images))
         except KeyboardInterrupt as error:
-            raise RenderInterruptedError(f"{len(tally.rendered)} of {len(images)} images are written") from error
+            done = f"{len(tally.rendered)} of {len(images)} images are written"
+            if any(_checkpoint(path).exists() for _, path in images):
+                done += "; of the next one what is done is kept, and the same command goes on from there"
+            raise RenderInterruptedError(done) from error
         return tally
 
     def render_frames(self, pattern: FramePattern, frames: Sequence[Frame], *, overwrite: bool = False) -> Tally:
@@ -191,12 +194,17 @@ class RenderJob:
         total = len(tally.rendered) + len(tally.kept)
         context = FrameContext(
             frame.number,
-            path.with_name(f".{path.name}.checkpoint"),
+            _checkpoint(path),
             lambda done, most: self._report("samples", done, most, f"image {total + 1}"),
         )
         self._writer.write(path, seen, self._renderer.draw(seen, context))
         tally.rendered.append(frame.number)
         tally.gaussian_count = max(tally.gaussian_count, len(seen.cloud))
+
+
+def _checkpoint(path: Path) -> Path:
+    """Return where a renderer keeps what is done of an image."""
+    return path.with_name(f".{path.name}.checkpoint")
 
 
 @contextmanager

@@ -410,7 +410,7 @@ def test_the_capture_brings_its_light(ball, white_light, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--out", "x.jpg"], "out must end in .png or .exr, got x.jpg. Rename it."),
+        (["--out", "x.jpg"], "out must end in .png, .exr or .mp4, got x.jpg. Rename it."),
         (["--out", "x.png", "--aov"], "out must end in .exr to hold the layers of --aov, got x.png"),
         (["--out", "nowhere/x.png"], "out must be in a folder that exists, got nowhere"),
         (["--out", "x.png", "--orbit", "0", "0", "--capture", "c"], "got --orbit and --capture. Leave one out."),
@@ -444,7 +444,10 @@ def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
     converters.write(GaussianSequence.from_clouds([sphere()]), tmp_path / "plain.ply")
     assert run(tmp_path / "plain.ply", "--environment", white_light, "--out", out) == 2
     error = capsys.readouterr().err
-    assert "asset must be relightable, got one without base_color, roughness, ambient_occlusion at" in error
+    assert (
+        "asset must be relightable, got one without base_color, roughness, ambient_occlusion in frame 0 of plain"
+        in error
+    )
     assert "beam run" in error
     assert not out.exists()
 
