@@ -11,6 +11,12 @@ from beam_warp.errors import InvalidOptionError
 MAX_IMAGES = 1_000_000
 """More images than this are a mistake."""
 
+SPEED_RANGE = (1e-3, 1e3)
+"""Speeds at which a sequence may play."""
+
+SECONDS_RANGE = (1e-3, 1e7)
+"""How long it may play [s]."""
+
 _RANGE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(\d+))?")
 
 
@@ -64,9 +70,9 @@ def frame_times(
             f"frames must have no step with seconds, fps or speed, got {frames}. State the images' rate with fps."
         )
     rate = require_number("fps", frame_rate if fps is None else fps, 0.01, 1000.0)
-    pace = require_number("speed", 1.0 if speed is None else speed, 1e-3, 1e3)
+    pace = require_number("speed", 1.0 if speed is None else speed, *SPEED_RANGE)
     length = (end - first) / (frame_rate * pace) if seconds is None else seconds
-    require_number("seconds", length, 1e-3, 1e7)
+    require_number("seconds", length, *SECONDS_RANGE)
     count = max(1, round(length * rate))
     if count > MAX_IMAGES:
         raise InvalidOptionError(f"seconds must hold at most {MAX_IMAGES} images, got {count}. Choose fewer.")

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from beam_warp.camera_paths import CameraPath, FixedCamera, OrbitPath, read_camera_path
 from beam_warp.cameras import Camera
-from beam_warp.checks import require_count
+from beam_warp.checks import require_count, require_number
 from beam_warp.cli.render_checks import is_stage
 from beam_warp.cli.render_views import DEFAULT_FOV, still_camera
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError
+from beam_warp.frame_times import SECONDS_RANGE, SPEED_RANGE
 from beam_warp.lights import read_lights
 from beam_warp.stage_environments import StageEnvironment
 from beam_warp.stage_meshes import Ground
@@ -70,7 +71,9 @@ def staged(args: Render, capture: Capture | None) -> Staged:
     Raises:
         BeamError: Something cannot be read or is no asset that can be lit, or there is no light.
     """
-    pace = 1.0 if args.speed is None else args.speed
+    pace = 1.0 if args.speed is None else require_number("speed", args.speed, *SPEED_RANGE)
+    if args.seconds is not None:
+        require_number("seconds", args.seconds, *SECONDS_RANGE)
     if is_stage(args):
         stage = Stage.read(args.asset[0])
     else:
