@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
+from beam_warp.deferred_options import DeferredOptions
+from beam_warp.deferred_rendering import DeferredRenderer
 from beam_warp.path_rendering import PathOptions, PathRenderer
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import ERROR_CHANNELS, rasterize
@@ -20,7 +21,7 @@ class DeferredFrames:
     """The deferred renderer, with the standard errors that an asset holds as further layers."""
 
     def __init__(
-        self, options: DeferredOptions | None, *, raster: RasterOptions, errors: bool = False, device: str | None = None
+        self, options: DeferredOptions, *, raster: RasterOptions, errors: bool = False, device: str | None = None
     ) -> None:
         """Take the options of both, and whether errors are drawn."""
         self._renderer = DeferredRenderer(options, raster=raster, device=device)

@@ -57,7 +57,7 @@ class Render:
     ]
     out: Annotated[
         Path,
-        arg(metavar="FILE", help=".png, .exr or .mp4; frames/%%04d.png for numbers; a folder with --capture."),
+        arg(metavar="FILE", help=".png, .exr or .mp4; frames/%04d.png for numbers; a folder with --capture."),
     ]
     mode: Annotated[
         Literal["deferred", "path"], arg(help="Deferred shading in real time, or path tracing, which takes its time.")
@@ -115,7 +115,9 @@ class Render:
         int | None,
         arg(metavar="N", help="Path: samples a pixel, at most if there is an error to reach; 64 by default."),
     ] = None
-    bounces: Annotated[int | None, arg(metavar="N", help="Path: from surface to surface; 4 by default.")] = None
+    bounces: Annotated[
+        int | None, arg(metavar="N", help="How often light goes from surface to surface; 4 by default, deferred 2.")
+    ] = None
     target_error: Annotated[
         float | None,
         arg(metavar="E", help="Path: stop where noise is below this display value; 0.004 is 8 bits' step."),
@@ -125,9 +127,9 @@ class Render:
     ] = None
     seed: Annotated[int | None, arg(metavar="N", help="Path: same seed, same device, same noise; 0 by default.")] = None
     environment_shadows: Annotated[
-        int | None, arg(metavar="N", help="Deferred: directions from which the environment casts shadows.")
+        int | None, arg(metavar="N", help="Deferred: directions from which the environment casts shadows; 0 for none.")
     ] = None
-    shadow_resolution: Annotated[int | None, arg(metavar="PX", help="Deferred: side of a shadow map.")] = None
+    shadow_resolution: Annotated[int | None, arg(metavar="PX", help="Deferred: side of a lamp's shadow map.")] = None
     antialiased: Antialiased = None
     low_pass: LowPass = None
     channel: Annotated[

@@ -32,7 +32,8 @@ _LIT = (
 )
 """Options of what is lit, and of what plays."""
 
-_PATH = ("spp", "bounces", "target_error", "denoise", "seed")
+_LIGHTING = ("spp", "target_error", "denoise", "seed", "bounces", "environment_shadows", "shadow_resolution")
+_PATH = ("spp", "target_error", "denoise", "seed")
 _DEFERRED = ("environment_shadows", "shadow_resolution", "antialiased", "low_pass")
 _TIMED = ("frames", "seconds", "fps", "speed", "crf")
 _MOVING = ("loop", "turntable", "turns", "rotate_per_second")
@@ -88,7 +89,7 @@ def _require_channel(args: Render) -> None:
     from beam_warp.channel_images import DRAWABLE
 
     require_choice("channel", args.channel or "", DRAWABLE)
-    _refuse(args, _LIT, "with --channel", "", ": a channel is drawn on grey, and without light")
+    _refuse(args, (*_LIT, *_LIGHTING), "with --channel", "", ": a channel is drawn on grey, and without light")
     if args.range is not None and not args.range[0] < args.range[1]:
         raise InvalidOptionError(f"range must be two numbers, the lower one first, got {args.range}. Swap them.")
     if len(args.asset) != 1 or is_stage(args):

@@ -15,7 +15,7 @@ from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import raster_options
 from beam_warp.cli.render_stage import Staged, staged
 from beam_warp.cli.render_views import capture_views, image_size
-from beam_warp.deferred_rendering import DeferredOptions
+from beam_warp.deferred_options import LAYERS, DeferredOptions
 from beam_warp.devices import resolve_device
 from beam_warp.frame_output import Film, FramePattern, Still, numbered, parse_target
 from beam_warp.frame_renderers import DeferredFrames, PathFrames
@@ -63,11 +63,13 @@ def _renderer(args: Render, stage: Stage) -> FrameRenderer:
     """Make the renderer that was asked for; options that were not given are its own."""
     if args.mode == "path":
         given = {"samples": args.spp, "bounces": args.bounces, "target_error": args.target_error, "seed": args.seed}
-        given |= {"denoiser": args.denoise}
-        return PathFrames(PathOptions(**_stated(given)), device=args.device)
-    given = {"environment_shadows": args.environment_shadows, "shadow_resolution": args.shadow_resolution}
+        return PathFrames(PathOptions(**_stated({**given, "denoiser": args.denoise})), device=args.device)
+    given = {"environment_shadows": args.environment_shadows, "bounces": args.bounces}
+    options = DeferredOptions(
+        layers=LAYERS if args.aov else (), **_stated({**given, "light_map_size": args.shadow_resolution})
+    )
     raster = raster_options(stage.raster_metadata, args.antialiased, args.low_pass)
-    return DeferredFrames(DeferredOptions(**_stated(given)), raster=raster, errors=args.aov, device=args.device)
+    return DeferredFrames(options, raster=raster, errors=args.aov, device=args.device)
 
 
 def _stated(options: dict[str, Any]) -> dict[str, Any]:
