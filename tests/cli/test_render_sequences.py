@@ -1,6 +1,8 @@
 """``beam render`` of sequences: which moments, from where, under which light, into which files; and how it goes on."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from beam_warp.cli import render_relit
 from beam_warp.cli.console import run_command
 from beam_warp.cli.main import main
 from beam_warp.cli.render import Render, render
+from beam_warp.cli.render_checks import require_consistent
 from beam_warp.images import read_image, write_exr
 from beam_warp.lights import PointLight
 from beam_warp.shots import RenderedImage
@@ -436,6 +439,17 @@ def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch
     monkeypatch.setattr("beam_warp.frame_output.os.access", lambda *_: False)
     assert run(*common, "--out", tmp_path / "x.png", "--frame", 0) == 2
     assert "out must be in a folder that can be written" in capsys.readouterr().err
+
+
+def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):
+    """Those of the page and of the help say nothing that contradicts itself; channels are asked for without light."""
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "sequences.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^    beam render (.+)$", page, re.MULTILINE)
+    shown += re.findall(r"Example, [^:]+: beam render (.+)$", Render.__doc__, re.MULTILINE)
+    assert len(shown) > 15
+    for words in shown:
+        require_consistent(tyro.cli(Render, args=words.split(), config=(FlagCreatePairsOff,)))
 
 
 def test_help_shows_a_line_for_every_use(capsys):
