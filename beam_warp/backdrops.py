@@ -16,6 +16,7 @@ class Backdrop:
         """Take the light as it is; it is turned when it is looked at."""
         self._environment = environment
         self._reduced = environment
+        self._held: tuple[tuple[object, ...], NDArray[np.float32]] | None = None
 
     def seen(self, camera: Camera, rotation: float = 0.0) -> NDArray[np.float32]:
         """Return the radiance behind every pixel.
@@ -30,6 +31,14 @@ class Backdrop:
         Returns:
             Scene-linear Rec.709, ``(H, W, 3)`` float32.
         """
+        lens = (camera.width, camera.height, camera.focal_x, camera.focal_y, camera.center_x, camera.center_y)
+        key = (*lens, camera.camera_to_world.tobytes(), rotation)
+        if self._held is None or self._held[0] != key:
+            self._held = (key, self._look(camera, rotation))
+        return self._held[1]
+
+    def _look(self, camera: Camera, rotation: float) -> NDArray[np.float32]:
+        """Look at the environment."""
         pixel = 1.0 / max(camera.focal_x, camera.focal_y)  # radians, in the middle of the image
         rows = max(MIN_HEIGHT, int(np.ceil(np.pi / pixel)))
         if rows >= self._environment.height:

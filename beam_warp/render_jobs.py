@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -141,7 +142,13 @@ class RenderJob:
         log = FrameLog(pattern)
         planned = {frame.number: frame for frame in frames}
         with _resumable(str(pattern), tally := Tally(), len(planned)):
-            todo = log.missing(planned, lambda number: self._digest(planned[number]), overwrite=overwrite)
+            compared = count(1)
+
+            def digest_of(number: int) -> str:
+                self._report("compare", next(compared), len(planned))
+                return self._digests.of(self._shot(planned[number]))
+
+            todo = log.missing(planned, digest_of, overwrite=overwrite)
             tally.kept = [number for number in planned if number not in set(todo)]
             self._report("render", len(tally.kept), len(planned))
             for number in todo:
@@ -184,9 +191,6 @@ class RenderJob:
     def _shot(self, frame: Frame) -> Shot:
         shot = self._stage.shot(frame.time, frame.width, frame.height)
         return shot if frame.camera is None else replace(shot, camera=frame.camera)
-
-    def _digest(self, frame: Frame) -> str:
-        return self._digests.of(self._shot(frame))
 
     def _draw(self, frame: Frame, path: Path, tally: Tally, shot: Shot | None = None) -> None:
         """Render an image and write it."""

@@ -34,6 +34,9 @@ ViewTransform: TypeAlias = Literal["standard", "aces", "agx", "neutral"]
 EXPOSURE_RANGE = (-64.0, 64.0)
 """Exposures that are taken [stops]."""
 
+WHITEST = np.float32(2.0**24)
+"""Light above which every curve has ended, and whose square float32 holds."""
+
 MIDDLE_GREY = 0.18
 AGX_STOPS = (-10.0, 6.5)
 """What AgX shows of the scene, in stops around middle grey."""
@@ -84,7 +87,9 @@ def display_linear(
     require_finite("linear_rgb", linear)
     require_choice("transform", transform, TRANSFORMS)
     gain = 2.0 ** require_number("exposure_stops", exposure_stops, *EXPOSURE_RANGE)
-    return np.clip(_CURVES[transform](np.maximum(linear * np.float64(gain), 0.0)), 0.0, 1.0).astype(np.float32)
+    with np.errstate(over="ignore"):  # what is brighter than float32 is white
+        exposed = linear * np.float32(gain)
+    return np.clip(_CURVES[transform](np.clip(exposed, 0.0, WHITEST)), 0.0, 1.0).astype(np.float32)
 
 
 def display_over(
@@ -127,20 +132,20 @@ def display_over(
     return np.concatenate([color, np.rint(opacity * 255.0).astype(np.uint8)], axis=-1)
 
 
-def agx_sigmoid(encoded: ArrayLike) -> NDArray[np.float64]:
+def agx_sigmoid(encoded: ArrayLike) -> NDArray[Any]:
     """Return the display value in [0, 1] of light that was encoded by its logarithm to [0, 1].
 
     Each half is s u (1 + u^p)^(-1/p) about middle grey, u = slope (x - pivot) / s: the slope is that asked for at the
     pivot, and the scale s is such that the curve ends at exactly 0 and 1.
     """
-    x = np.clip(np.asarray(encoded, np.float64), 0.0, 1.0)
+    x = np.clip(np.asarray(encoded), 0.0, 1.0)
     pivot = AGX_STOPS[0] / (AGX_STOPS[0] - AGX_STOPS[1])
     toe = _agx_half(np.maximum(pivot - x, 0.0), pivot, AGX_TOE)
     shoulder = _agx_half(np.maximum(x - pivot, 0.0), 1.0 - pivot, AGX_SHOULDER)
     return 0.5 - toe + shoulder
 
 
-def _agx_half(distance: NDArray[np.float64], reach: float, power: float) -> NDArray[np.float64]:
+def _agx_half(distance: NDArray[Any], reach: float, power: float) -> NDArray[Any]:
     """Return how far from 0.5 the sigmoid is at a distance from its pivot: 0.5 at the reach."""
     end = AGX_SLOPE * reach
     scale = (0.5**-power - end**-power) ** (-1.0 / power)  # solves scale u (1 + u^p)^(-1/p) = 0.5 at the end
@@ -148,25 +153,24 @@ def _agx_half(distance: NDArray[np.float64], reach: float, power: float) -> NDAr
     return scale * u * (1.0 + u**power) ** (-1.0 / power)
 
 
-def _standard(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def _standard(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     return linear
 
 
-def _aces(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    x = np.minimum(linear, 1e6)  # its square is finite, and the curve has long ended
-    return x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+def _aces(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    return linear * (2.51 * linear + 0.03) / (linear * (2.43 * linear + 0.59) + 0.14)
 
 
-def _agx(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def _agx(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     inset = np.array(AGX_INSET)
     inset /= inset.sum(axis=1, keepdims=True)
     low, high = AGX_STOPS
-    stops = np.log2(np.maximum(linear @ inset.T / MIDDLE_GREY, 2.0**low))
-    shown = agx_sigmoid((stops - low) / (high - low)) @ np.linalg.inv(inset).T
+    stops = np.log2(np.maximum(linear @ (inset.T / MIDDLE_GREY).astype(np.float32), 2.0**low))
+    shown = agx_sigmoid((stops - low) / (high - low)) @ np.linalg.inv(inset).T.astype(np.float32)
     return np.maximum(shown, 0.0) ** AGX_DISPLAY_POWER
 
 
-def _neutral(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def _neutral(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     low = linear.min(axis=-1, keepdims=True)
     color = linear - np.where(low < 2.0 * FRESNEL, low - low**2 / (4.0 * FRESNEL), FRESNEL)
     peak = color.max(axis=-1, keepdims=True)
@@ -177,7 +181,7 @@ def _neutral(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(peak < NEUTRAL_START, color, compressed * (1.0 - white) + new_peak * white)
 
 
-_CURVES: Mapping[str, Callable[[NDArray[np.float64]], NDArray[Any]]] = {
+_CURVES: Mapping[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "standard": _standard,
     "aces": _aces,
     "agx": _agx,

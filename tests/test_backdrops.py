@@ -39,6 +39,14 @@ def test_rotation_by_whole_texels_is_that_of_the_map(rng):
     np.testing.assert_allclose(Backdrop(light).seen(view, 45.0), turned, rtol=1e-5)  # of float32, and angles of float64
 
 
+def test_what_stays_is_looked_at_once(smooth):
+    backdrop = Backdrop(smooth)
+    first = backdrop.seen(camera((1, 0, 0)), 10.0)
+    assert backdrop.seen(camera((1, 0, 0)), 10.0) is first
+    assert not np.array_equal(backdrop.seen(camera((1, 0, 0)), 11.0), first)
+    assert not np.array_equal(backdrop.seen(camera((1, 0, 0.1)), 10.0), first)
+
+
 def test_poles_are_whole(smooth):
     seen = Backdrop(smooth).seen(camera((0, 0, 1), up=(0, 1, 0), fov=2.0))
     # The corner of the image is 1.42 degrees from the pole, beyond the half texel in which the map stays as it is.

@@ -16,7 +16,7 @@ from beam_warp.tone_mapping import (
 )
 
 FLOAT32 = 8 * np.finfo(np.float32).eps
-"""Input and output are float32; between them is float64."""
+"""Everything is float32: the roundings of some operations on values up to 1."""
 
 
 def row(*colors):
