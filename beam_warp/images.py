@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.checks import require_array, require_choice, require_finite, require_number
-from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileError, OutputError
+from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError, OutputError
 from beam_warp.radiance_hdr import read_radiance_hdr
 
 MAX_SIDE = 32_768
@@ -62,6 +62,8 @@ def linear_to_srgb(linear: ArrayLike) -> NDArray[Any]:
 def display_image(linear_rgb: ArrayLike, exposure_stops: float = 0.0) -> NDArray[np.uint8]:
     """Turn linear radiance into 8-bit sRGB: exposure, clip to [0, 1], sRGB, round to nearest; no tone curve.
 
+    View transforms are in `beam_warp.tone_mapping`; what comes out of them is encoded here.
+
     Args:
         linear_rgb: Linear Rec.709, ``(H, W, 3)``, finite.
         exposure_stops: Gain in powers of two.
@@ -72,7 +74,9 @@ def display_image(linear_rgb: ArrayLike, exposure_stops: float = 0.0) -> NDArray
     linear = require_array("linear_rgb", linear_rgb, (None, None, 3))
     require_finite("linear_rgb", linear)
     gain = 2.0 ** require_number("exposure_stops", exposure_stops, -64, 64)
-    return np.rint(linear_to_srgb(np.clip(linear * gain, 0.0, 1.0)) * 255.0).astype(np.uint8)
+    with np.errstate(over="ignore"):  # what is brighter than float32 is white
+        exposed = linear * gain
+    return np.rint(linear_to_srgb(np.clip(exposed, 0.0, 1.0)) * 255.0).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,6 +330,8 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.replace(path)
+    except BeamError:  # says already what is wrong
+        raise
     except (OSError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise OutputError(

@@ -18,8 +18,8 @@ def run_command(command: Callable[[], int]) -> int:
     except BeamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print(f"stopped: {error}" if str(error) else "stopped", file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()

@@ -20,6 +20,9 @@ from beam_warp.rasterizing import rasterize
 
 SIDE = ["--width", "48"]
 
+PLAIN = ["--environment-shadows", "0", "--bounces", "0"]
+"""Where shading is not what a test is about."""
+
 LAYERS = {"R", "G", "B", "A", "depth", "roughness", "ambient_occlusion"} | {
     f"{name}.{part}" for name, parts in (("base_color", "RGB"), ("normal", "XYZ")) for part in parts
 }
@@ -132,7 +135,8 @@ def test_exr_shows_the_white_furnace(ball, white_light, tmp_path):
 
 def test_light_from_the_right_lights_the_right_and_turns(ball, sided_light, tmp_path):
     def sides(*more):
-        assert run(ball, "--environment", sided_light, "--out", tmp_path / "x.exr", *SIDE, *more) == 0
+        words = [ball, "--environment", sided_light, "--out", tmp_path / "x.exr", *SIDE, *PLAIN]
+        assert run(*words, *more) == 0
         green = read_image(tmp_path / "x.exr").channels["G"]
         return green[:, 30:].mean(), green[:, :18].mean()
 
@@ -145,7 +149,7 @@ def test_light_from_the_right_lights_the_right_and_turns(ball, sided_light, tmp_
 
 
 def test_png_is_display_encoded_with_straight_alpha(ball, white_light, tmp_path):
-    common = [ball, "--environment", white_light, *SIDE]
+    common = [ball, "--environment", white_light, *SIDE, *PLAIN]
     assert run(*common, "--out", tmp_path / "x.exr") == 0
     assert run(*common, "--out", tmp_path / "x.png") == 0
     linear, coded = read_image(tmp_path / "x.exr").channels, read_image(tmp_path / "x.png").channels
@@ -161,7 +165,7 @@ def test_png_is_display_encoded_with_straight_alpha(ball, white_light, tmp_path)
 
 def test_usd_shows_the_same_picture(ball, sided_light, tmp_path):
     save([sphere()], tmp_path / "ball.usdc")
-    look = ["--environment", sided_light, *SIDE, "--look-at", 2, -2, 1, 0, 0, 0]
+    look = ["--environment", sided_light, *SIDE, *PLAIN, "--look-at", 2, -2, 1, 0, 0, 0]
     assert run(ball, "--out", tmp_path / "ply.png", *look) == 0
     assert run(tmp_path / "ball.usdc", "--out", tmp_path / "usd.png", *look) == 0
     ply, usd = (read_image(tmp_path / name) for name in ("ply.png", "usd.png"))
@@ -178,7 +182,7 @@ def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(white_light, tmp_pa
         converters.write(ball, tmp_path / name, converters.WriteOptions(**options))
 
     def alpha(*more, asset="ball.ply"):
-        words = [tmp_path / asset, "--environment", white_light, *SIDE, "--device", "cpu", *more]
+        words = [tmp_path / asset, "--environment", white_light, *SIDE, *PLAIN, "--device", "cpu", *more]
         assert run(*words, "--out", tmp_path / "x.exr") == 0
         return read_image(tmp_path / "x.exr").channels["A"]
 
@@ -228,7 +232,8 @@ def test_aov_writes_the_errors_that_there_are(white_light, tmp_path):
         path = tmp_path / f"{name}.usdc"
         converters.write(GaussianSequence.from_clouds([cloud]), path, converters.WriteOptions(full_float=True))
         out = tmp_path / f"{name}.exr"
-        assert run(path, "--environment", white_light, "--out", out, *SIDE, "--aov", "--device", "cpu") == 0
+        words = ["--environment", white_light, "--out", out, *SIDE, *PLAIN, "--aov", "--device", "cpu"]
+        assert run(path, *words) == 0
         layers = read_image(out).channels
         assert set(layers) == LAYERS | more
         np.testing.assert_allclose(layers["roughness_error"][layers["A"] > 0.99], 0.02, rtol=1e-5)
@@ -323,7 +328,7 @@ def test_refusals_of_channels_are_one_line(ball, tmp_path, capsys, monkeypatch, 
 def test_several_frames_are_numbered_and_share_a_camera(white_light, tmp_path, capsys):
     (tmp_path / "walk").mkdir()
     save([sphere((x, 0, 0)) for x in (-0.5, 0.0, 0.5)], tmp_path / "walk" / "walk.ply")
-    common = [tmp_path / "walk", "--environment", white_light, *SIDE, "--height", 24, "--json"]
+    common = [tmp_path / "walk", "--environment", white_light, *SIDE, *PLAIN, "--height", 24, "--json"]
     assert run(*common, "--out", tmp_path / "x.png") == 0
     result = json.loads(capsys.readouterr().out)
     assert result["outputs"] == [str(tmp_path / f"x{n:06d}.png") for n in range(3)]
@@ -343,7 +348,7 @@ def test_capture_gives_a_file_for_each_record(ball, white_light, tmp_path, capsy
     cameras = [("a", 0, "train"), ("b", 0, "test"), ("c", 0, "test"), ("b", 7, "test")]
     camera = write_capture(tmp_path / "capture", cameras)
     out = tmp_path / "out"
-    common = [ball, "--capture", tmp_path / "capture", "--environment", white_light, "--out", out]
+    common = [ball, "--capture", tmp_path / "capture", "--environment", white_light, *PLAIN, "--out", out]
     assert run(*common, "--aov") == 0
     assert sorted(path.name for path in out.iterdir()) == ["b_0000.exr", "c_0000.exr"]
     assert "1 records are of frames that the asset lacks (7): not drawn" in capsys.readouterr().err
@@ -390,7 +395,7 @@ def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_ligh
     pinhole = Capture.read(tmp_path / "bent").records[0].camera
     same = {"fl_x": pinhole.focal_x, "fl_y": pinhole.focal_y, "cx": pinhole.center_x, "cy": pinhole.center_y}
     write_capture(tmp_path / "straight", [("b", 0, "test")], **same)
-    common = (ball, "--environment", white_light, "--out")
+    common = (ball, "--environment", white_light, *PLAIN, "--out")
     assert run(*common, tmp_path / "x", "--capture", tmp_path / "bent") == 0
     assert "1 records were photographed through a lens that bends lines" in capsys.readouterr().err
     assert run(*common, tmp_path / "y", "--capture", tmp_path / "straight") == 0
@@ -410,7 +415,7 @@ def test_the_capture_brings_its_light(ball, white_light, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--out", "x.jpg"], "out must end in .png or .exr, got x.jpg. Rename it."),
+        (["--out", "x.jpg"], "out must end in .png, .exr or .mp4, got x.jpg. Rename it."),
         (["--out", "x.png", "--aov"], "out must end in .exr to hold the layers of --aov, got x.png"),
         (["--out", "nowhere/x.png"], "out must be in a folder that exists, got nowhere"),
         (["--out", "x.png", "--orbit", "0", "0", "--capture", "c"], "got --orbit and --capture. Leave one out."),
@@ -444,7 +449,10 @@ def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
     converters.write(GaussianSequence.from_clouds([sphere()]), tmp_path / "plain.ply")
     assert run(tmp_path / "plain.ply", "--environment", white_light, "--out", out) == 2
     error = capsys.readouterr().err
-    assert "asset must be relightable, got one without base_color, roughness, ambient_occlusion at" in error
+    assert (
+        "asset must be relightable, got one without base_color, roughness, ambient_occlusion in frame 0 of plain"
+        in error
+    )
     assert "beam run" in error
     assert not out.exists()
 

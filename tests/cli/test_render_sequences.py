@@ -1,0 +1,460 @@
+"""``beam render`` of sequences: which moments, from where, under which light, into which files; and how it goes on."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from tyro.conf import FlagCreatePairsOff
+
+from beam_warp import converters
+from beam_warp.assets import GaussianCloud, GaussianSequence
+from beam_warp.cli import render_relit
+from beam_warp.cli.console import run_command
+from beam_warp.cli.main import main
+from beam_warp.cli.render import Render, render
+from beam_warp.cli.render_checks import require_consistent
+from beam_warp.images import read_image, write_exr
+from beam_warp.lights import PointLight
+from beam_warp.shots import RenderedImage
+from beam_warp.video import find_ffmpeg
+
+needs_ffmpeg = pytest.mark.skipif(find_ffmpeg() is None, reason="there is no ffmpeg here")
+
+LAMP = {"type": "point", "position": [1, -2, 2], "intensity": [4, 4, 4]}
+
+
+def run(*words):
+    args = tyro.cli(Render, args=[str(word) for word in words], config=(FlagCreatePairsOff,))
+    return run_command(lambda: render(args))
+
+
+def points(x, count=40):
+    """Gaussians on a ball of radius 0.5 m around (x, 0, 0), the same ones in every frame."""
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return GaussianCloud(
+        positions=0.5 * normals + (x, 0, 0),
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        scales=np.full((count, 3), 0.05),
+        opacities=np.full(count, 0.9),
+        base_color=np.full((count, 3), 0.5),
+        roughness=np.full(count, 0.5),
+        ambient_occlusion=np.ones(count),
+        normals=normals,
+        ids=np.arange(count),
+    )
+
+
+def keep(monkeypatch, path, clouds, rate=30.0):
+    """Let a file stand for clouds in memory: USD alone keeps ids and rates, and takes a second to be opened."""
+    sequence = GaussianSequence.from_clouds(clouds, frames_per_second=rate)
+    usual = converters.read
+    monkeypatch.setattr(converters, "read", lambda name, **more: sequence if name == path else usual(name, **more))
+    path.touch()
+    return path
+
+
+@pytest.fixture
+def walk(tmp_path, monkeypatch):
+    """Four frames at 10 a second that go 1 m a frame."""
+    return keep(monkeypatch, tmp_path / "walk.ply", [points(float(x)) for x in range(4)], 10.0)
+
+
+@pytest.fixture
+def still(tmp_path, monkeypatch):
+    return keep(monkeypatch, tmp_path / "still.ply", [points(0.0)])
+
+
+@pytest.fixture
+def light(tmp_path):
+    path = tmp_path / "light.exr"
+    write_exr(path, {name: np.full((8, 16), 0.5) for name in "RGB"})
+    return path
+
+
+class Recorder:
+    """Stands in for both renderers: a grey of the place that the asset has, and what it was asked for."""
+
+    def __init__(self):
+        self.shots, self.contexts, self.options, self.stop_at = [], [], [], None
+
+    def make(self, options, **more):
+        self.options.append((options, more))
+        self.decisive = (repr(options),)
+        return self
+
+    def draw(self, shot, context):
+        if context.number == self.stop_at:
+            raise KeyboardInterrupt
+        self.shots.append(shot)
+        self.contexts.append(context)
+        size = (shot.camera.height, shot.camera.width)
+        alpha = np.zeros(size, np.float32)
+        alpha[: size[0] // 2] = 1.0
+        place = 0.1 * (1.0 + shot.cloud.positions[:, 0].mean())
+        return RenderedImage(alpha[..., None] * np.float32([place] * 3), alpha)
+
+    def places(self):
+        """Where the asset was in every image [m]."""
+        at_zero = points(0.0).positions[:, 0].mean()
+        return [float(shot.cloud.positions[:, 0].mean() - at_zero) for shot in self.shots]
+
+    def azimuths(self):
+        """From where the asset was seen in every image [degree]."""
+        return [float(np.degrees(np.arctan2(-s.camera.forward[0], s.camera.forward[1]))) % 360 for s in self.shots]
+
+
+@pytest.fixture
+def recorder(monkeypatch):
+    made = Recorder()
+    monkeypatch.setattr(render_relit, "DeferredFrames", made.make)
+    monkeypatch.setattr(render_relit, "PathFrames", made.make)
+    return made
+
+
+@pytest.fixture
+def common(walk, light):
+    return [walk, "--environment", light, "--width", 8, "--height", 6, "--device", "cpu"]
+
+
+@pytest.fixture
+def common_still(still, light):
+    return [still, "--environment", light, "--width", 8, "--height", 6, "--device", "cpu"]
+
+
+POSITION = 1e-6
+"""Coordinates of up to 4 m are float32, as are blends of them; so are their means."""
+
+
+class TestFrames:
+    def test_a_pattern_names_frames_by_their_numbers(self, common, recorder, tmp_path, capsys):
+        assert run(*common, "--out", tmp_path / "f" / "%03d.exr", "--frames", "1:4:2", "--json") == 0
+        said = json.loads(capsys.readouterr().out)
+        assert said["outputs"] == [str(tmp_path / "f" / name) for name in ("001.exr", "003.exr")]
+        assert (said["frames"], said["rendered"], said["kept"], said["mode"]) == ([1, 3], 2, 0, "deferred")
+        np.testing.assert_allclose(recorder.places(), [1.0, 3.0], atol=POSITION)
+        shown = read_image(tmp_path / "f" / "003.exr").channels
+        np.testing.assert_allclose(shown["G"][0], 0.1 * (1 + 3.0 + points(0).positions[:, 0].mean()), rtol=1e-5)
+
+    def test_negative_numbers_count_from_the_end(self, common, recorder, tmp_path):
+        assert run(*common, "--out", tmp_path / "%d.png", "--frames=-2:") == 0
+        np.testing.assert_allclose(recorder.places(), [2.0, 3.0], atol=POSITION)
+
+    def test_part_of_a_sequence_is_seen_like_the_whole(self, common, recorder, tmp_path):
+        assert run(*common, "--out", tmp_path / "a%d.png") == 0
+        assert run(*common, "--out", tmp_path / "b%d.png", "--frames", "2:3", "--turntable", 0) == 0
+        whole, part = recorder.shots[2].camera, recorder.shots[4].camera
+        np.testing.assert_allclose(part.camera_to_world, whole.camera_to_world, atol=1e-9)
+
+    def test_what_is_there_is_kept_and_what_is_missing_is_filled(self, common, recorder, tmp_path, capsys):
+        words = [*common, "--out", tmp_path / "%d.png"]
+        assert run(*words, "--frames", "0:2") == 0
+        assert run(*words) == 0
+        assert "4 images, 2 of them were there, 40 Gaussians" in capsys.readouterr().out
+        (tmp_path / "1.png").unlink()
+        assert run(*words) == 0
+        np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3, 1], atol=POSITION)
+
+    def test_another_render_is_refused_unless_it_may_overwrite(self, common, recorder, tmp_path, capsys):
+        words = [*common, "--out", tmp_path / "%d.png"]
+        assert run(*words) == 0
+        assert run(*words, "--view", "agx") == 2
+        captured = capsys.readouterr()
+        assert "frames that are there must be of the same render" in captured.err
+        assert captured.err.count("\n") == 1
+        assert run(*words, "--view", "agx", "--overwrite") == 0
+        assert len(recorder.shots) == 8
+
+    def test_an_interrupted_render_says_how_to_go_on(self, common, recorder, tmp_path, capsys):
+        words = [*common, "--out", tmp_path / "f" / "%d.png"]
+        recorder.stop_at = 2
+        assert run(*words) == 130
+        error = capsys.readouterr().err
+        assert error.startswith("stopped: 2 of 4 images are whole in")
+        assert error.endswith("the same command goes on from there\n")
+        assert sorted(path.name for path in (tmp_path / "f").glob("[!.]*")) == ["0.png", "1.png"]
+        recorder.stop_at = None
+        assert run(*words) == 0
+        np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3], atol=POSITION)
+
+
+class TestTime:
+    def test_another_rate_blends_frames(self, common, recorder, tmp_path):
+        assert run(*common, "--out", tmp_path / "%d.png", "--fps", 20) == 0
+        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5, 2, 2.5, 3, 3], atol=POSITION)
+
+    def test_half_speed(self, common, recorder, tmp_path):
+        assert run(*common, "--out", tmp_path / "%d.png", "--speed", 0.5, "--frames", "0:2") == 0
+        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5], atol=POSITION)
+
+    def test_loop_and_hold(self, common, recorder, tmp_path):
+        for name, more in (("a", ["--loop"]), ("b", [])):
+            assert run(*common, "--out", tmp_path / f"{name}%d.png", "--seconds", 0.6, *more) == 0
+        np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3, 0, 1, 0, 1, 2, 3, 3, 3], atol=POSITION)
+
+
+class TestCamera:
+    def test_a_turntable_goes_around(self, common_still, recorder, tmp_path):
+        more = ["--turntable", 90, "--seconds", 2, "--fps", 2, "--orbit", 10, 0]
+        assert run(*common_still, "--out", tmp_path / "%d.png", *more) == 0
+        np.testing.assert_allclose(recorder.azimuths(), [10, 55, 100, 145], atol=1e-6)
+
+    def test_turns_are_spread_over_all(self, common_still, recorder, tmp_path):
+        assert run(*common_still, "--out", tmp_path / "%d.png", "--turns", 1, "--seconds", 2, "--fps", 2) == 0
+        np.testing.assert_allclose(recorder.azimuths(), [0, 90, 180, 270], atol=1e-6)
+
+    def test_a_turntable_lasts_a_turn(self, common_still, recorder, tmp_path):
+        assert run(*common_still, "--out", tmp_path / "%d.png", "--turntable", 1800) == 0
+        assert len(recorder.shots) == 6  # 0.2 s at 30 a second
+        np.testing.assert_allclose(recorder.azimuths(), np.arange(6) * 60.0, atol=1e-6)
+
+    def test_it_goes_by_the_films_seconds(self, common, recorder, tmp_path):
+        """At half speed the asset takes twice as long, and the camera goes around twice as far."""
+        more = ["--turntable", 100, "--rotate-per-second", 50, "--speed", 0.5]
+        assert run(*common, "--out", tmp_path / "%d.png", *more) == 0
+        np.testing.assert_allclose(recorder.azimuths(), np.arange(8) * 10.0, atol=1e-6)
+        rotations = [shot.environment_rotation for shot in recorder.shots]
+        np.testing.assert_allclose(rotations, np.arange(8) * 5.0, atol=1e-9)
+        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5, 2, 2.5, 3, 3], atol=POSITION)
+
+    def test_a_camera_path(self, common, recorder, tmp_path):
+        path = tmp_path / "path.json"
+        keys = [{"time": t, "position": [4 * t, -5, 1], "target": [4 * t, 0, 1], "fov": 40} for t in (0.0, 1.0)]
+        path.write_text(json.dumps({"keyframes": keys, "interpolation": "linear"}))
+        for name, more in (("a", []), ("b", ["--speed", 0.5])):
+            assert run(*common, "--out", tmp_path / f"{name}%d.png", "--camera", path, *more) == 0
+        there = [shot.camera.position[0] for shot in recorder.shots]
+        np.testing.assert_allclose(there, [0.4 * n for n in (*range(4), *range(8))], atol=1e-6)
+        assert {shot.camera.width for shot in recorder.shots} == {8}
+
+    def test_a_preview_of_one_frame_of_it(self, common, recorder, tmp_path):
+        assert run(*common, "--out", tmp_path / "x.png", "--frame", 2, "--turntable", 100) == 0
+        np.testing.assert_allclose(recorder.azimuths(), [20.0], atol=1e-6)
+        np.testing.assert_allclose(recorder.places(), [2.0], atol=POSITION)
+
+
+class TestStage:
+    def test_light_turns_and_exposure_is_of_the_image(self, common, recorder, tmp_path):
+        more = ["--rotate", 30, "--rotate-per-second", 100, "--exposure", 1, "--frames", "0:2"]
+        assert run(*common, "--out", tmp_path / "%d.exr", *more) == 0
+        assert [shot.environment_rotation for shot in recorder.shots] == pytest.approx([30.0, 40.0])
+        assert recorder.shots[0].environment is recorder.shots[1].environment
+        np.testing.assert_array_equal(recorder.shots[0].environment.radiance, 0.5)
+        expected = 2 * 0.1 * (1 + points(0).positions[:, 0].mean())
+        np.testing.assert_allclose(read_image(tmp_path / "0.exr").channels["R"][0], expected, rtol=1e-5)
+
+    def test_lamps_need_no_environment(self, still, recorder, tmp_path):
+        (tmp_path / "lamps.json").write_text(json.dumps([LAMP]))
+        words = [still, "--lights", tmp_path / "lamps.json", "--width", 4, "--device", "cpu"]
+        assert run(*words, "--out", tmp_path / "x.png") == 0
+        assert recorder.shots[0].environment is None
+        assert recorder.shots[0].lights == (PointLight(position=(1, -2, 2), intensity=(4, 4, 4)),)
+
+    @pytest.mark.parametrize(("ground", "catches"), [("plain", False), ("shadows", True)])
+    def test_a_floor(self, common_still, recorder, tmp_path, ground, catches):
+        assert run(*common_still, "--out", tmp_path / "x.png", "--ground", ground) == 0
+        mesh = recorder.shots[0].mesh
+        assert (mesh.catches_shadows == catches).all()
+        assert mesh.surface.vertices[:, 2].max() <= points(0).positions[:, 2].min()
+
+    def test_several_assets(self, still, walk, light, recorder, tmp_path):
+        words = [walk, still, "--environment", light, "--width", 4, "--device", "cpu"]
+        assert run(*words, "--out", tmp_path / "%d.png") == 0
+        assert [len(shot.cloud) for shot in recorder.shots] == [80] * 4
+        recorder.shots.clear()
+        assert run(*words, "--spacing", 3, "--frame", 0, "--out", tmp_path / "x.png") == 0
+        x = recorder.shots[0].cloud.positions[:, 0]
+        # the walk is centred over all its way of 3 m: it begins at its left
+        assert (x[:40].mean(), x[40:].mean()) == pytest.approx((-3.0, 1.5), abs=0.1)
+
+    def test_a_stage_and_what_is_said_instead(self, walk, light, recorder, tmp_path):
+        stage = {
+            "beam-stage": 1,
+            "assets": [{"path": "walk.ply", "translate": [0, 0, 1], "start": 0.1}],
+            "lights": [LAMP],
+            "environment": {"path": "light.exr", "rotate": 10},
+            "camera": {"type": "orbit", "azimuth": 45},
+        }
+        (tmp_path / "stage.json").write_text(json.dumps(stage))
+        words = [tmp_path / "stage.json", "--width", 4, "--device", "cpu"]
+        assert run(*words, "--out", tmp_path / "a%d.png") == 0
+        assert len(recorder.shots) == 5
+        np.testing.assert_allclose(recorder.places(), [0, 0, 1, 2, 3], atol=POSITION)
+        assert recorder.azimuths() == pytest.approx([45.0] * 5)
+        assert recorder.shots[0].environment_rotation == pytest.approx(10.0)
+        recorder.shots.clear()
+        more = ["--look-at", 0, -9, 0, 0, 0, 0, "--rotate", 5, "--frames", "0:1", "--ground", "plain"]
+        assert run(*words, "--out", tmp_path / "b%d.png", *more) == 0
+        (shot,) = recorder.shots
+        assert (shot.camera.position[1], shot.environment_rotation) == pytest.approx((-9.0, 15.0))
+        assert len(shot.lights) == 1
+        assert shot.mesh is not None
+
+
+class TestRenderers:
+    def test_paths(self, common_still, recorder, tmp_path):
+        more = ["--spp", 8, "--bounces", 2, "--target-error", 0.01, "--denoise", "bilateral", "--seed", 7]
+        assert run(*common_still, "--out", tmp_path / "x.png", "--mode", "path", *more) == 0
+        options, more = recorder.options[0]
+        assert (options.samples, options.bounces, options.target_error) == (8, 2, 0.01)
+        assert (options.denoiser, options.seed) == ("bilateral", 7)
+        assert more == {"device": "cpu"}
+
+    def test_deferred(self, common_still, recorder, tmp_path):
+        more = ["--environment-shadows", 4, "--shadow-resolution", 256, "--bounces", 1, "--low-pass", 0.5, "--aov"]
+        assert run(*common_still, "--out", tmp_path / "x.exr", *more) == 0
+        options, more = recorder.options[0]
+        assert (options.environment_shadows, options.light_map_size, options.bounces) == (4, 256, 1)
+        assert (more["raster"].low_pass, more["errors"]) == (0.5, True)
+
+    def test_what_is_behind(self, common_still, recorder, tmp_path):
+        for name, more in (("a", []), ("b", ["--background", "environment"]), ("c", ["--background", 0, 0.5, 1])):
+            assert run(*common_still, "--out", tmp_path / f"{name}.exr", *more) == 0
+        lower = [read_image(tmp_path / f"{name}.exr").stack(*"RGBA")[-1, 0] for name in "abc"]
+        np.testing.assert_allclose(lower[0], 0.0)
+        np.testing.assert_allclose(lower[1], [0.5, 0.5, 0.5, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(lower[2], [0.0, 0.2140411, 1.0, 1.0], rtol=1e-5)
+
+
+@needs_ffmpeg
+class TestFilm:
+    def test_a_film(self, common, recorder, tmp_path, capsys):
+        before = {path.name for path in tmp_path.iterdir()}
+        assert run(*common, "--out", tmp_path / "x.mp4", "--crf", 10, "--json") == 0
+        said = json.loads(capsys.readouterr().out)
+        assert said["outputs"] == [str(tmp_path / "x.mp4")]
+        assert (said["frames"], said["rendered"]) == ([0, 1, 2, 3], 4)
+        assert "a film has no transparency: its background is black" in said["notes"]
+        assert {path.name for path in tmp_path.iterdir()} - before == {"x.mp4"}
+        assert run(*common, "--out", tmp_path / "x.mp4") == 2
+        assert "out must be a new file" in capsys.readouterr().err
+
+    def test_an_interrupted_film_goes_on(self, common, recorder, tmp_path, capsys):
+        recorder.stop_at = 3
+        assert run(*common, "--out", tmp_path / "x.mp4") == 130
+        assert "3 of 4 images are whole" in capsys.readouterr().err
+        recorder.stop_at = None
+        assert run(*common, "--out", tmp_path / "x.mp4") == 0
+        assert "4 images, 3 of them were there" in capsys.readouterr().out
+        assert len(recorder.shots) == 4
+
+
+def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(render_relit, "find_ffmpeg", lambda: None)
+    assert run(*common, "--out", tmp_path / "x.mp4", "--frames", "0:2") == 0
+    captured = capsys.readouterr()
+    assert "note: there is no ffmpeg to make x.mp4: its frames are" in captured.err
+    for how in ("apt install ffmpeg", "brew install ffmpeg", "winget install ffmpeg", "pip install 'beam-warp[video]'"):
+        assert how in captured.err
+    assert sorted(path.name for path in (tmp_path / "x").glob("[!.]*")) == ["000000.png", "000001.png"]
+    assert not (tmp_path / "x.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "%d_%d.png"], "out must have one integer field in the name of an image"),
+        (["--out", "no/no/%d.png"], "out must be in a folder that exists, got no. Create it"),
+        (["--out", "%d.png", "--frames", "0:5"], "frames must be some of the 4 that there are, 0:4, got 0:5"),
+        (["--out", "%d.png", "--frames", "abc"], "frames must be A:B or A:B:STEP, got abc"),
+        (
+            ["--out", "%d.png", "--frames", "0:4:2", "--fps", "20"],
+            "frames must have no step with seconds, fps or speed",
+        ),
+        (["--out", "x.png", "--frame", "1", "--frames", "0:2"], "frames must be left out with --frame, got 0:2"),
+        (["--out", "x.mp4", "--frame", "1"], "out must end in .png or .exr with --frame, got x.mp4"),
+        (["--out", "x.mp4", "--aov"], "out must end in .exr to hold the layers of --aov, got x.mp4"),
+        (["--out", "x.png", "--crf", "10"], "crf must be left out unless out ends in .mp4, got 10"),
+        (["--out", "x.png", "--spp", "9"], "spp must be left out with --mode deferred, got 9"),
+        (["--out", "x.png", "--target-error", "0.1"], "target-error must be left out with --mode deferred, got 0.1"),
+        (
+            ["--out", "x.png", "--mode", "path", "--environment-shadows", "4"],
+            "environment-shadows must be left out with",
+        ),
+        (
+            ["--out", "x.png", "--mode", "path", "--low-pass", "1"],
+            "low-pass must be left out with --mode path, got 1.0",
+        ),
+        (["--out", "x.png", "--mode", "path", "--spp", "0"], "samples must be an integer in [1, 1048576], got 0"),
+        (["--out", "x.png", "--turntable", "9", "--turns", "1"], "got --turntable and --turns. Leave one out."),
+        (["--out", "x.png", "--turns", "1", "--look-at", *"012345"], "got --look-at and --turns. Leave one out."),
+        (["--out", "x.png", "--camera", "c.json", "--orbit", "0", "0"], "got --orbit and --camera. Leave one out."),
+        (["--out", "x.png", "--camera", "c.json", "--fov", "9"], "fov must be left out with --camera, got 9.0"),
+        (["--out", "x.png", "--camera", "none.json"], "none.json"),
+        (["--out", "x.png", "--camera", "nan.json"], "camera_to_world must be finite, got NaN"),
+        (["--out", "x.png", "--lights", "none.json"], "lights must be a file, got none.json"),
+        (
+            ["--out", "x.png", "--lights", "area.json"],
+            "lights[0].type must be one of directional, point, spot, got 'area'",
+        ),
+        (["--out", "o", "--capture", "c", "--fps", "9"], "fps must be left out with --capture, got 9.0"),
+        (
+            ["--out", "o", "--capture", "c", "--turntable", "9"],
+            "camera must move in one way, got --capture and --turntable",
+        ),
+        (
+            ["--out", "x.png", "--channel", "roughness", "--mode", "path"],
+            "mode must be left out with --channel, got path",
+        ),
+        (["--out", "x.mp4", "--channel", "roughness"], "out must end in .png or .exr with --channel, got x.mp4"),
+        (["--out", "%d.png", "--seconds", "-1"], "seconds must be a number in"),
+        (["--out", "%d.png", "--speed", "0"], "speed must be a number in [0.001, 1000], got 0.0"),
+        (["--out", "x.mp4", "--crf", "99"], "crf must be an integer in [0, 51], got 99"),
+    ],
+)
+def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "area.json").write_text(json.dumps([{"type": "area"}]))
+    pose = np.eye(4).tolist()
+    pose[0][3] = float("nan")
+    (tmp_path / "nan.json").write_text(json.dumps([{"time": 0, "camera_to_world": pose}]))
+    before = sorted(tmp_path.iterdir())
+    environment = [] if "--channel" in words else ["--environment", light]
+    assert run(walk, *environment, "--device", "cpu", *words) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_one_stage_or_several_assets(walk, light, tmp_path, capsys):
+    stage = tmp_path / "stage.json"
+    stage.write_text("{}")
+    words = ["--environment", light, "--out", tmp_path / "x.png"]
+    assert run(walk, stage, *words) == 2
+    assert "asset must be one stage, or several assets, got" in capsys.readouterr().err
+    assert run(stage, *words, "--spacing", 1) == 2
+    assert "spacing must be left out with a stage, got 1.0" in capsys.readouterr().err
+    assert run(walk, walk, "--out", tmp_path / "x.png", "--channel", "roughness") == 2
+    assert "asset must be one with --channel" in capsys.readouterr().err
+    assert run(walk, "--background", "environment", "--out", tmp_path / "x.png") == 2
+    assert "environment must be given, got none. Pass --environment with a lat-long" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("beam_warp.frame_output.os.access", lambda *_: False)
+    assert run(*common, "--out", tmp_path / "x.png", "--frame", 0) == 2
+    assert "out must be in a folder that can be written" in capsys.readouterr().err
+
+
+def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):
+    """Those of the page and of the help say nothing that contradicts itself; channels are asked for without light."""
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "sequences.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^    beam render (.+)$", page, re.MULTILINE)
+    shown += re.findall(r"Example, [^:]+: beam render (.+)$", Render.__doc__, re.MULTILINE)
+    assert len(shown) > 15
+    for words in shown:
+        require_consistent(tyro.cli(Render, args=words.split(), config=(FlagCreatePairsOff,)))
+
+
+def test_help_shows_a_line_for_every_use(capsys):
+    with pytest.raises(SystemExit):
+        main(["render", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    for words in ("--frames 0:150 --mode path --out turntable.mp4", "frames/%04d.exr", "--speed 0.25", "--turns 1"):
+        assert words in said
