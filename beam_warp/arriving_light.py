@@ -92,7 +92,8 @@ class ArrivingLight:
             self.distant = DistantLight()
             self.distant.turn = wp.zeros(1, dtype=wp.vec2)
             self._moments = LightMoments()
-            self._none = _no_maps()
+            self._no_radiosity = wp.zeros(0, dtype=wp.vec3)
+        self._no_maps = ShadowMaps()
         self.regions = RegionShadows()
         self.lights = Lights()
         self.shadows = LightShadows()
@@ -142,7 +143,7 @@ class ArrivingLight:
             pairs = zip(regions.directions, regions.half_angles, strict=True)
             views = [distant_view(direction, float(half), subject, size) for direction, half in pairs]
         self._region_drawer = self._moved(self._region_drawer, views, subject, REGION_TAPS)
-        self.regions.maps = self._none if self._region_drawer is None else self._region_drawer.maps
+        self.regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
         self.regions.moments = self._moments
         self._stale["regions"] = True
 
@@ -165,8 +166,10 @@ class ArrivingLight:
         else:
             for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
                 wp.copy(getattr(self.lights, name), getattr(uploaded, name))
-        self._light_drawer = self._moved(self._light_drawer, sum(views, []), subject, LIGHT_TAPS)
-        self.shadows.maps = self._none if self._light_drawer is None else self._light_drawer.maps
+        self._light_drawer = self._moved(
+            self._light_drawer, [view for of_light in views for view in of_light], subject, LIGHT_TAPS
+        )
+        self.shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
         self._lamps, self._map_counts = lights, counts
         self._stale["lights"] = True
 
@@ -227,9 +230,7 @@ class ArrivingLight:
             self._lit,
             self._device,
         )
-        radiosity = (
-            wp.zeros(0, dtype=wp.vec3, device=self._device) if not self._options.bounces else self._bounced(gaussians)
-        )
+        radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
             gaussians.positions, self._arriving, self._clusters, radiosity, gaussians.values, self._device
         )
@@ -254,8 +255,3 @@ def _zero_clusters(count: int, cluster_count: int) -> Clusters:
     for name in ("areas", "occlusion"):
         setattr(clusters, name, wp.zeros(cluster_count, dtype=float))
     return clusters
-
-
-def _no_maps() -> ShadowMaps:
-    """Return maps that nothing refers to."""
-    return ShadowMaps()

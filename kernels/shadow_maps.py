@@ -21,8 +21,8 @@ from beam_warp.kernels.row_loads import load_row
 
 wp.set_module_options({"enable_backward": False})
 
-STEEPEST = wp.constant(4.0)
-"""Largest tangent of a receiver's slope against the light: 76 degrees. Beyond it, little of the light arrives."""
+STEEPEST = wp.constant(10.0)
+"""Largest tangent of a receiver's slope against the light: 84 degrees. Beyond it, little of the light arrives."""
 
 LEAST_DEPTH = wp.constant(1.0e-6)
 
