@@ -8,7 +8,7 @@ around. What lies outside of a map is not shadowed by it.
 Bias: a comparison is with the receiver's tangent plane at each texel, begins half a texel (plus half of what the plane
 rises within a texel) and the Gaussians' thickness before it, and is full at twice that. Shadows of what is nearer than
 that to its receiver are missing: half a texel is 0.8 mm for a subject of 1.7 m in a map of 1024, the thickness the
-median over the Gaussians of the middle one of their three scales.
+median over the Gaussians of the middle one of their three scales, at most 1 % of the subject's radius.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ FAR = 500.0
 
 ROOM = 1.06
 """A map shows this much more than the subject's sphere: splats and kernels reach beyond centres."""
+
+THICKEST = 0.01
+"""Largest thickness of a layer, in radii of the subject: few large Gaussians are flat, not thick."""
 
 NEAR = 0.02
 """Depth before which a lamp's map shows nothing [m]."""
@@ -72,12 +75,13 @@ class Subject:
         points, thickness = np.zeros((1, 3)), 0.0
         if len(cloud):
             points = bulk(cloud.positions, cloud.opacities)
-            thickness = float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))
+            thickness = float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))  # of a surface's discs, their radius
         elif vertices is not None:
             points = np.asarray(vertices, np.float64)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = float(np.linalg.norm(points - center, axis=1).max())
-        return cls(center, max(radius, 1e-3), thickness)
+        radius = max(radius, 1e-3)
+        return cls(center, radius, min(thickness, THICKEST * radius))
 
 
 @dataclass(frozen=True, eq=False)

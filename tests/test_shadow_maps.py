@@ -28,7 +28,7 @@ def share_kernel(
     out: wp.array[float],
 ):
     i = wp.tid()
-    k = int(0)
+    k = 0
     if around != 0:
         k = face_towards(points[i] - middle)
     out[i] = visible_share(maps, k, points[i], normals[i], turns[i])
