@@ -41,6 +41,10 @@ ROOM = 1.06
 THICKEST = 0.01
 """Largest thickness of a layer, in radii of the subject: few large Gaussians are flat, not thick."""
 
+NEARBY = 2.0
+"""Props whose corners are within this many radii of the Gaussians are in the maps; a ground's are not, and it casts
+shadows only where the maps see it."""
+
 NEAR = 0.02
 """Depth before which a lamp's map shows nothing [m]."""
 
@@ -71,17 +75,22 @@ class Subject:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, vertices: NDArray[np.float32] | None = None) -> Subject:
-        """Return the sphere around a cloud's bulk; without Gaussians, around a mesh's vertices."""
-        points, thickness = np.zeros((1, 3)), 0.0
-        if len(cloud):
-            points = bulk(cloud.positions, cloud.opacities)
-            thickness = float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))  # of a surface's discs, their radius
-        elif vertices is not None:
-            points = np.asarray(vertices, np.float64)
-        center = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        radius = float(np.linalg.norm(points - center, axis=1).max())
-        radius = max(radius, 1e-3)
+        """Return the sphere around a cloud's bulk and what corners of triangles are near it; or around all corners."""
+        corners = np.zeros((0, 3)) if vertices is None else np.asarray(vertices, np.float64)
+        if not len(cloud):
+            return cls(*_sphere(corners if len(corners) else np.zeros((1, 3))))
+        points = bulk(cloud.positions, cloud.opacities)
+        center, radius = _sphere(points)
+        near = corners[np.linalg.norm(corners - center, axis=1) < NEARBY * radius]
+        center, radius = _sphere(np.concatenate([points, near]))
+        thickness = float(np.median(np.sort(cloud.scales, axis=1)[:, 1]))  # of a surface's discs, their radius
         return cls(center, radius, min(thickness, THICKEST * radius))
+
+
+def _sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the middle of the box around points, and how far they are from it; at least a millimetre."""
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return center, max(float(np.linalg.norm(points - center, axis=1).max()), 1e-3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from beam_warp.rasterizing import rasterize
 from beam_warp.shots import Shot, ShotMesh
 
 UP = np.array([0.0, 0.0, 1.0])
-PLAIN = DeferredOptions(environment_shadows=0, bounces=0)
+PLAIN = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=128)
 SMALL = DeferredOptions(environment_shadows=4, bounces=2, light_map_size=128, environment_map_size=64)
 FLOAT32 = float(np.finfo(np.float32).eps)
 
@@ -294,7 +294,7 @@ def test_bounces_in_a_closed_room(device):
 
 
 def plate(z=0.0, half=3.0, x=0.0, *, catches=False, color=1.0, flip=False):
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + [x, 0, 0]
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     return corners, faces[:, ::-1] if flip else faces, np.tile(-UP if flip else UP, (4, 1)), color, catches
 

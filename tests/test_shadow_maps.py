@@ -74,7 +74,7 @@ def empty():
 
 
 def square(z, half=0.5, x=0.0):
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + [x, 0, 0]
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
     return MaterialMesh(
         vertices=corners,
         faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -151,6 +151,8 @@ def test_the_subject_is_what_is_there():
     vertices = np.array([[0, 0, 0], [0, 0, 4]], np.float32)
     assert Subject.of(empty(), vertices).radius == pytest.approx(2.0)
     assert Subject.of(empty()).radius > 0.0
+    props = np.array([[1, 1.5, 0], [50, 0, 0]], np.float32)  # one is near
+    assert Subject.of(cloud, props).radius == pytest.approx(1.25)
 
 
 def test_taps_are_spread_over_the_disc():
@@ -167,7 +169,7 @@ def test_taps_are_spread_over_the_disc():
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (0.4, 0.2, -1.0)])
 def test_the_shadow_of_a_square(device, direction):
-    """Of triangles, under a light without size: lit and dark change within the filter, a texel and a half, and a bias."""
+    """Of triangles, under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
     light = DirectionalLight(direction=direction, irradiance=(1, 1, 1), angular_diameter=0.0)
     drawer = drawn(light, empty(), SUBJECT, device, mesh=square(0.5, half=0.25))
     x = np.linspace(-0.6, 0.6, 121)
@@ -187,7 +189,7 @@ def test_what_is_outside_of_the_map_is_lit(device):
 
 @pytest.mark.parametrize("diameter", [6.0, 12.0])
 def test_the_penumbra_of_an_edge(device, diameter):
-    """Behind a straight edge at a height h a point at x sees the part of the disc beyond a line: its share is a circle's
+    """Behind a straight edge at a height h a point at x sees the part of the disc beyond a line: a circle's
     segment of height 1 + x / (h tan). In the mean over many points with taps turned at random the place where half is
     seen, and the width (the standard deviation of its slope), are found within a texel."""
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
@@ -244,7 +246,7 @@ def test_a_translucent_layer_lets_the_rest_through(device, opacity):
 
 
 def test_two_layers_of_gaussians(device):
-    """Of a texel that shows a layer of more than half before another, the nearer one's share is told from both depths."""
+    """Where a layer of more than half is before another, the nearer one's share is told from both depths."""
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
     cloud = discs([[0, 0, 0.5], [0, 0, -0.5]], UP, 0.3, 0.99)
     opacities = np.array([0.7, 0.99], np.float32)
