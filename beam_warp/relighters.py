@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
-from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.evaluation import block_means
 from beam_warp.material_light import MaterialLight
 from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize, rasterize_values
+from beam_warp.rasterizing import rasterize_values
+from beam_warp.shots import Shot
 from beam_warp.traced_relighting import traced_radiance
 
 
@@ -59,11 +60,11 @@ class Relighter(Protocol):
 
 
 class DeferredRelighter:
-    """Lights a G-buffer as real-time renderers do (see `beam_warp.deferred`): its only shadow is ambient occlusion."""
+    """Lights a G-buffer as real-time renderers do, with shadow maps; see `beam_warp.deferred_rendering`."""
 
     def __init__(self) -> None:
-        """Start with no light made ready."""
-        self._lightings: dict[tuple[EnvironmentMap, str], EnvironmentLighting] = {}
+        """Start with no renderer."""
+        self._renderers: dict[tuple[RasterOptions, int, str], DeferredRenderer] = {}
 
     def __call__(
         self,
@@ -76,21 +77,20 @@ class DeferredRelighter:
         device: str | None,
     ) -> list[RelitImage]:
         """Light every sample of a pixel, and take their mean."""
-        lighting = self._lighting(environment, str(resolve_device(device)))
+        renderer = self._renderer(raster, samples, str(resolve_device(device)))
         images = []
         for camera in cameras:
-            buffer = rasterize(cloud, camera.supersampled(samples), options=raster, device=device)
-            images.append(
-                RelitImage(block_means(relight(buffer, lighting), samples), block_means(buffer.alpha, samples))
-            )
+            image = renderer.draw(Shot(cloud=cloud, camera=camera, environment=environment))
+            images.append(RelitImage(image.rgb, image.alpha))
         return images
 
-    def _lighting(self, environment: EnvironmentMap, device: str) -> EnvironmentLighting:
-        """Return a light made ready, once for all frames."""
-        key = (environment, device)
-        if key not in self._lightings:
-            self._lightings[key] = EnvironmentLighting.from_environment(environment, device=device)
-        return self._lightings[key]
+    def _renderer(self, raster: RasterOptions, samples: int, device: str) -> DeferredRenderer:
+        """Return a renderer, the same one for all frames: it keeps lights made ready."""
+        key = (raster, samples, device)
+        if key not in self._renderers:
+            options = DeferredOptions(samples=samples, layers=())
+            self._renderers[key] = DeferredRenderer(options, raster=raster, device=device)
+        return self._renderers[key]
 
 
 class TracedRelighter:

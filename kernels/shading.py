@@ -95,6 +95,34 @@ def specular_occlusion(ambient_occlusion: float, n_dot_v: float, roughness: floa
 
 
 @wp.func
+def seen_normal(raw_normal: wp.vec3, view: wp.vec3) -> wp.vec3:
+    """A normal of length 1; a blend whose normals cancel has none: take the one that is seen best."""
+    size = wp.length(raw_normal)
+    normal = view
+    if size > 1.0e-12:
+        normal = raw_normal / size
+    return normal
+
+
+@wp.func
+def reflected_radiance(light: EnvironmentLight, normal: wp.vec3, view: wp.vec3, roughness: float) -> wp.vec3:
+    """Radiance that the specular lobe sees, before its albedo; a normal that faces away is turned to graze the view, so
+    that the mirror direction stays outside."""
+    cosine = wp.dot(normal, view)
+    facing = normal
+    if cosine < MIN_N_DOT_V:
+        facing = wp.normalize(normal + (MIN_N_DOT_V - cosine) * view)
+    mirrored = 2.0 * wp.dot(facing, view) * facing - view
+    return blurred_radiance(light, wp.normalize(mirrored), roughness)
+
+
+@wp.func
+def view_albedo(light: EnvironmentLight, normal: wp.vec3, view: wp.vec3, roughness: float) -> float:
+    """Directional albedo of the specular lobe."""
+    return specular_albedo(light.albedo_terms, wp.clamp(wp.dot(normal, view), MIN_N_DOT_V, 1.0), roughness)
+
+
+@wp.func
 def environment_radiance(
     light: EnvironmentLight,
     base_color: wp.vec3,
@@ -104,22 +132,14 @@ def environment_radiance(
     view: wp.vec3,
 ) -> wp.vec3:
     """Radiance towards the camera; view is the unit direction from the surface to it."""
-    size = wp.length(raw_normal)
-    normal = view  # a blend whose normals cancel has none: take the one that is seen best
-    if size > 1.0e-12:
-        normal = raw_normal / size
-    cosine = wp.dot(normal, view)
-    facing = normal
-    if cosine < MIN_N_DOT_V:  # turned to graze the view, so that the mirror direction stays outside
-        facing = wp.normalize(normal + (MIN_N_DOT_V - cosine) * view)
-    n_dot_v = wp.clamp(cosine, MIN_N_DOT_V, 1.0)
-    mirrored = 2.0 * wp.dot(facing, view) * facing - view
-    reflected = specular_albedo(light.albedo_terms, n_dot_v, roughness)
+    normal = seen_normal(raw_normal, view)
+    reflected = view_albedo(light, normal, view, roughness)
     diffuse = wp.cw_mul(base_color, latlong_bilinear(light.irradiance, normal)) * (
         (1.0 - reflected) * ambient_occlusion / PI
     )
+    n_dot_v = wp.clamp(wp.dot(normal, view), MIN_N_DOT_V, 1.0)
     open_share = specular_occlusion(ambient_occlusion, n_dot_v, roughness)
-    return diffuse + blurred_radiance(light, wp.normalize(mirrored), roughness) * (reflected * open_share)
+    return diffuse + reflected_radiance(light, normal, view, roughness) * (reflected * open_share)
 
 
 @wp.kernel

@@ -1,16 +1,17 @@
-"""Relighters: all behind one call; the deferred one is the mean of what `relight` gives of every sample."""
+"""Relighters: all behind one call; the deferred one is the deferred renderer."""
 
 import numpy as np
 import pytest
 from figure_asset import figure_asset
 
-from beam_warp import relighters
+from beam_warp import arriving_light
 from beam_warp.cameras import Camera
-from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.deferred import EnvironmentLighting
+from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
 from beam_warp.environments import EnvironmentMap
 from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize
 from beam_warp.relighters import RELIGHTERS, DeferredRelighter
+from beam_warp.shots import Shot
 
 LIGHT = EnvironmentMap.constant((0.5, 0.7, 0.9))
 RASTER = RasterOptions(antialiased=True, low_pass=0.1)
@@ -35,14 +36,15 @@ def test_every_relighter_can_be_made_and_called(cloud, device):
             assert image.rgb[image.alpha == 0.0].max(initial=0.0) == 0.0
 
 
-def test_deferred_is_the_mean_of_what_samples_show(cloud, device):
-    (camera,) = cameras(cloud, 1)
-    lighting = EnvironmentLighting.from_environment(LIGHT, device=device)
-    buffer = rasterize(cloud, camera.supersampled(2), options=RASTER, device=device)
-    fine = relight(buffer, lighting).reshape(30, 2, 20, 2, 3)
-    (found,) = DeferredRelighter()(cloud, LIGHT, [camera], raster=RASTER, samples=2, device=device)
-    np.testing.assert_allclose(found.rgb, fine.mean(axis=(1, 3)), rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(found.alpha, buffer.alpha.reshape(30, 2, 20, 2).mean(axis=(1, 3)), rtol=1e-6)
+def test_deferred_is_what_the_renderer_draws(cloud, device):
+    views = cameras(cloud, 2)
+    options = DeferredOptions(samples=2)
+    found = DeferredRelighter()(cloud, LIGHT, views, raster=RASTER, samples=2, device=device)
+    for image, camera in zip(found, views, strict=True):
+        shot = Shot(cloud=cloud, camera=camera, environment=LIGHT)
+        expected = DeferredRenderer(options, raster=RASTER, device=device).draw(shot)
+        np.testing.assert_array_equal(image.rgb, expected.rgb)
+        np.testing.assert_array_equal(image.alpha, expected.alpha)
 
 
 def test_a_light_is_made_ready_once(cloud, monkeypatch):
@@ -55,7 +57,7 @@ def test_a_light_is_made_ready_once(cloud, monkeypatch):
             made.append(environment)
             return usual(environment, device=device)
 
-    monkeypatch.setattr(relighters, "EnvironmentLighting", Counting)
+    monkeypatch.setattr(arriving_light, "EnvironmentLighting", Counting)
     deferred = DeferredRelighter()
     for _ in range(2):
         deferred(cloud, LIGHT, cameras(cloud, 1), raster=RASTER, samples=1, device="cpu")
