@@ -50,6 +50,9 @@ NOISE_BLOCK = 8
 """Pixels are stopped in squares of this side, when the noisiest of a square is good enough: one alone may look good by
 chance."""
 
+WARP_TILE = (8, 4)
+"""Columns and rows of pixels that the threads of a warp trace."""
+
 DARKEST = 1e-3
 """Luminance below which noise counts as if there: the square root's slope has no bound at black."""
 
@@ -277,7 +280,7 @@ class PathProgress:
         self._images = PathImages()
         for name, dtype in IMAGES.items():
             setattr(self._images, name, wp.zeros(pixel_count, dtype=dtype, device=self._device))
-        self._pixels = upload(np.arange(pixel_count, dtype=np.int32), int, self._device)
+        self._pixels = upload(_tiled(shot.camera.width, shot.camera.height), int, self._device)
 
     @property
     def done(self) -> bool:
@@ -429,6 +432,15 @@ class PathProgress:
             upload(layers["depth"], float, self._device),
         )
         return denoise([noisy], guides, denoiser=denoiser)[0].numpy() * color
+
+
+def _tiled(width: int, height: int) -> NDArray[np.int32]:
+    """Return the numbers of all pixels, tile by tile: neighbours in the list meet the same Gaussians."""
+    row, column = np.divmod(np.arange(width * height, dtype=np.int64), width)
+    across, down = WARP_TILE
+    order = ((row // down) * (-(-width // across)) + column // across) * (across * down)
+    order += (row % down) * across + column % across
+    return np.argsort(order, kind="stable").astype(np.int32)
 
 
 def _standard_error(moments: NDArray[np.float32], passes: NDArray[np.int32]) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.evaluation import block_means
 from beam_warp.material_light import MaterialLight
+from beam_warp.path_rendering import PathOptions, PathRenderer
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize_values
 from beam_warp.shots import Shot
@@ -123,5 +124,44 @@ class TracedRelighter:
         return images
 
 
-RELIGHTERS: Mapping[str, Callable[[], Relighter]] = {"deferred": DeferredRelighter, "traced": TracedRelighter}
+PATHS_PER_PIXEL = 256
+"""Of the path tracer, when it is scored: four times as many add 0.2 dB on reconstructions of two captures."""
+
+
+class PathRelighter:
+    """Path traces every pixel (see `beam_warp.path_rendering`): what the offline renderer shows.
+
+    Gaussians are met as they are, without the filter of the rasteriser; ``raster`` and ``samples`` have no effect.
+    """
+
+    def __init__(self) -> None:
+        """Start with no renderer."""
+        self._renderers: dict[str, PathRenderer] = {}
+
+    def __call__(
+        self,
+        cloud: GaussianCloud,
+        environment: EnvironmentMap,
+        cameras: Sequence[Camera],
+        *,
+        raster: RasterOptions,
+        samples: int,
+        device: str | None,
+    ) -> list[RelitImage]:
+        """Trace each view by itself."""
+        target = str(resolve_device(device))
+        if target not in self._renderers:
+            self._renderers[target] = PathRenderer(PathOptions(samples=PATHS_PER_PIXEL), device=target)
+        images = []
+        for camera in cameras:
+            image = self._renderers[target].draw(Shot(cloud=cloud, camera=camera, environment=environment))
+            images.append(RelitImage(image.rgb, image.alpha))
+        return images
+
+
+RELIGHTERS: Mapping[str, Callable[[], Relighter]] = {
+    "deferred": DeferredRelighter,
+    "traced": TracedRelighter,
+    "path": PathRelighter,
+}
 """By name, what makes a relighter."""
