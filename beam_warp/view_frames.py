@@ -184,7 +184,7 @@ class FrameLoop:
                 self._guarded(export[0], lambda export=export: self._export(*export))
             elif order is not None and not self._guarded(order.client, lambda order=order: self._carry_out(order)):
                 with self._changed:  # it is not tried again before something changes
-                    self._schedule.done(order, milliseconds=None, is_over=True)
+                    self._schedule.failed(order)
                     self._tracings.pop(order.client, None)
 
     def _guarded(self, client: int, work: Callable[[], None]) -> bool:
@@ -217,17 +217,19 @@ class FrameLoop:
             picture = tracing.picture()
         else:
             picture = self._painter.draw(order.state, order.viewpoint.camera(order.scale, self._schedule.longest))
-        taken = 1000.0 * (self._clock() - started)
+        drawn = 1000.0 * (self._clock() - started) / max(samples, 1)
         with self._changed:
-            is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find
-            self._cost_key = key
-            self._schedule.done(order, milliseconds=taken if is_typical else None, samples=samples, is_over=is_over)
             is_wanted = self._schedule.is_wanted(order)
             if not is_wanted or order.kind != "traced":
                 self._tracings.pop(order.client, None)
         if is_wanted:
             is_last = order.is_last and (order.kind != "traced" or is_over)
-            self._deliver(order.client, Frame(picture, taken / max(samples, 1), is_last))
+            self._deliver(order.client, Frame(picture, drawn, is_last))
+        taken = 1000.0 * (self._clock() - started)
+        with self._changed:
+            is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find
+            self._cost_key = key
+            self._schedule.done(order, milliseconds=taken if is_typical else None, samples=samples, is_over=is_over)
 
     def _tracing(self, order: Order) -> Tracing:
         """Return what is traced for a page: as it was left, or a new one."""

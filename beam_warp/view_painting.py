@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -17,7 +18,7 @@ from beam_warp.cameras import Camera, bulk
 from beam_warp.channel_images import SeenChannel, channel_range, see_channel
 from beam_warp.devices import device_label, resolve_device
 from beam_warp.environments import EnvironmentMap
-from beam_warp.errors import InvalidOptionError
+from beam_warp.errors import BeamError, InvalidOptionError
 from beam_warp.material_mesh import MaterialMesh
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize
@@ -88,7 +89,7 @@ class CloudPainter:
     """Draws a sequence: lit, or one of its channels; satisfies `beam_warp.view_frames.Painter`.
 
     Attributes:
-        subject: The box that the first frame with Gaussians is in.
+        subject: The box that the first, the middle and the last frame are in.
         channels: What can be shown of it.
         has_lamps: Whether lamps and the ground are drawn.
         can_trace: Whether paths can be traced.
@@ -124,11 +125,9 @@ class CloudPainter:
         self._lights: OrderedDict[str, EnvironmentMap] = OrderedDict()
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
         self._deferred, self.has_lamps = deferred_renderer(self._raster, self._target)
-        first = next(
-            (cloud for cloud in map(self._frames.__getitem__, range(min(len(sequence), 8))) if len(cloud)), None
-        )
-        self.subject = Subject.of(np.zeros((0, 3)) if first is None else bulk(first.positions, first.opacities))
-        self.channels = channels_of(self._frames[0] if first is None else first)
+        clouds = self._looked_at()
+        self.subject = Subject.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
+        self.channels = channels_of(next(filter(len, clouds), clouds[0]))
         self._tracer = path_tracer(self._target) if LIT in self.channels else None
         self.can_trace = self._tracer is not None
         self._ground: tuple[str, ShotMesh] | None = None
@@ -160,6 +159,15 @@ class CloudPainter:
             )
         cloud = self._frames[state.frame]
         return TracedPicture(self._tracer.start(self._shot(state, cloud, camera)), state, len(cloud))
+
+    def _looked_at(self) -> list[GaussianCloud]:
+        """Return the first, the middle and the last frame; a broken one but the first says so when it is drawn."""
+        last = len(self._frames.sequence) - 1
+        clouds = [self._frames[0]]
+        for frame in sorted({last // 2, last} - {0}):
+            with contextlib.suppress(BeamError):
+                clouds.append(self._frames[frame])
+        return clouds
 
     def _shot(self, state: ViewState, cloud: GaussianCloud, camera: Camera) -> Shot:
         return Shot(
@@ -267,6 +275,11 @@ def _depth_range(seen: SeenChannel) -> tuple[float, float]:
     step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6)))  # ends that people can read
     first, last = math.floor(low / step) * step, math.ceil(high / step) * step
     return first, last if last > first else first + step
+
+
+def _bulk(cloud: GaussianCloud) -> NDArray[np.float64]:
+    """Return the positions that belong to the subject; none of an empty frame."""
+    return bulk(cloud.positions, cloud.opacities) if len(cloud) else np.zeros((0, 3))
 
 
 def _size(cloud: GaussianCloud) -> int:

@@ -207,7 +207,7 @@ class Schedule:
         return max(min(later), 1e-3) if later else None
 
     def done(self, order: Order, *, milliseconds: float | None, samples: int = 0, is_over: bool = False) -> None:
-        """Take note that an order was carried out, or failed.
+        """Take note that an order was carried out.
 
         Args:
             order: The order.
@@ -231,6 +231,13 @@ class Schedule:
             page.is_traced_out = is_over and page.version == order.version
         else:
             page.drawn_version, page.drawn_scale, page.is_sharp = order.version, order.scale, order.is_last
+
+    def failed(self, order: Order) -> None:
+        """Take note that an order cannot be carried out: the page gets nothing before something changes."""
+        page = self._pages.get(order.client)
+        if page is not None and page.version == order.version:
+            page.drawn_version = page.traced_version = order.version
+            page.is_sharp = page.is_traced_out = True
 
     def samples_at_a_time(self, order: Order, left: int) -> int:
         """Return how many paths a pixel to add: as many as a moment has room for, at most ``left``."""

@@ -175,14 +175,14 @@ class Viewer:
         self._loop.close()
         stop_server(self._server)
 
-    def _enter(self, client: viser.ClientHandle) -> None:
+    async def _enter(self, client: viser.ClientHandle) -> None:
         """Take a new page in."""
         page = _Page(client, self._loop, self._painter)
         self._pages[client.client_id] = page
         client.camera.on_update(page.look)
         self._loop.look(client.client_id, _viewpoint(client.camera))
 
-    def _leave(self, client: viser.ClientHandle) -> None:
+    async def _leave(self, client: viser.ClientHandle) -> None:
         """Forget a page."""
         self._pages.pop(client.client_id, None)
         self._loop.leave(client.client_id)
@@ -199,8 +199,13 @@ class Viewer:
 
     def _tick(self) -> None:
         """Let time run while it is played."""
-        while not self._is_closed.wait(self._controls.tick(time.monotonic())):
-            pass
+        pause = 0.0
+        while not self._is_closed.wait(pause):
+            try:
+                pause = self._controls.tick(time.monotonic())
+            except Exception:
+                log.exception("time stood still")
+                pause = 1.0
 
 
 class _Page:
