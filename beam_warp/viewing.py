@@ -161,6 +161,17 @@ class Viewer:
         """How many pages look."""
         return len(self._pages)
 
+    @property
+    def state(self) -> ViewState:
+        """What is looked at."""
+        return self._loop.state
+
+    def change(self, **values: Any) -> ViewState:
+        """Change what is looked at as the controls do, and the controls with it; see `ViewState.changed`."""
+        state = self._loop.change(**values)
+        self._controls.follow(state)
+        return state
+
     def wait(self) -> None:
         """Return when the viewer is closed."""
         while not self._is_closed.wait(1.0):
@@ -272,6 +283,7 @@ class _Controls:
         self._painter = painter
         self._frame_count = len(sequence)
         self._playback: Playback | None = None
+        self._bound: dict[str, tuple[Any, Callable[[Any], Any]]] = {}
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         server.scene.set_up_direction("+z")
         with server.gui.add_folder("Picture"):
@@ -293,27 +305,26 @@ class _Controls:
         playback = self._playback
         if playback is None:
             return 0.05
-        self._frame.value = playback.frame_at(now)
+        frame = playback.frame_at(now)
+        self._loop.change(frame=frame)
+        self._frame.value = frame
         if playback.is_over(now):
             self._playing.value = False
         return min(0.05, 0.5 / playback.frames_per_second)
 
     def _add_picture(self, gui: viser.GuiApi, state: ViewState) -> None:
         words = {LABELS.get(name, name): name for name in self._painter.channels}
-        self._bind(
-            gui.add_dropdown("Channel", tuple(words), initial_value=LABELS.get(state.channel, state.channel)),
-            lambda word: {"channel": words[word]},
-        )
+        names = {name: word for word, name in words.items()}
+        channels = gui.add_dropdown("Channel", tuple(words), initial_value=names[state.channel])
+        self._bind("channel", channels, words.__getitem__, names.__getitem__)
         if self._painter.can_trace:
-            modes = gui.add_dropdown(
-                "Mode", (DEFERRED, TRACED), initial_value=state.mode, hint="Paths are traced when still"
-            )
-            self._bind(modes, lambda mode: {"mode": mode})
-            self._bind(gui.add_number("Samples", state.samples, min=1, step=1), lambda count: {"samples": count})
-        self._bind(gui.add_rgb("Background", state.background), lambda color: {"background": color})
+            hint = "Paths are traced once nothing moves"
+            self._bind("mode", gui.add_dropdown("Mode", (DEFERRED, TRACED), initial_value=state.mode, hint=hint))
+            self._bind("samples", gui.add_number("Samples", state.samples, min=1, step=1))
+        self._bind("background", gui.add_rgb("Background", state.background))
         if self._painter.has_lamps and LIT in self._painter.channels:
-            grounds = gui.add_dropdown("Ground", (NO_GROUND, GREY_GROUND, SHADOW_GROUND), initial_value=state.ground)
-            self._bind(grounds, lambda ground: {"ground": ground})
+            grounds = (NO_GROUND, GREY_GROUND, SHADOW_GROUND)
+            self._bind("ground", gui.add_dropdown("Ground", grounds, initial_value=state.ground))
         gui.add_button("Frame subject").on_click(self._frame_subject)
 
     def _add_time(self, gui: viser.GuiApi, sequence: GaussianSequence, state: ViewState) -> None:
@@ -321,10 +332,10 @@ class _Controls:
         self._playing = gui.add_checkbox("Play", False)
         self._rate = gui.add_number("Frames/s", float(sequence.frames_per_second), min=0.1, max=240.0, step=0.1)
         self._loops = gui.add_checkbox("Loop", True)
+        self._bind("frame", self._frame)
 
         @self._frame.on_update
         async def _(event: Any) -> None:
-            self._loop.change(frame=event.target.value)
             if event.client is not None and self._playback is not None:  # a hand moved it: time goes on from there
                 self._play()
 
@@ -347,21 +358,15 @@ class _Controls:
 
     def _add_light(self, gui: viser.GuiApi, environments: tuple[str, ...], state: ViewState) -> None:
         names = (*environments, NO_ENVIRONMENT)
-        self._bind(
-            gui.add_dropdown("Environment", names, initial_value=state.environment), lambda name: {"environment": name}
-        )
-        self._bind(
-            gui.add_slider("Rotation [°]", -180.0, 180.0, 1.0, float(np.clip(state.rotation, -180.0, 180.0))),
-            lambda degrees: {"rotation": degrees},
-        )
-        self._bind(
-            gui.add_slider("Exposure [stops]", -6.0, 6.0, 0.1, float(np.clip(state.exposure, -6.0, 6.0))),
-            lambda stops: {"exposure": stops},
-        )
+        self._bind("environment", gui.add_dropdown("Environment", names, initial_value=state.environment))
+        turn = float(np.clip(state.rotation, -180.0, 180.0))
+        self._bind("rotation", gui.add_slider("Rotation [°]", -180.0, 180.0, 1.0, turn))
+        stops = float(np.clip(state.exposure, -6.0, 6.0))
+        self._bind("exposure", gui.add_slider("Exposure [stops]", -6.0, 6.0, 0.1, stops))
         transforms = view_transforms()
         if len(transforms) > 1:
             chosen = gui.add_dropdown("View transform", transforms, initial_value=state.transform)
-            self._bind(chosen, lambda name: {"transform": name})
+            self._bind("transform", chosen)
 
     def _add_save(self, gui: viser.GuiApi) -> None:
         gui.add_button("Save PNG", hint="As it is shown, in the page's full size").on_click(
@@ -395,12 +400,32 @@ class _Controls:
             event.client.camera.look_at = self._painter.subject.center
             event.client.camera.up_direction = (0.0, 0.0, 1.0)
 
-    def _bind(self, control: Any, values: Callable[[Any], dict[str, Any]]) -> None:
-        """Let a control change what is looked at."""
+    def follow(self, state: ViewState) -> None:
+        """Let the controls show a state."""
+        for name, (control, shown) in self._bound.items():
+            control.value = shown(getattr(state, name))
+
+    def _bind(
+        self,
+        name: str,
+        control: Any,
+        meant: Callable[[Any], Any] = lambda value: value,
+        shown: Callable[[Any], Any] = lambda value: value,
+    ) -> None:
+        """Let a control change a part of what is looked at.
+
+        Args:
+            name: Of `ViewState`.
+            control: What shows it.
+            meant: What a value of the control means.
+            shown: The control's value for a meaning.
+        """
+        self._bound[name] = control, shown
 
         @control.on_update
         async def _(event: Any) -> None:
-            self._loop.change(**values(event.target.value))
+            if event.client is not None:  # a hand, and not `follow`
+                self._loop.change(**{name: meant(event.target.value)})
 
 
 def _possible(state: ViewState, painter: CloudPainter) -> ViewState:

@@ -20,6 +20,8 @@ CHROMIUM = os.environ.get("BEAM_CHROMIUM") or shutil.which("chromium") or shutil
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (set BEAM_CHROMIUM)", allow_module_level=True)
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 900, 480
 SEEN = slice(320, 560)
 """Columns between the note on the left, which says that this browser draws in software, and the controls."""
@@ -31,6 +33,8 @@ FLAGS = (
 )
 SHARP = "?fixedDpr=1"
 """Part of the address: the page takes away no pixels where it is slow."""
+
+FIRST = {"frame": 0, "channel": "lit", "environment": "studio", "rotation": 0.0, "exposure": 0.0}
 
 BACKGROUND = (33, 33, 33)
 
@@ -58,19 +62,25 @@ def browser():
         opened.close()
 
 
-@pytest.fixture
-def page(viewer, browser):
-    """A new page on the first state, which has its sharp picture; nothing may be wrong in it until it is closed."""
-    viewer._loop.change(frame=0, channel="lit", environment="studio", rotation=0.0, exposure=0.0)
-    opened = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+@pytest.fixture(scope="module")
+def opened(viewer, browser):
+    """A page in which nothing goes wrong."""
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     wrong = []
-    opened.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-    opened.on("pageerror", lambda error: wrong.append(str(error)))
-    opened.goto(viewer.url + SHARP)
-    settled(opened, viewer)
-    yield opened
-    opened.close()
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(viewer.url + SHARP)
+    yield page
+    page.close()
     assert wrong == []
+
+
+@pytest.fixture
+def page(viewer, opened):
+    """The page on the first state, with its sharp picture."""
+    viewer.change(**FIRST)
+    settled(opened, viewer)
+    return opened
 
 
 def screen(page):
@@ -82,7 +92,7 @@ def screen(page):
 def ours(viewer, client):
     """What the page of a client is to show, drawn here and now."""
     viewpoint, _ = viewer._loop._schedule.seen(client)
-    return viewer._painter.draw(viewer._loop.state, viewpoint.camera(1.0, 4096)).pixels[:, SEEN].astype(int)
+    return viewer._painter.draw(viewer.state, viewpoint.camera(1.0, 4096)).pixels[:, SEEN].astype(int)
 
 
 def newest(viewer):
@@ -148,36 +158,40 @@ def test_a_drag_orbits(page, viewer, tmp_path):
     page.mouse.down()
     page.mouse.move(430, 300, steps=8)
     page.mouse.up()
-    settled(page, viewer, before)
+    turned = settled(page, viewer, before)
     keep(page, tmp_path, "orbit")
     end, _ = viewer._loop._schedule.seen(newest(viewer))
     center = viewer._painter.subject.center
     away = [np.asarray(view.position) - center for view in (start, end)]
     assert np.linalg.norm(away[1]) == pytest.approx(np.linalg.norm(away[0]), rel=1e-3)  # it goes round, not away
-    turned = np.degrees(np.arctan2(away[1][1], away[1][0]) - np.arctan2(away[0][1], away[0][0]))
-    assert 10.0 < abs((turned + 180.0) % 360.0 - 180.0) < 170.0
+    angle = np.degrees(np.arctan2(away[1][1], away[1][0]) - np.arctan2(away[0][1], away[0][0]))
+    assert 10.0 < abs((angle + 180.0) % 360.0 - 180.0) < 170.0
+    page.get_by_role("button", name="Frame subject").click()
+    settled(page, viewer, turned)
+    back, _ = viewer._loop._schedule.seen(newest(viewer))
+    np.testing.assert_allclose(back.position, start.position, atol=1e-2)
 
 
 def test_sliders_change_time_and_light(page, viewer, tmp_path):
     before = screen(page)
     slide(page, "Frame", "ArrowRight", 2)
     moved = settled(page, viewer, before)
-    assert viewer._loop.state.frame == 2
+    assert viewer.state.frame == 2
     keep(page, tmp_path, "later")
     slide(page, "Rotation", "End")
     turned = settled(page, viewer, moved)
-    assert viewer._loop.state.rotation == 180.0
+    assert viewer.state.rotation == 180.0
     keep(page, tmp_path, "turned")
     slide(page, "Exposure", "ArrowLeft", 15)
     settled(page, viewer, turned)
-    assert viewer._loop.state.exposure == pytest.approx(-1.5)
+    assert viewer.state.exposure == pytest.approx(-1.5)
 
 
 def test_choices_change_the_picture(page, viewer, tmp_path):
     before = screen(page)
     choose(page, "lit", "normals")
     normals = settled(page, viewer, before)
-    assert viewer._loop.state.channel == "normals"
+    assert viewer.state.channel == "normals"
     keep(page, tmp_path, "normals")
     choose(page, "normals", "depth")
     settled(page, viewer, normals)
@@ -195,7 +209,7 @@ def test_time_runs(page, viewer):
     ).click()
     seen, deadline = set(), time.monotonic() + PATIENCE
     while len(seen) < 3 and time.monotonic() < deadline:
-        seen.add(viewer._loop.state.frame)
+        seen.add(viewer.state.frame)
         time.sleep(0.01)
     viewer._controls._playing.value = False
     assert seen == {0, 1, 2}
@@ -223,9 +237,9 @@ def test_two_pages_look_from_two_sides_and_one_leaves(page, viewer, browser):
         other.wait_for_timeout(100)
     sizes = {viewer._loop._schedule.seen(client)[0].width for client in (first, newest(viewer))}
     assert sizes == {WIDTH, 700}
-    viewer._loop.change(rotation=50.0)
+    viewer.change(rotation=50.0)
     other.close()  # in the middle of its frame
-    viewer._loop.change(rotation=120.0)
+    viewer.change(rotation=120.0)
     deadline = time.monotonic() + PATIENCE
     while viewer.page_count > 1 and time.monotonic() < deadline:
         page.wait_for_timeout(100)
@@ -236,6 +250,7 @@ def test_two_pages_look_from_two_sides_and_one_leaves(page, viewer, browser):
 def test_a_window_that_is_resized(page, viewer):
     page.set_viewport_size({"width": WIDTH, "height": 400})
     shown = settled(page, viewer)
+    page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
     assert shown.shape[0] == 400
 
 
@@ -244,5 +259,5 @@ def test_what_fails_is_said_on_the_page(page, viewer, tmp_path):
     viewer._loop.change(environment="moon")
     page.get_by_text("This could not be drawn").first.wait_for(timeout=1000 * PATIENCE)
     keep(page, tmp_path, "failed")
-    viewer._loop.change(environment="stage")
+    viewer.change(environment="stage")
     settled(page, viewer, before)
