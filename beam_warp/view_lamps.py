@@ -41,7 +41,11 @@ class Lamps:
         self._count = 0
         self._kind = server.gui.add_dropdown("New light", KINDS)
         self._add = server.gui.add_button("Add light", hint="Drag its handle in the picture")
-        self._add.on_click(lambda _: self.add(self._kind.value))
+
+        @self._add.on_click
+        def _(_: Any) -> None:
+            self.add(self._kind.value)
+
         self._folder = server.gui.add_folder("Placed lights", visible=False)
 
     def add(self, kind: LightKind) -> int | None:

@@ -277,17 +277,17 @@ class Subject:
         return max(float(np.linalg.norm(self.high - self.low)), 1e-3)
 
     def new_light(self, kind: LightKind) -> PlacedLight:
-        """Return a light to the subject's left front, above it, that shines on it.
+        """Return a light to the subject's left front that shines on it, where a page that frames the subject sees it.
 
         Point and spot lights give white about the irradiance π: as much as an environment of radiance 1 from all sides.
         """
-        offset = self.extent * np.array([-0.55, -0.7, 0.5])
+        offset = self.extent * np.array([-0.35, -0.3, 0.25])
         x, y, z = (self.center + offset).tolist()
         squared = float(offset @ offset)
         return PlacedLight(
             kind=kind,
             position=(x, y, z),
-            wxyz=turn_to((-offset).tolist()),
+            wxyz=(1.0, 0.0, 0.0, 0.0) if kind == "point" else turn_to((-offset).tolist()),
             power=float(f"{math.pi * (1.0 if kind == 'directional' else squared):.2g}"),
             size=0.53 if kind == "directional" else float(f"{0.03 * self.extent:.1g}"),
         )

@@ -70,6 +70,9 @@ def opened(viewer, browser):
     page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.goto(viewer.url + SHARP)
+    note = page.get_by_text("Software WebGL rendering detected")
+    if note.is_visible():
+        page.locator(".mantine-Notification-closeButton").first.click()
     yield page
     page.close()
     assert wrong == []
@@ -261,3 +264,48 @@ def test_what_fails_is_said_on_the_page(page, viewer, tmp_path):
     keep(page, tmp_path, "failed")
     viewer.change(environment="stage")
     settled(page, viewer, before)
+
+
+def lights_page(page, viewer):
+    if not viewer._painter.has_lamps:
+        pytest.skip("the renderer knows no lamps")
+    folder = page.get_by_text("Lamps", exact=True)
+    if not page.get_by_role("button", name="Add light").is_visible():
+        folder.click()
+    return page.get_by_role("button", name="Add light")
+
+
+def test_a_light_is_added_dragged_and_taken_away(page, viewer, tmp_path):
+    add = lights_page(page, viewer)
+    viewer.change(environment="none")
+    dark = settled(page, viewer)
+    add.click()
+    deadline = time.monotonic() + PATIENCE
+    while not viewer.state.lights and time.monotonic() < deadline:
+        page.wait_for_timeout(100)
+    page.wait_for_timeout(1000)
+    keep(page, tmp_path, "lamp")
+    (light,) = viewer.state.lights
+    view, _ = viewer._loop._schedule.seen(newest(viewer))
+    size = 0.15 * viewer._painter.subject.extent
+    place = np.asarray(light.position)
+    arrow = place + np.array([0.0, 0.0, 0.7 * size])  # the handle's arrow upwards
+    higher = arrow + np.array([0.0, 0.0, 0.2])
+    (x, y, _), (up_x, up_y, _) = view.camera(1.0, 4096).project(np.stack([arrow, higher]))
+    page.mouse.move(x, y)
+    page.wait_for_timeout(300)
+    page.mouse.down()
+    page.mouse.move(up_x, up_y, steps=6)
+    page.mouse.up()
+    page.wait_for_timeout(1000)
+    keep(page, tmp_path, "dragged")
+    (moved,) = viewer.state.lights
+    step = np.asarray(moved.position) - place
+    assert step[2] == pytest.approx(0.2, abs=0.05)
+    np.testing.assert_allclose(step[:2], 0.0, atol=1e-3)
+    assert differs(screen(page), dark) > 0.02
+    page.get_by_role("button", name="Remove").first.click()
+    while viewer.state.lights and time.monotonic() < deadline:
+        page.wait_for_timeout(100)
+    assert viewer.state.lights == ()
+    settled(page, viewer)
