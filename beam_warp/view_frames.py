@@ -61,8 +61,8 @@ class Tracing(Protocol):
 class Painter(Protocol):
     """Draws states; called from one thread."""
 
-    def draw(self, state: ViewState, camera: Camera) -> Picture:
-        """Draw a state at once."""
+    def draw(self, state: ViewState, camera: Camera, *, is_quick: bool = False) -> Picture:
+        """Draw a state at once; quickly, if something moves."""
         ...
 
     def trace(self, state: ViewState, camera: Camera) -> Tracing:
@@ -205,7 +205,7 @@ class FrameLoop:
         started = self._clock()
         samples = 0
         is_over = False
-        key = (order.kind == "traced", self._painter.cost_key(order.state))
+        key = (order.kind, self._painter.cost_key(order.state))
         if order.kind == "traced":
             tracing = self._tracing(order)
             with self._changed:
@@ -216,7 +216,8 @@ class FrameLoop:
             is_over = tracing.sample_count >= order.state.samples
             picture = tracing.picture()
         else:
-            picture = self._painter.draw(order.state, order.viewpoint.camera(order.scale, self._schedule.longest))
+            camera = order.viewpoint.camera(order.scale, self._schedule.longest)
+            picture = self._painter.draw(order.state, camera, is_quick=order.kind == "moving")
         drawn = 1000.0 * (self._clock() - started) / max(samples, 1)
         with self._changed:
             is_wanted = self._schedule.is_wanted(order)

@@ -137,6 +137,9 @@ class _Lamp:
             color = gui.add_rgb("Colour", self.placed.color)
             strength = gui.add_number(power, self.placed.power, min=0.0, max=1e6, step=0.1)
             width = gui.add_number(extent, self.placed.size, min=0.0, max=90.0, step=0.01, hint="0 casts sharp shadows")
+            if kind == "spot":
+                cone = gui.add_number("Cone [°]", self.placed.cone, min=1.0, max=89.0, step=1.0)
+                cone.on_update(lambda event: self.change(cone=event.target.value))
             shadows = gui.add_checkbox("Casts shadows", True)
             gone = gui.add_button("Remove", color="red")
         color.on_update(lambda event: self._paint(event.target.value))

@@ -24,7 +24,7 @@ from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize
 from beam_warp.shots import RenderedImage, Shot, ShotMesh
 from beam_warp.view_frames import Picture
-from beam_warp.view_renderers import Progress, deferred_renderer, displayed, path_tracer
+from beam_warp.view_renderers import DeferredPair, Progress, displayed, path_tracer
 from beam_warp.view_state import (
     ALPHA,
     DEPTH,
@@ -124,7 +124,8 @@ class CloudPainter:
         self._environments = dict(environments)
         self._lights: OrderedDict[str, EnvironmentMap] = OrderedDict()
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
-        self._deferred, self.has_lamps = deferred_renderer(self._raster, self._target)
+        self._deferred = DeferredPair(self._raster, self._target)
+        self.has_lamps = self._deferred.has_lamps
         clouds = self._looked_at()
         self.subject = Subject.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
         self.channels = channels_of(next(filter(len, clouds), clouds[0]))
@@ -134,13 +135,18 @@ class CloudPainter:
 
     def cost_key(self, state: ViewState) -> object:
         """Return what must be the same for two pictures of a size to take about the same time."""
-        return state.channel, state.environment, state.ground, len(state.lights)
+        return state.channel, state.environment, state.ground, len(state.lights), state.environment_shadows
 
-    def draw(self, state: ViewState, camera: Camera) -> Picture:
-        """Draw a state at once."""
+    def draw(self, state: ViewState, camera: Camera, *, is_quick: bool = False) -> Picture:
+        """Draw a state at once; quickly, if something moves."""
         cloud = self._frames[state.frame]
         if state.channel == LIT:
-            image = self._deferred.draw(self._shot(state, cloud, camera))
+            image = self._deferred.draw(
+                self._shot(state, cloud, camera),
+                lighting=state.lighting,
+                is_thorough=state.environment_shadows,
+                is_quick=is_quick,
+            )
             return _lit_picture(image, state, len(cloud))
         seen = self._seen(state.channel, cloud, camera)
         value_range = _depth_range(seen) if state.channel == DEPTH else channel_range(cloud, state.channel)

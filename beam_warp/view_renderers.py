@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +17,9 @@ from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize
 from beam_warp.shots import ImageRenderer, RenderedImage, Shot
 from beam_warp.view_state import Color, rotation_of
+
+QUICK_MAP_SIZE = 256
+"""Side of shadow maps of lamps while something moves, where there is no GPU [texel]."""
 
 
 class Progress(Protocol):
@@ -71,12 +75,44 @@ class EnvironmentRenderer:
         return RenderedImage(rgb, buffer.alpha, layers)
 
 
-def deferred_renderer(raster: RasterOptions, device: str | None) -> tuple[ImageRenderer, bool]:
-    """Return what lights at once, and whether it knows lamps and meshes."""
-    found = _module("deferred_rendering")
-    if found is None:
-        return EnvironmentRenderer(raster=raster, device=device), False
-    return found.DeferredRenderer(raster=raster, device=device), True
+class DeferredPair:
+    """Renders at once: thoroughly, or quickly where shadows of the environment would take seconds.
+
+    Attributes:
+        has_lamps: Whether lamps and meshes are drawn.
+    """
+
+    def __init__(self, raster: RasterOptions, device: str | None) -> None:
+        """Choose renderers; on a GPU, what is thorough is quick."""
+        found = _module("deferred_rendering")
+        self.has_lamps = found is not None
+        self._is_fast = bool(resolve_device(device).is_cuda)
+        self._lit: object = None
+        if found is None:
+            self._quick: ImageRenderer = EnvironmentRenderer(raster=raster, device=device)
+            self._thorough = self._quick
+            return
+        options = _module("deferred_options").DeferredOptions
+        plain = options(layers=(), environment_shadows=0, bounces=0)
+        if not self._is_fast:
+            plain = replace(plain, light_map_size=QUICK_MAP_SIZE)
+        self._quick = found.DeferredRenderer(plain, raster=raster, device=device)
+        self._thorough = found.DeferredRenderer(options(layers=()), raster=raster, device=device)
+
+    def draw(self, shot: Shot, *, lighting: object, is_thorough: bool, is_quick: bool) -> RenderedImage:
+        """Render a shot.
+
+        Args:
+            shot: What is rendered.
+            lighting: What light depends on: where it is what it was, what was found for it is there.
+            is_thorough: Whether the environment is to cast shadows.
+            is_quick: Whether something moves.
+        """
+        if not is_thorough or (is_quick and not self._is_fast and lighting != self._lit):
+            return self._quick.draw(shot)
+        image = self._thorough.draw(shot)
+        self._lit = lighting
+        return image
 
 
 def path_tracer(device: str | None) -> PathTracer | None:

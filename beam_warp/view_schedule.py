@@ -219,7 +219,7 @@ class Schedule:
         if milliseconds is not None:
             if order.kind == "traced":
                 self.traced.note(width * height, milliseconds / max(samples, 1))
-            else:
+            elif order.kind == "moving":
                 self.moving.note(width * height, milliseconds)
         page = self._pages.get(order.client)
         if page is None:

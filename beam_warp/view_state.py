@@ -37,6 +37,9 @@ LIMITS = {
 }
 """Least and most of every number."""
 
+SPOT_CORE = 0.7
+"""Of a spot light's cone, the part that gets all of its light."""
+
 LARGEST_SIDE = 8192
 """Sides of a page beyond this are a mistake [pixel]."""
 
@@ -58,6 +61,8 @@ class ViewState:
         background: Display colour behind everything, 0 to 255.
         lights: Lamps and suns besides.
         ground: `NO_GROUND`, `GREY_GROUND` or `SHADOW_GROUND`.
+        environment_shadows: Whether the environment casts shadows and light goes from surface to surface, in what is
+            deferred; where there is no GPU, once nothing moves.
         mode: `DEFERRED` or `TRACED`.
         samples: Paths a pixel at which path tracing ends.
     """
@@ -71,6 +76,7 @@ class ViewState:
     background: Color = (33, 33, 33)
     lights: tuple[Light, ...] = ()
     ground: str = NO_GROUND
+    environment_shadows: bool = True
     mode: str = DEFERRED
     samples: int = 256
 
@@ -89,6 +95,11 @@ class ViewState:
             else:
                 kept[name] = value
         return replace(self, **kept)
+
+    @property
+    def lighting(self) -> object:
+        """What light on the subject depends on, from wherever it is seen."""
+        return self.frame, self.environment, self.rotation, self.lights, self.ground
 
     @property
     def is_traced(self) -> bool:
@@ -192,6 +203,7 @@ class PlacedLight:
         color: Display colour of the light, 0 to 255.
         power: Of a directional light the irradiance [W/m^2], else the radiant intensity [W/sr], of white.
         size: Radius [m]; of a directional light the angular diameter [degree].
+        cone: Of a spot light, the angle between its axis and where light ends [degree].
         casts_shadows: Whether what is in the way casts a shadow.
     """
 
@@ -201,12 +213,14 @@ class PlacedLight:
     color: Color = (255, 255, 255)
     power: float = 3.0
     size: float = 0.0
+    cone: float = 60.0
     casts_shadows: bool = True
 
     def changed(self, **values: Any) -> PlacedLight:
         """Return the light with other values; what is not finite is left as it was, what is out of range is cut."""
         kept = dict(values)
-        limits = {"power": (0.0, 1e6), "size": (0.0, 90.0 if self.kind == "directional" else 100.0)}
+        widest = 90.0 if self.kind == "directional" else 100.0
+        limits = {"power": (0.0, 1e6), "size": (0.0, widest), "cone": (1.0, 89.0)}
         for name, (low, high) in limits.items():
             if name in kept:
                 kept[name] = number_within(kept[name], getattr(self, name), low, high)
@@ -235,6 +249,8 @@ class PlacedLight:
                 position=self.position,
                 direction=direction,
                 intensity=power,
+                inner_angle=SPOT_CORE * self.cone,
+                outer_angle=self.cone,
                 radius=self.size,
                 casts_shadows=self.casts_shadows,
             )

@@ -116,7 +116,7 @@ class Viewer:
             sequence: What is looked at; frames are read when they are wanted.
             environments: By name, what reads or makes a light; the first one shines at first.
             title: Above the controls.
-            state: What is looked at first; of the channel and the light, what there is.
+            state: What is looked at first, as far as it is there; environments cast shadows at first only on a GPU.
             options: See `ViewOptions`.
 
         Raises:
@@ -359,6 +359,10 @@ class _Controls:
     def _add_light(self, gui: viser.GuiApi, environments: tuple[str, ...], state: ViewState) -> None:
         names = (*environments, NO_ENVIRONMENT)
         self._bind("environment", gui.add_dropdown("Environment", names, initial_value=state.environment))
+        if self._painter.has_lamps:
+            hint = "And light from surface to surface; without a GPU, once nothing moves, and it takes seconds"
+            shadows = gui.add_checkbox("Environment shadows", state.environment_shadows, hint=hint)
+            self._bind("environment_shadows", shadows)
         turn = float(np.clip(state.rotation, -180.0, 180.0))
         self._bind("rotation", gui.add_slider("Rotation [°]", -180.0, 180.0, 1.0, turn))
         stops = float(np.clip(state.exposure, -6.0, 6.0))
@@ -434,7 +438,10 @@ def _possible(state: ViewState, painter: CloudPainter) -> ViewState:
     mode = state.mode if painter.can_trace else DEFERRED
     transforms = view_transforms()
     return state.changed(
-        channel=channel, mode=mode, transform=state.transform if state.transform in transforms else transforms[0]
+        environment_shadows=state.environment_shadows and painter.is_cuda,
+        channel=channel,
+        mode=mode,
+        transform=state.transform if state.transform in transforms else transforms[0],
     )
 
 

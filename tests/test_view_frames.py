@@ -36,7 +36,7 @@ class FakePainter:
         self.drawn = []
         self.traced = 0
 
-    def draw(self, state, camera):
+    def draw(self, state, camera, *, is_quick=False):
         self.gate.wait(PATIENCE)
         if state.frame == 13:
             raise ValueError("thirteen")
