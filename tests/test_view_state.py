@@ -138,6 +138,13 @@ def test_lights_are_what_was_placed():
     assert (sun.direction, sun.angular_diameter, sun.casts_shadows) == ((0.0, 0.0, -1.0), 0.53, False)
 
 
+def test_a_spot_light_has_a_cone():
+    spot = PlacedLight(kind="spot", position=(0, 0, 0)).changed(cone=40.0).light()
+    assert (spot.outer_angle, spot.inner_angle) == (40.0, pytest.approx(28.0))
+    for cone in (-5.0, 1e9, math.nan):
+        assert isinstance(PlacedLight(kind="spot", position=(0, 0, 0)).changed(cone=cone).light(), SpotLight)
+
+
 def test_placed_lights_take_no_nonsense():
     placed = PlacedLight(kind="spot", position=(1.0, 2.0, 3.0), power=2.0)
     nowhere = placed.changed(position=(math.nan, 0, 0), wxyz=(0, 0, 0, 0), power=math.nan, size=math.inf, color=(1, 2))

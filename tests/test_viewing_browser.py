@@ -82,6 +82,7 @@ def opened(viewer, browser):
 def page(viewer, opened):
     """The page on the first state, with its sharp picture."""
     viewer.change(**FIRST)
+    opened.get_by_role("button", name="Frame subject").click()  # keys that move sliders orbit too
     settled(opened, viewer)
     return opened
 
@@ -309,3 +310,17 @@ def test_a_light_is_added_dragged_and_taken_away(page, viewer, tmp_path):
         page.wait_for_timeout(100)
     assert viewer.state.lights == ()
     settled(page, viewer)
+
+
+def test_paths_are_traced_once_nothing_moves(page, viewer, tmp_path):
+    if not viewer._painter.can_trace:
+        pytest.skip("there is no path tracer")
+    viewer.change(samples=4)
+    choose(page, "deferred", "path traced")
+    page.get_by_text("· 4 samples ·").wait_for(timeout=1000 * PATIENCE)
+    keep(page, tmp_path, "traced")
+    covered = np.abs(screen(page) - BACKGROUND).max(axis=-1) > 24
+    viewer.change(mode="deferred")
+    deferred = np.abs(settled(page, viewer) - BACKGROUND).max(axis=-1) > 24
+    both = (covered & deferred).sum() / (covered | deferred).sum()
+    assert both > 0.85  # the same subject, but for the edges of a coarser picture
