@@ -102,21 +102,30 @@ class SeenChannel:
         Returns:
             8-bit sRGB, ``(H + legend, W, 3)``.
         """
-        alpha = self.alpha[..., None]
+        shown = over_background(self.colors(value_range), self.alpha[..., None])
+        legend = self.legend(shown.shape[1], value_range)
+        return shown if legend is None else np.concatenate([shown, legend])
+
+    def colors(self, value_range: tuple[float, float] = (0.0, 1.0)) -> NDArray[np.float64]:
+        """Return the display colours of a picture in [0, 1], nothing behind them and not multiplied by alpha."""
         if self.name == OBSERVABILITY:
-            shown = over_background(_flag_colors(self.values), alpha)
-            shares = self.flag_shares()
-            entries = [(f"{word} {shares[word]:.1%}", color) for word, color in FLAG_COLORS.values()]
-            return np.concatenate([shown, _flag_legend(shown.shape[1], [*entries, ("none of these", OBSERVED_COLOR)])])
+            return _flag_colors(self.values)
         if self.is_mapped:
             low, high = value_range
             numbers = self.values if self.values.ndim == 2 else np.sqrt((self.values**2).mean(axis=-1))
-            shown = over_background(_viridis((numbers - low) / (high - low)), alpha)
-            return np.concatenate([shown, _bar_legend(shown.shape[1], self.name, low, high)])
+            return _viridis((numbers - low) / (high - low))
         if self.name in UNIT_CHANNELS:
-            return over_background(0.5 * self.values + 0.5, alpha)
+            return 0.5 * self.values.astype(np.float64) + 0.5
         straight = self.values if self.is_display else display_image(self.values) / 255.0
-        return over_background(np.clip(straight, 0.0, 1.0), alpha)
+        return np.clip(straight, 0.0, 1.0).astype(np.float64)
+
+    def legend(self, width: int, value_range: tuple[float, float] = (0.0, 1.0)) -> NDArray[np.uint8] | None:
+        """Return what the colours of a picture mean, ``(h, width, 3)``; None where they mean themselves."""
+        if self.name == OBSERVABILITY:
+            shares = self.flag_shares()
+            entries = [(f"{word} {shares[word]:.1%}", color) for word, color in FLAG_COLORS.values()]
+            return _flag_legend(width, [*entries, ("none of these", OBSERVED_COLOR)])
+        return _bar_legend(width, self.name, *value_range) if self.is_mapped else None
 
 
 def see_channel(

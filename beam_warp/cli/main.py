@@ -21,8 +21,9 @@ from beam_warp.cli.reconstruct import Reconstruct, reconstruct
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.run import Run, run
 from beam_warp.cli.stability import Stability, stability
+from beam_warp.cli.view import View, view
 
-_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, evaluate, demonstrate.
+_HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.
 
 Example: beam run person.ply --environment studio.hdr --out person
 
@@ -34,6 +35,7 @@ Command = (
     | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
     | Annotated[Decompose, subcommand("decompose", prefix_name=False)]
     | Annotated[Render, subcommand("render", prefix_name=False)]
+    | Annotated[View, subcommand("view", prefix_name=False)]
     | Annotated[Evaluate, subcommand("evaluate", prefix_name=False)]
     | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
@@ -58,6 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: decompose(command))
     if isinstance(command, Render):
         return run_command(lambda: render(command))
+    if isinstance(command, View):
+        return run_command(lambda: view(command))
     if isinstance(command, Evaluate):
         return run_command(lambda: evaluate(command))
     if isinstance(command, Mesh):

@@ -1,0 +1,113 @@
+"""`beam view` as a user meets it: it says where the page is, ends with Ctrl-C, and refuses what cannot be served."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from figure_asset import figure_asset
+
+from beam_warp import converters
+from beam_warp.cli.main import main
+from beam_warp.cli.view import environments
+from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.images import write_exr
+
+
+def beam(*words):
+    return main([str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def asset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("person")
+    converters.write(figure_asset(frame_count=2), folder / "asset.usda")
+    return folder
+
+
+@pytest.fixture
+def lights(tmp_path):
+    folder = tmp_path / "hdri"
+    folder.mkdir()
+    for name in ("noon.exr", "evening.exr"):
+        write_exr(folder / name, dict.fromkeys("RGB", np.ones((16, 32), np.float32)))
+    (folder / "readme.txt").write_text("lights")
+    return folder
+
+
+def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights):
+    pytest.importorskip("viser")
+    words = ["view", str(asset), "--environment", str(lights), "--port", "0", "--json", "--device", "cpu"]
+    code = "import sys; from beam_warp.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        said = ""
+        while not said.endswith("}\n"):
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            said += line
+        report = json.loads(said)
+        assert report["frames"] == 2
+        with urllib.request.urlopen(report["url"], timeout=20) as page:
+            assert page.status == 200
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=60)
+    assert (process.returncode, rest, errors) == (0, "", "")
+
+
+def test_a_taken_port_is_one_clear_line(asset, capsys):
+    pytest.importorskip("viser")
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        assert beam("view", asset, "--port", port, "--no-open") == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(f"error: port must be free at 127.0.0.1, got {port}")
+    assert said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--open", "--no-open"], "error: open must be given once"),
+        (["--rate", "0"], "error: rate must be a number in"),
+        (["--longest", "3"], "error: longest must be an integer in"),
+        (["--environment", "nowhere.hdr"], "error: environment must be a file or a folder, got nowhere.hdr"),
+    ],
+)
+def test_contradictions_are_refused_before_anything_is_read(words, error, capsys):
+    assert beam("view", "no such asset", *words) == 2
+    assert capsys.readouterr().err.startswith(error)
+
+
+def test_a_missing_asset(tmp_path, capsys):
+    assert beam("view", tmp_path / "none.usda", "--port", "0", "--no-open") == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_lights_are_those_given_then_those_built_in(lights):
+    found = environments((lights / "noon.exr", lights))
+    assert list(found) == ["noon", "evening", "noon 2", "studio (built in)", "sunset (built in)", "stage (built in)"]
+    assert found["noon"]().height == 16
+    assert found["stage (built in)"]().height == 64
+
+
+def test_lights_that_are_none(lights, tmp_path):
+    with pytest.raises(AssetFormatError, match=r"\.exr or \.hdr file, got .*readme\.txt"):
+        environments((lights / "readme.txt",))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MissingFileError, match="folder with"):
+        environments((tmp_path / "empty",))
+
+
+def test_the_help_has_an_example(capsys):
+    with pytest.raises(SystemExit):
+        beam("view", "--help")
+    assert "Example: beam view person" in capsys.readouterr().out
