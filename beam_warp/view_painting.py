@@ -20,11 +20,12 @@ from beam_warp.devices import device_label, resolve_device
 from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import BeamError, InvalidOptionError
 from beam_warp.material_mesh import MaterialMesh
+from beam_warp.path_rendering import PathProgress
 from beam_warp.raster_records import RasterOptions
 from beam_warp.rasterizing import rasterize
 from beam_warp.shots import RenderedImage, Shot, ShotMesh
 from beam_warp.view_frames import Picture
-from beam_warp.view_renderers import DeferredPair, Progress, displayed, path_tracer
+from beam_warp.view_renderers import DeferredPair, displayed, path_tracer
 from beam_warp.view_state import (
     ALPHA,
     DEPTH,
@@ -91,7 +92,6 @@ class CloudPainter:
     Attributes:
         subject: The box that the first, the middle and the last frame are in.
         channels: What can be shown of it.
-        has_lamps: Whether lamps and the ground are drawn.
         can_trace: Whether paths can be traced.
         device: What draws.
     """
@@ -125,7 +125,6 @@ class CloudPainter:
         self._lights: OrderedDict[str, EnvironmentMap] = OrderedDict()
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
         self._deferred = DeferredPair(self._raster, self._target)
-        self.has_lamps = self._deferred.has_lamps
         clouds = self._looked_at()
         self.subject = Subject.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
         self.channels = channels_of(next(filter(len, clouds), clouds[0]))
@@ -221,7 +220,7 @@ class CloudPainter:
 class TracedPicture:
     """What was traced so far of a state; satisfies `beam_warp.view_frames.Tracing`."""
 
-    progress: Progress
+    progress: PathProgress
     state: ViewState
     gaussian_count: int
 

@@ -23,10 +23,10 @@ from beam_warp.errors import BeamError
 from beam_warp.images import write_exr
 from beam_warp.lights import lights_to_json
 from beam_warp.raster_records import RasterOptions
+from beam_warp.tone_mapping import TRANSFORMS
 from beam_warp.view_frames import Frame, FrameLoop, Picture
 from beam_warp.view_lamps import Lamps
 from beam_warp.view_painting import CloudPainter
-from beam_warp.view_renderers import view_transforms
 from beam_warp.view_schedule import LONGEST_SIDE, Pace, Schedule
 from beam_warp.view_server import DEFAULT_HOST, DEFAULT_PORT, server_url, start_server, stop_server
 from beam_warp.view_state import (
@@ -294,9 +294,8 @@ class _Controls:
         if LIT in painter.channels:
             with server.gui.add_folder("Light"):
                 self._add_light(server.gui, environments, state)
-            if painter.has_lamps:
-                with server.gui.add_folder("Lamps", expand_by_default=False):
-                    self._lamps = Lamps(server, painter.subject, lambda lights: loop.change(lights=lights))
+            with server.gui.add_folder("Lamps", expand_by_default=False):
+                self._lamps = Lamps(server, painter.subject, lambda lights: loop.change(lights=lights))
         with server.gui.add_folder("Save", expand_by_default=False):
             self._add_save(server.gui)
 
@@ -322,7 +321,7 @@ class _Controls:
             self._bind("mode", gui.add_dropdown("Mode", (DEFERRED, TRACED), initial_value=state.mode, hint=hint))
             self._bind("samples", gui.add_number("Samples", state.samples, min=1, step=1))
         self._bind("background", gui.add_rgb("Background", state.background))
-        if self._painter.has_lamps and LIT in self._painter.channels:
+        if LIT in self._painter.channels:
             grounds = (NO_GROUND, GREY_GROUND, SHADOW_GROUND)
             self._bind("ground", gui.add_dropdown("Ground", grounds, initial_value=state.ground))
         gui.add_button("Frame subject").on_click(self._frame_subject)
@@ -359,18 +358,14 @@ class _Controls:
     def _add_light(self, gui: viser.GuiApi, environments: tuple[str, ...], state: ViewState) -> None:
         names = (*environments, NO_ENVIRONMENT)
         self._bind("environment", gui.add_dropdown("Environment", names, initial_value=state.environment))
-        if self._painter.has_lamps:
-            hint = "And light from surface to surface; without a GPU, once nothing moves, and it takes seconds"
-            shadows = gui.add_checkbox("Environment shadows", state.environment_shadows, hint=hint)
-            self._bind("environment_shadows", shadows)
+        hint = "And light from surface to surface; without a GPU, once nothing moves, and it takes seconds"
+        shadows = gui.add_checkbox("Environment shadows", state.environment_shadows, hint=hint)
+        self._bind("environment_shadows", shadows)
         turn = float(np.clip(state.rotation, -180.0, 180.0))
         self._bind("rotation", gui.add_slider("Rotation [°]", -180.0, 180.0, 1.0, turn))
         stops = float(np.clip(state.exposure, -6.0, 6.0))
         self._bind("exposure", gui.add_slider("Exposure [stops]", -6.0, 6.0, 0.1, stops))
-        transforms = view_transforms()
-        if len(transforms) > 1:
-            chosen = gui.add_dropdown("View transform", transforms, initial_value=state.transform)
-            self._bind("transform", chosen)
+        self._bind("transform", gui.add_dropdown("View transform", TRANSFORMS, initial_value=state.transform))
 
     def _add_save(self, gui: viser.GuiApi) -> None:
         gui.add_button("Save PNG", hint="As it is shown, in the page's full size").on_click(
@@ -379,7 +374,7 @@ class _Controls:
         gui.add_button("Save EXR", hint="Scene-linear light with alpha, or the channel's numbers").on_click(
             lambda event: self._save(event.client, "beam-view.exr", _exr)
         )
-        if LIT in self._painter.channels and self._painter.has_lamps:
+        if LIT in self._painter.channels:
             gui.add_button("Save lights", hint="Placed lights as JSON").on_click(self._save_lights)
 
     def _save(self, client: viser.ClientHandle | None, name: str, encode: Callable[[Picture], bytes]) -> None:
@@ -436,12 +431,11 @@ def _possible(state: ViewState, painter: CloudPainter) -> ViewState:
     """Return a state that can be shown."""
     channel = state.channel if state.channel in painter.channels else painter.channels[0]
     mode = state.mode if painter.can_trace else DEFERRED
-    transforms = view_transforms()
     return state.changed(
         environment_shadows=state.environment_shadows and painter.is_cuda,
         channel=channel,
         mode=mode,
-        transform=state.transform if state.transform in transforms else transforms[0],
+        transform=state.transform if state.transform in TRANSFORMS else TRANSFORMS[0],
     )
 
 

@@ -248,7 +248,7 @@ def path_sample(
     return result
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
 def trace_paths_kernel(
     first: int,
     occluders: Any,
