@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from beam_warp.captures import Capture as Capture
     from beam_warp.converters import read as read
     from beam_warp.converters import write as write
+    from beam_warp.deferred_options import DeferredOptions as DeferredOptions
+    from beam_warp.deferred_rendering import DeferredRenderer as DeferredRenderer
     from beam_warp.depth_normals import DepthNormals as DepthNormals
     from beam_warp.environments import EnvironmentMap as EnvironmentMap
     from beam_warp.errors import BeamError as BeamError
@@ -38,9 +40,14 @@ if TYPE_CHECKING:
     from beam_warp.initialization import initial_gaussians as initial_gaussians
     from beam_warp.lighting import AmbientOcclusion as AmbientOcclusion
     from beam_warp.lighting import ambient_occlusion as ambient_occlusion
+    from beam_warp.lights import DirectionalLight as DirectionalLight
+    from beam_warp.lights import PointLight as PointLight
+    from beam_warp.lights import SpotLight as SpotLight
     from beam_warp.material_scores import score_materials as score_materials
     from beam_warp.materials import MaterialOptions as MaterialOptions
     from beam_warp.meshing import mesh_of_gaussians as mesh_of_gaussians
+    from beam_warp.path_rendering import PathOptions as PathOptions
+    from beam_warp.path_rendering import PathRenderer as PathRenderer
     from beam_warp.pipeline import RunOptions as RunOptions
     from beam_warp.pipeline import RunResult as RunResult
     from beam_warp.pipeline import run as run
@@ -56,6 +63,9 @@ if TYPE_CHECKING:
     from beam_warp.reconstruction_steps import FitAndTrack as FitAndTrack
     from beam_warp.scene import Scene as Scene
     from beam_warp.schema.validator import validate as validate
+    from beam_warp.shots import RenderedImage as RenderedImage
+    from beam_warp.shots import Shot as Shot
+    from beam_warp.shots import ShotMesh as ShotMesh
     from beam_warp.stages import Stage as Stage
     from beam_warp.surfaces import SurfaceNormals as SurfaceNormals
     from beam_warp.surfaces import estimate_normals as estimate_normals
@@ -63,6 +73,16 @@ if TYPE_CHECKING:
     from beam_warp.tracking import TrackOptions as TrackOptions
 
 _HOMES = {
+    "SpotLight": "lights",
+    "PointLight": "lights",
+    "DirectionalLight": "lights",
+    "RenderedImage": "shots",
+    "ShotMesh": "shots",
+    "Shot": "shots",
+    "PathRenderer": "path_rendering",
+    "PathOptions": "path_rendering",
+    "DeferredRenderer": "deferred_rendering",
+    "DeferredOptions": "deferred_options",
     "Adam": "adam",
     "AmbientOcclusion": "lighting",
     "BeamError": "errors",
