@@ -8,7 +8,7 @@ around. What lies outside of a map is not shadowed by it.
 Bias: a comparison is with the receiver's tangent plane at each texel, begins half a texel (plus half of what the plane
 rises within a texel) and the Gaussians' thickness before it, and is full at twice that. Shadows of what is nearer than
 that to its receiver are missing: half a texel is 0.8 mm for a subject of 1.7 m in a map of 1024, the thickness the
-median over the Gaussians of the middle one of their three scales, at most 1 % of the subject's radius.
+median over the Gaussians of the middle one of their three scales, at most 2 % of the subject's radius.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FAR = 500.0
 ROOM = 1.06
 """A map shows this much more than the subject's sphere: splats and kernels reach beyond centres."""
 
-THICKEST = 0.01
+THICKEST = 0.02
 """Largest thickness of a layer, in radii of the subject: few large Gaussians are flat, not thick."""
 
 NEARBY = 2.0

@@ -256,12 +256,12 @@ def test_two_layers_of_gaussians(device):
 
 def test_a_layer_does_not_shadow_itself(device, rng):
     """A ball of discs, each with a depth of its own, in the light: what faces it by more than 17 degrees is lit."""
-    count = 4000
+    count = 16000
     k = np.arange(count) + 0.5
     z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     normals = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
     positions = 0.8 * normals + rng.normal(size=(count, 1)) * 0.001 * normals
-    cloud = discs(positions, normals, 0.045)  # 6 on top of each other
+    cloud = discs(positions, normals, 0.0225)  # 6 on top of each other
     for diameter in (0.0, 0.53, 40.0):
         light = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
         drawer = drawn(light, cloud, Subject.of(cloud), device, size=256)
