@@ -85,7 +85,7 @@ class ArrivingLight:
         self._count, self._options, self._environments, self._device = gaussian_count, options, environments, device
         cluster_count = min(CLUSTER_COUNT, gaussian_count)
         with wp.ScopedDevice(device):
-            self._arriving = wp.zeros(gaussian_count, dtype=wp.vec3)
+            self._arriving = wp.zeros(gaussian_count, dtype=wp.vec4)
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = _zero_clusters(gaussian_count, cluster_count)
             self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
