@@ -214,7 +214,7 @@ class ArrivingLight:
     def capacities(self) -> tuple[int, ...]:
         """Room for pairs of what draws maps: where it changes, graphs must be recorded again."""
         drawers = (self._region_drawer, self._light_drawer)
-        return tuple(0 if drawer is None else drawer.rasterizer.pair_capacity for drawer in drawers)
+        return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
 
     def _light(self, gaussians: GaussianArrays) -> None:
         """Find what arrives at the Gaussians."""
