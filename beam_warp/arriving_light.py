@@ -85,7 +85,7 @@ class ArrivingLight:
         self._count, self._options, self._environments, self._device = gaussian_count, options, environments, device
         cluster_count = min(CLUSTER_COUNT, gaussian_count)
         with wp.ScopedDevice(device):
-            self._arriving = wp.zeros(gaussian_count, dtype=wp.vec3)
+            self._arriving = wp.zeros(gaussian_count, dtype=wp.vec4)
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = _zero_clusters(gaussian_count, cluster_count)
             self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
@@ -214,7 +214,7 @@ class ArrivingLight:
     def capacities(self) -> tuple[int, ...]:
         """Room for pairs of what draws maps: where it changes, graphs must be recorded again."""
         drawers = (self._region_drawer, self._light_drawer)
-        return tuple(0 if drawer is None else drawer.rasterizer.pair_capacity for drawer in drawers)
+        return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
 
     def _light(self, gaussians: GaussianArrays) -> None:
         """Find what arrives at the Gaussians."""

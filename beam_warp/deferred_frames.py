@@ -51,8 +51,8 @@ class DeferredFrame:
 
     Attributes:
         gaussians: What is drawn: arrays on the device. Values are base colour, roughness, ambient occlusion and normal,
-            and, unless neither environment shadows nor bounces are wanted, what arrives [W/m^2], found by `draw` and
-            `launch`.
+            and, unless neither environment shadows nor bounces are wanted, what arrives [W/m^2] and the share of the
+            environment that does, found by `draw` and `launch`.
         samples: Radiance multiplied by alpha, and alpha, of every sample of the image, row by row, vec4 on the device.
         pixels: The same for pixels, their means; ``samples`` itself for one sample a pixel.
     """
@@ -77,7 +77,7 @@ class DeferredFrame:
         self._traced: TracedMesh | None = None
         self._light = ArrivingLight(self._count, options, environments, device)
         camera = shot.camera.supersampled(options.samples)
-        value_count = 11 if options.lights_gaussians else 8
+        value_count = 12 if options.lights_gaussians else 8
         self._rasterizer = Rasterizer(self._count, [camera], value_count=value_count, options=raster, device=device)
         with wp.ScopedDevice(device):
             self.gaussians = GaussianArrays(

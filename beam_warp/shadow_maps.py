@@ -8,7 +8,7 @@ around. What lies outside of a map is not shadowed by it.
 Bias: a comparison is with the receiver's tangent plane at each texel, begins half a texel (plus half of what the plane
 rises within a texel) and the Gaussians' thickness before it, and is full at twice that. Shadows of what is nearer than
 that to its receiver are missing: half a texel is 0.8 mm for a subject of 1.7 m in a map of 1024, the thickness the
-median over the Gaussians of the middle one of their three scales, at most 1 % of the subject's radius.
+median over the Gaussians of the middle one of their three scales, at most 2 % of the subject's radius.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FAR = 500.0
 ROOM = 1.06
 """A map shows this much more than the subject's sphere: splats and kernels reach beyond centres."""
 
-THICKEST = 0.01
+THICKEST = 0.02
 """Largest thickness of a layer, in radii of the subject: few large Gaussians are flat, not thick."""
 
 NEARBY = 2.0
@@ -51,6 +51,10 @@ NEAR = 0.02
 WIDEST = 60.0
 """Largest half angle of a single view [degree]: beyond it six views cost less than one with as many texels in its
 middle."""
+
+GROUP_SPLATS = 2**23
+"""Most splats, Gaussians times views, drawn at a time unless one view has more: their pairs with tiles, about twice as
+many, are then few enough to be drawn in one go, as CUDA graphs want it."""
 
 LARGEST_KERNEL = 0.25
 """Largest radius of a filter, as a share of a map's side: half of the subject."""
@@ -155,7 +159,7 @@ class ShadowDrawer:
 
     Attributes:
         maps: What kernels take: the same arrays for ever.
-        rasterizer: What draws them.
+        cameras: What the maps see now.
     """
 
     def __init__(
@@ -178,28 +182,41 @@ class ShadowDrawer:
             device: Warp device.
         """
         self._device = device
-        # Widened splats lose in height what they gain in area: small ones in a coarse map cast no wider shadows.
-        raster = RasterOptions(antialiased=True, low_pass=0.1)
-        cameras = [view.camera for view in views]
-        self.rasterizer = Rasterizer(gaussian_count, cameras, options=raster, device=device)
-        texel_count = self.rasterizer.first_pixels[-1]
+        self.cameras = [view.camera for view in views]
+        self._texels_of_view = self.cameras[0].width * self.cameras[0].height
+        group = max(1, GROUP_SPLATS // max(gaussian_count, 1))
+        self._groups = [range(k, min(k + group, len(views))) for k in range(0, len(views), group)]
+        self._rasterizers: list[Rasterizer] = []
+        for views_of_group in self._groups:
+            self._rasterizers.append(
+                Rasterizer(
+                    gaussian_count,
+                    [self.cameras[k] for k in views_of_group],
+                    # Widened splats lose in height what they gain in area: small ones cast no wider shadows.
+                    options=RasterOptions(antialiased=True, low_pass=0.1),
+                    device=device,
+                    images_of=self._rasterizers[0] if self._rasterizers else None,
+                )
+            )
+        texel_count = self._texels_of_view * len(views)
         self._mesh_depth = wp.zeros(0, dtype=float, device=device)
         self._mesh: Any = None
         self.maps = ShadowMaps()
-        self.maps.views = wp.array(ViewLayout.of(cameras).views, dtype=View, device=device)
+        self.maps.views = wp.array(ViewLayout.of(self.cameras).views, dtype=View, device=device)
         self.maps.texels = wp.zeros(texel_count, dtype=wp.vec4, device=device)
         self.maps.radii = wp.zeros(len(views), dtype=float, device=device)
         self.maps.fronts = wp.zeros(len(views), dtype=float, device=device)
         self.maps.search_taps = upload(disc_taps(taps[0]), wp.vec2, device)
         self.maps.filter_taps = upload(disc_taps(taps[1]), wp.vec2, device)
-        self.maps.largest_kernel = LARGEST_KERNEL * cameras[0].width
+        self.maps.largest_kernel = LARGEST_KERNEL * self.cameras[0].width
         self._set(views, subject)
 
     def move(self, views: Sequence[ShadowView], subject: Subject) -> None:
         """See the subject from elsewhere; number and size of the views stay."""
-        prepared = self.rasterizer.prepare_cameras([view.camera for view in views])
-        self.rasterizer.set_cameras(prepared)
-        wp.copy(self.maps.views, prepared.views)
+        self.cameras = [view.camera for view in views]
+        for rasterizer, group in zip(self._rasterizers, self._groups, strict=True):
+            rasterizer.set_cameras([self.cameras[k] for k in group])
+        self.maps.views.assign(wp.array(ViewLayout.of(self.cameras).views, dtype=View, device=self._device))
         self._set(views, subject)
 
     def _set(self, views: Sequence[ShadowView], subject: Subject) -> None:
@@ -207,6 +224,11 @@ class ShadowDrawer:
         self.maps.radii.assign(np.array([view.radius for view in views], np.float32))
         self.maps.fronts.assign(np.array([view.front for view in views], np.float32))
         self.maps.thickness = subject.thickness
+
+    @property
+    def pair_capacities(self) -> tuple[int, ...]:
+        """Room for pairs of splats and tiles; see `Rasterizer.pair_capacity`."""
+        return tuple(rasterizer.pair_capacity for rasterizer in self._rasterizers)
 
     def draw(self, gaussians: GaussianArrays, mesh: Any = None) -> None:
         """Draw all maps, however much room they take.
@@ -216,24 +238,35 @@ class ShadowDrawer:
             mesh: A `beam_warp.kernels.mesh_surface.MeshSurface`, or None.
         """
         self._mesh = mesh
-        if mesh is not None and not len(self._mesh_depth):
-            self._mesh_depth = wp.zeros(len(self.maps.texels), dtype=float, device=self._device)
-        if mesh is None:
-            self._mesh_depth = wp.zeros(0, dtype=float, device=self._device)
-        self.rasterizer.draw(gaussians)
-        self._gather()
+        depths = 0 if mesh is None else len(self.maps.texels)
+        if len(self._mesh_depth) != depths:
+            self._mesh_depth = wp.zeros(depths, dtype=float, device=self._device)
+        self._cast()
+        for rasterizer, group in zip(self._rasterizers, self._groups, strict=True):
+            rasterizer.draw(gaussians)
+            self._gather(rasterizer, group)
 
     def redraw(self) -> None:
         """Draw again what arrays and views have become, without waiting; see `Rasterizer.redraw`."""
-        self.rasterizer.redraw()
-        self._gather()
+        self._cast()
+        for rasterizer, group in zip(self._rasterizers, self._groups, strict=True):
+            rasterizer.redraw()
+            self._gather(rasterizer, group)
 
-    def _gather(self) -> None:
-        """Make texels of what was drawn."""
+    def _cast(self) -> None:
+        """Find the triangles that maps see."""
         if self._mesh is not None:
-            side = self.rasterizer.cameras[0].width
-            launch_cast_mesh(self._mesh, self.maps.views, side * side, self._mesh_depth, self._device)
-        launch_gather_texels(self.rasterizer.images, self._mesh_depth, self.maps.texels, self._device)
+            launch_cast_mesh(self._mesh, self.maps.views, self._texels_of_view, self._mesh_depth, self._device)
+
+    def _gather(self, rasterizer: Rasterizer, group: range) -> None:
+        """Make texels of what was drawn."""
+        texels = slice(group.start * self._texels_of_view, group.stop * self._texels_of_view)
+        launch_gather_texels(
+            rasterizer.images,
+            self._mesh_depth[texels] if len(self._mesh_depth) else self._mesh_depth,
+            self.maps.texels[texels],
+            self._device,
+        )
 
 
 @cache

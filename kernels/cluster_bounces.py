@@ -14,7 +14,15 @@ Source: disc to point form factor as in Bunnell 2005; the ratio is ours.
 import warp as wp
 
 from beam_warp.kernels.brdf import specular_albedo
-from beam_warp.kernels.gaussian_light import ARRIVING, NORMAL, OCCLUSION, POINT_CHUNK, ROUGHNESS, row_vector
+from beam_warp.kernels.gaussian_light import (
+    ARRIVING,
+    NORMAL,
+    OCCLUSION,
+    OPENNESS,
+    POINT_CHUNK,
+    ROUGHNESS,
+    row_vector,
+)
 from beam_warp.kernels.launching import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -124,19 +132,21 @@ def bounce_clusters_kernel(
 def gather_bounces_kernel(
     first: int,
     positions: wp.array[wp.vec3],
-    arriving: wp.array[wp.vec3],
+    arriving: wp.array[wp.vec4],
     clusters: Clusters,
     radiosity: wp.array[wp.vec3],
     out_values: wp.array2d[float],
 ):
-    """Write what arrives at each Gaussian from the environment and from surfaces among its values."""
+    """Write what arrives at each Gaussian from the environment and from surfaces, and the former's openness."""
     i = first + wp.tid()
-    total = arriving[i]
+    straight = arriving[i]
+    total = wp.vec3(straight[0], straight[1], straight[2])
     occlusion = 1.0 - out_values[i, OCCLUSION]
     if occlusion > 0.0 and radiosity.shape[0] > 0:
         total += facing_radiosity(clusters, radiosity, positions[i], row_vector(out_values, i, NORMAL)) * occlusion
     for c in range(3):
         out_values[i, ARRIVING + c] = total[c]
+    out_values[i, OPENNESS] = straight[3]
 
 
 def launch_sum_clusters(gaussians, lit, albedo_table, out_clusters, device):

@@ -4,7 +4,7 @@ import warp as wp
 
 from beam_warp.kernels.constants import LARGEST_FLOAT
 from beam_warp.kernels.deferred_pixels import SHADE_CHUNK, arriving_radiance, pixel_ray
-from beam_warp.kernels.gaussian_light import RegionShadows, environment_openness, random_turn
+from beam_warp.kernels.gaussian_light import RegionShadows, environment_openness, luminance, random_turn
 from beam_warp.kernels.latlong import latlong_bilinear
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.lights import Lights
@@ -21,11 +21,6 @@ from beam_warp.kernels.surface_lighting import (
 )
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def luminance(rgb: wp.vec3) -> float:
-    return 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
 
 
 @wp.kernel

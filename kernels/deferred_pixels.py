@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.gaussian_light import ARRIVING, NORMAL, OCCLUSION, ROUGHNESS, random_turn, row_vector
+from beam_warp.kernels.gaussian_light import ARRIVING, NORMAL, OCCLUSION, OPENNESS, ROUGHNESS, random_turn, row_vector
 from beam_warp.kernels.launching import launch
 from beam_warp.kernels.lights import Lights
 from beam_warp.kernels.project import View
@@ -38,7 +38,7 @@ def arriving_radiance(
     environment: DistantLight,
     base_color: wp.vec3,
     roughness: float,
-    ambient_occlusion: float,
+    openness: float,
     arriving: wp.vec3,
     raw_normal: wp.vec3,
     raw_view: wp.vec3,
@@ -48,7 +48,7 @@ def arriving_radiance(
     normal = seen_normal(unturned(environment, raw_normal), view)
     reflected = view_albedo(environment.light, normal, view, roughness)
     n_dot_v = wp.clamp(wp.dot(normal, view), MIN_N_DOT_V, 1.0)
-    open_share = specular_occlusion(ambient_occlusion, n_dot_v, roughness)
+    open_share = specular_occlusion(openness, n_dot_v, roughness)
     diffuse = wp.cw_mul(base_color, arriving) * ((1.0 - reflected) / PI)
     return diffuse + reflected_radiance(environment.light, normal, view, roughness) * (reflected * open_share)
 
@@ -87,7 +87,7 @@ def shade_gaussians_kernel(
             environment,
             base_color,
             roughness,
-            ambient_occlusion,
+            wp.clamp(channels[i, OPENNESS] * share, 0.0, 1.0),
             row_vector(channels, i, ARRIVING) * share,
             raw_normal,
             toward,

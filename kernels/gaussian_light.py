@@ -25,6 +25,7 @@ ROUGHNESS = wp.constant(3)
 OCCLUSION = wp.constant(4)
 NORMAL = wp.constant(5)
 ARRIVING = wp.constant(8)
+OPENNESS = wp.constant(11)
 
 POINT_CHUNK = 256
 """Fewest points of one launch on the CPU: each reads many texels."""
@@ -68,6 +69,11 @@ def environment_openness(regions: RegionShadows, point: wp.vec3, normal: wp.vec3
 
 
 @wp.func
+def luminance(rgb: wp.vec3) -> float:
+    return 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
+
+
+@wp.func
 def row_vector(values: wp.array2d[float], row: int, column: int) -> wp.vec3:
     return wp.vec3(values[row, column], values[row, column + 1], values[row, column + 2])
 
@@ -81,21 +87,22 @@ def light_gaussians_kernel(
     regions: RegionShadows,
     lights: Lights,
     shadows: LightShadows,
-    out_arriving: wp.array[wp.vec3],
+    out_arriving: wp.array[wp.vec4],
     out_lit: wp.array[wp.vec3],
 ):
-    """``out_arriving`` is the environment's; ``out_lit`` the lights' as well."""
+    """``out_arriving`` is the environment's, and its share of the unshadowed luminance; ``out_lit`` all lights'."""
     i = first + wp.tid()
     normal = row_vector(values, i, NORMAL)
     point = positions[i]
     turn = random_turn(i)
-    arriving = latlong_bilinear(environment.light.irradiance, unturned(environment, normal))
+    free = latlong_bilinear(environment.light.irradiance, unturned(environment, normal))
+    arriving = free * values[i, OCCLUSION]
+    share = values[i, OCCLUSION]
     if regions.moments.red.shape[0] > 0:
-        if arriving[0] + arriving[1] + arriving[2] > 0.0:
-            arriving = wp.cw_mul(arriving, environment_openness(regions, point, normal, turn))
-    else:
-        arriving = arriving * values[i, OCCLUSION]
-    out_arriving[i] = arriving
+        arriving = wp.cw_mul(free, environment_openness(regions, point, normal, turn))
+        if luminance(free) > 0.0:
+            share = luminance(arriving) / luminance(free)
+    out_arriving[i] = wp.vec4(arriving[0], arriving[1], arriving[2], share)
     out_lit[i] = arriving + lit_irradiance(lights, shadows, point, normal, turn)
 
 

@@ -29,6 +29,9 @@ LEAST_DEPTH = wp.constant(1.0e-6)
 CURVATURE_TEXELS = wp.constant(0.5)
 """What a surface rises over its tangent plane within a texel, in texels."""
 
+SMOOTH_KERNEL = wp.constant(4.0)
+"""Radius below which taps are bilinear [texel]: in wider kernels they are texels apart, and hit many."""
+
 ROUNDING = wp.constant(4.0e-7)
 """Of a depth: a few float32 steps."""
 
@@ -233,7 +236,11 @@ def visible_share(maps: ShadowMaps, k: int, point: wp.vec3, normal: wp.vec3, tur
     hidden = float(0.0)
     count = maps.filter_taps.shape[0]
     for i in range(count):
-        hidden += hidden_between(maps, view, receiver, receiver.place + radius * turned(maps.filter_taps[i], turn))
+        place = receiver.place + radius * turned(maps.filter_taps[i], turn)
+        if radius < SMOOTH_KERNEL:
+            hidden += hidden_between(maps, view, receiver, place)
+        else:
+            hidden += hidden_at(maps, view, receiver, int(wp.floor(place[0])), int(wp.floor(place[1])))
     return 1.0 - hidden / float(count)
 
 

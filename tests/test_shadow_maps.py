@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from beam_warp import shadow_maps
 from beam_warp.assets import GaussianCloud
 from beam_warp.devices import resolve_device
 from beam_warp.kernels.shadow_maps import ShadowMaps, face_towards, visible_share
@@ -42,7 +43,7 @@ def visible(drawer, points, normals, light=None, turned=True):
     turns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
     out = wp.zeros(len(points), dtype=float, device=device)
     arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=device) for a in (points, normals)]
-    around = len(drawer.rasterizer.cameras) == 6
+    around = len(drawer.cameras) == 6
     middle = wp.vec3(*light.position) if around else wp.vec3()
     wp.launch(
         share_kernel,
@@ -224,7 +225,7 @@ def test_a_point_light_inside_sees_all_around(device):
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     cloud = discs(np.asarray(light.position) + 0.4 * axes, axes, 0.05)
     drawer = drawn(light, cloud, Subject(np.zeros(3), 1.0, 0.002), device)
-    assert len(drawer.rasterizer.cameras) == 6
+    assert len(drawer.cameras) == 6
     behind = np.asarray(light.position) + 0.9 * axes
     assert visible(drawer, behind, -axes, light).max() < 0.02
     diagonal = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3.0)
@@ -256,12 +257,12 @@ def test_two_layers_of_gaussians(device):
 
 def test_a_layer_does_not_shadow_itself(device, rng):
     """A ball of discs, each with a depth of its own, in the light: what faces it by more than 17 degrees is lit."""
-    count = 4000
+    count = 16000
     k = np.arange(count) + 0.5
     z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     normals = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
     positions = 0.8 * normals + rng.normal(size=(count, 1)) * 0.001 * normals
-    cloud = discs(positions, normals, 0.045)  # 6 on top of each other
+    cloud = discs(positions, normals, 0.0225)  # 6 on top of each other
     for diameter in (0.0, 0.53, 40.0):
         light = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
         drawer = drawn(light, cloud, Subject.of(cloud), device, size=256)
@@ -302,3 +303,17 @@ def test_redraw_and_move_are_draw(device):
     drawer.move(light_views(light, subject, 128), subject)
     drawer.redraw()
     np.testing.assert_array_equal(drawer.maps.texels.numpy(), first)
+
+
+def test_maps_in_groups_are_the_same_maps(device, monkeypatch):
+    """Views that are drawn one after the other, into the same images, make the same texels."""
+    light = PointLight(position=(0.1, 0.0, -0.1), intensity=(1, 1, 1))
+    cloud = discs(0.5 * np.eye(3), np.eye(3), 0.1)
+    subject = Subject(np.zeros(3), 1.0, 0.002)
+    whole = drawn(light, cloud, subject, device, mesh=square(-0.5))
+    monkeypatch.setattr(shadow_maps, "GROUP_SPLATS", 13)
+    grouped = drawn(light, cloud, subject, device, mesh=square(-0.5))
+    assert len(grouped.pair_capacities) == 2
+    np.testing.assert_array_equal(grouped.maps.texels.numpy(), whole.maps.texels.numpy())
+    grouped.redraw()
+    np.testing.assert_array_equal(grouped.maps.texels.numpy(), whole.maps.texels.numpy())
