@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beam_warp.assets import GaussianCloud
 from beam_warp.captured_views import CapturedView
-from beam_warp.captures import Capture
+from beam_warp.captures import Capture, CaptureRecord
 from beam_warp.environment_sampling import SampledEnvironment
 from beam_warp.environments import EnvironmentMap
 from beam_warp.evaluation import (
@@ -217,21 +217,40 @@ class PerfectFrame:
     def true_roughness(self, device: Any) -> NDArray[np.float32]:
         """Return the truth's roughness as its test views show it; the nearest neighbour's where they do not."""
         records = [r for r in self.capture.select(split="test", frames=[self.frame]) if r.truth_path is not None]
-        shown = []
-        for record in records:
-            truth = record.truth()
-            rough = np.repeat(truth.stack("roughness"), 3, axis=-1) * truth.channels["A"][..., None]
-            shown.append(
-                CapturedView(
-                    name=record.name,
-                    camera=record.camera,
-                    color=rough.astype(np.float32),
-                    alpha=np.clip(truth.channels["A"], 0.0, 1.0).astype(np.float32),
-                )
+        return np.clip(shown_by_truth(self.cloud, records, ("roughness",), device)[:, 0], 0.05, 1.0)
+
+
+def shown_by_truth(
+    cloud: GaussianCloud, records: Sequence[CaptureRecord], names: Sequence[str], device: Any
+) -> NDArray[np.float32]:
+    """Return what exact channels of some views, one or three, say of every Gaussian, ``(N, 3)`` in [0, 1]."""
+    shown = []
+    for record in records:
+        truth = record.truth()
+        values = np.broadcast_to(truth.stack(*names), (*truth.channels["A"].shape, 3))
+        shown.append(
+            CapturedView(
+                name=record.name,
+                camera=record.camera,
+                color=(values * truth.channels["A"][..., None]).astype(np.float32),
+                alpha=np.clip(truth.channels["A"], 0.0, 1.0).astype(np.float32),
             )
-        fitted = colored_by_views(self.cloud, shown, options=SHARP, device=str(device)).radiance
-        assert fitted is not None
-        return np.clip(0.5 + SH_C0 * fitted[:, 0, 0], 0.05, 1.0)
+        )
+    fitted = colored_by_views(cloud, shown, options=SHARP, device=str(device)).radiance
+    assert fitted is not None
+    return np.clip(0.5 + SH_C0 * fitted[:, 0], 0.0, 1.0)
+
+
+def true_cloud(capture: Capture, frame: int, count: int, device: Any) -> GaussianCloud:
+    """Return relightable Gaussians on the true surface with the materials that the truth of the test views shows."""
+    mesh = read_truth_mesh(capture, frame)
+    cloud = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
+    records = [r for r in capture.select(split="test", frames=[frame]) if r.truth_path is not None]
+    return cloud.with_arrays(
+        base_color=shown_by_truth(cloud, records, ("base_color.R", "base_color.G", "base_color.B"), device),
+        roughness=shown_by_truth(cloud, records, ("roughness",), device)[:, 0],
+        ambient_occlusion=shown_by_truth(cloud, records, ("ambient_occlusion",), device)[:, 0],
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,354 @@
+"""How near relit images come to path-traced truth, and what each costs: deferred, gathered per Gaussian, path traced.
+
+Geometry is perfect, Gaussians on the true surface with the truth's materials, or that of a decomposed reconstruction.
+The demo figure's materials are known at every point, so that nothing but the renderer is in the way of its truth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from materials_truth import SHARP, true_cloud
+from numpy.typing import NDArray
+from relight_scenes import Bench, Row, seconds_of
+from scipy.spatial import cKDTree
+
+from beam_warp import converters
+from beam_warp.assets import GaussianCloud
+from beam_warp.axes import change_axes
+from beam_warp.cameras import Camera
+from beam_warp.capture_matching import match_frames
+from beam_warp.captures import Capture
+from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
+from beam_warp.demo_environments import demo_environments
+from beam_warp.demo_figure import build_figure
+from beam_warp.environments import EnvironmentMap
+from beam_warp.evaluation import bounding_box, compare
+from beam_warp.lighting import ambient_occlusion
+from beam_warp.material_mesh import MaterialMesh
+from beam_warp.mesh_path_tracing import TracedMesh, trace_radiance
+from beam_warp.path_rendering import PathOptions, PathProgress, PathRenderer
+from beam_warp.raster_records import RasterOptions
+from beam_warp.reconstruction_scores import truth_frames
+from beam_warp.relighters import TracedRelighter
+from beam_warp.scene import Scene
+from beam_warp.shots import Shot
+from beam_warp.surface_gaussians import gaussians_on_mesh
+
+TARGET_PSNR = 36.0
+"""Of path traced images of perfect geometry against the truth [dB]."""
+
+DANCE_PHASE = 0.15
+"""The moment of the demo figure's dance that is rendered."""
+
+CANDIDATES = 24
+"""Triangles, by their middles' distance, among which the one below a point is looked for."""
+
+OPENNESS_RAYS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A relit image that is known: scene-linear radiance multiplied by alpha, and alpha."""
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is rendered, and what that should look like.
+
+    Attributes:
+        name: In tables.
+        cloud: Relightable Gaussians.
+        raster: How splats are drawn.
+        cameras: At least one.
+        lights: By name.
+        truth: By light, an image a camera.
+    """
+
+    name: str
+    cloud: GaussianCloud
+    raster: RasterOptions
+    cameras: Sequence[Camera]
+    lights: Mapping[str, EnvironmentMap]
+    truth: Mapping[str, Sequence[Known]]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One way's images of all cameras under a light, and what each took [ms]."""
+
+    method: str
+    setting: str
+    images: Sequence[Known]
+    milliseconds: Sequence[float]
+
+
+def measure_accuracy(bench: Bench) -> Iterator[Row]:
+    """Yield scores so far of every subject under every light."""
+    result: Row = {"target_psnr": TARGET_PSNR, "side": bench.effort.side, "subjects": {}}
+    warm_up(bench)
+    for subject in subjects(bench):
+        row: Row = {
+            "gaussians": len(subject.cloud),
+            "views": len(subject.cameras),
+            "size": [subject.cameras[0].width, subject.cameras[0].height],
+            "lights": {},
+        }
+        result["subjects"][subject.name] = row
+        kept: dict[str, NDArray[Any]] = {}
+        for light in subject.lights:
+            row["lights"][light] = found = measure_light(bench, subject, light, kept)
+            for entry in found["rows"]:
+                bench.say(f"{subject.name}, {light}, {described(entry)}")
+            yield result
+        row["picture"] = keep_images(bench, subject.name, kept)
+        yield result
+
+
+def warm_up(bench: Bench) -> None:
+    """Compile what the rows need."""
+    shot = replace(bench.small_figure(), lights=(), mesh=None)
+    assert shot.environment is not None
+    device = str(bench.device)
+    PathRenderer(PathOptions(samples=1), device=device).draw(shot)
+    for count in sorted({min(bench.effort.scored_shadows), max(bench.effort.scored_shadows)}):
+        deferred_renderer(bench, count, SHARP).frame(shot).launch()
+    TracedRelighter()(shot.cloud, shot.environment, [shot.camera], raster=SHARP, samples=1, device=device)
+
+
+def subjects(bench: Bench) -> Iterator[Subject]:
+    """Yield the captures' perfect geometry, the demo figure, and the reconstructions that were given."""
+    for name, capture in bench.captures.items():
+        frame = truth_frames(capture)[0]
+        started = time.perf_counter()
+        cloud = true_cloud(capture, frame, bench.effort.perfect_gaussians, bench.device)
+        bench.say(f"{name}: true materials of {len(cloud):,} Gaussians in {time.perf_counter() - started:.1f} s")
+        yield captured_subject(name, capture, frame, cloud, SHARP, bench.effort.views)
+    yield demo_subject(bench)
+    for name, path in bench.assets.items():
+        if name in bench.captures:
+            capture = bench.captures[name]
+            sequence = converters.read(path)
+            matched = match_frames(sequence)
+            frame = next(frame for frame in truth_frames(capture) if frame in matched)
+            cloud = change_axes(sequence[matched[frame]], "rfu")
+            raster = RasterOptions.from_metadata(sequence.metadata)
+            yield captured_subject(f"{name}, decomposed", capture, frame, cloud, raster, bench.effort.views)
+
+
+def captured_subject(
+    name: str, capture: Capture, frame: int, cloud: GaussianCloud, raster: RasterOptions, views: int
+) -> Subject:
+    """Return Gaussians with a capture's truth under the lights that it has, of views far from each other."""
+    records = [r for r in capture.select(split="test", frames=[frame]) if r.truth_path is not None and r.relit_paths]
+    records = records[:: max(1, len(records) // views)][:views]
+    names = sorted(records[0].relit_paths)
+    return Subject(
+        name,
+        cloud,
+        raster,
+        [record.camera for record in records],
+        {light: EnvironmentMap.read(capture.folder / "truth" / f"{light}.exr") for light in names},
+        {
+            light: [Known(r.relit(light).linear_rgba()[..., :3], r.truth().channels["A"]) for r in records]
+            for light in names
+        },
+    )
+
+
+def demo_subject(bench: Bench) -> Subject:
+    """Return the demo figure as Gaussians whose materials are the mesh's own, and the mesh path traced."""
+    effort, device = bench.effort, str(bench.device)
+    mesh = build_figure().at(DANCE_PHASE)
+    bare = gaussians_on_mesh(mesh.vertices, mesh.faces, effort.perfect_gaussians)
+    assert bare.normals is not None
+    color, roughness = materials_at(mesh, bare.positions)
+    scene = Scene.from_gaussians(bare, device)
+    openness = ambient_occlusion(scene, bare.positions, bare.normals, sample_count=OPENNESS_RAYS).visibility
+    cloud = bare.with_arrays(
+        base_color=color, roughness=roughness, ambient_occlusion=np.clip(openness, 0.0, 1.0).astype(np.float32)
+    )
+    cameras = [
+        Camera.frame_points(
+            mesh.vertices,
+            azimuth=20.0 + 360.0 / effort.views * view,
+            elevation=8.0,
+            width=effort.demo_size[0],
+            height=effort.demo_size[1],
+        )
+        for view in range(effort.views)
+    ]
+    lights = {name: light for name, light in demo_environments().items() if name != "stage"}
+    traced = TracedMesh.from_mesh(mesh, device=device)
+    truth: dict[str, list[Known]] = {}
+    for name, light in lights.items():
+        images = [
+            trace_radiance(traced, c, light, sample_count=effort.truth_samples, bounce_count=effort.bounces, seed=1)
+            for c in cameras
+        ]
+        truth[name] = [Known(image.rgb, image.alpha) for image in images]
+    bench.say(f"demo figure: {len(cloud):,} Gaussians, truth of {effort.truth_samples} paths a pixel")
+    return Subject("demo figure", cloud, SHARP, cameras, lights, truth)
+
+
+def materials_at(mesh: MaterialMesh, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return base colour and roughness of a mesh at points on its surface."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    near = cKDTree(corners.mean(axis=1)).query(points, k=min(CANDIDATES, len(corners)), workers=-1)[1]
+    near = near.reshape(len(points), -1)
+    best = np.full(len(points), np.inf)
+    faces, weights = near[:, 0].copy(), np.zeros((len(points), 3))
+    for candidate in near.T:
+        found = trimesh.triangles.points_to_barycentric(corners[candidate], points)
+        found = np.clip(found, 0.0, 1.0)
+        found /= found.sum(axis=1, keepdims=True)
+        away = np.linalg.norm(np.einsum("nk,nkc->nc", found, corners[candidate]) - points, axis=1)
+        nearer = away < best
+        best[nearer], faces[nearer], weights[nearer] = away[nearer], candidate[nearer], found[nearer]
+    color = mesh.interpolate(mesh.base_color, faces, weights)
+    roughness = mesh.interpolate(mesh.roughness, faces, weights)
+    return np.clip(color, 0.0, 1.0).astype(np.float32), np.clip(roughness, 0.0, 1.0).astype(np.float32)
+
+
+def measure_light(bench: Bench, subject: Subject, light: str, kept: dict[str, NDArray[Any]]) -> Row:
+    """Return a row of every way under one light; images of the first camera go to ``kept``."""
+    reference, rendered = path_traced(bench, subject, light)
+    for count in bench.effort.scored_shadows:
+        rendered.append(deferred(bench, subject, light, count))
+    rendered.append(gathered(bench, subject, light))
+    best = max((r for r in rendered if r.method == "path traced"), key=lambda r: int(r.setting.split()[0]))
+    usual = DeferredOptions().environment_shadows
+    shown = min((r for r in rendered if r.method == "deferred"), key=lambda r: abs(int(r.setting.split()[-1]) - usual))
+    known = subject.truth[light][0]
+    box = bounding_box(known.alpha)
+    for name, image in (("deferred", shown.images[0]), ("path", best.images[0]), ("truth", known)):
+        kept[f"{light}_{name}"] = image.rgb[box].astype(np.float16)
+    return {
+        **reference,
+        "shown": {"deferred": shown.setting, "path": best.setting},
+        "rows": [
+            {
+                "method": way.method,
+                "setting": way.setting,
+                "ms": float(np.mean(way.milliseconds)),
+                **scores(way.images, subject.truth[light]),
+                "against_path": scores(way.images, best.images) if way is not best else None,
+            }
+            for way in rendered
+        ],
+    }
+
+
+def path_traced(bench: Bench, subject: Subject, light: str) -> tuple[Row, list[Rendered]]:
+    """Return every level of samples of a pixel, each with what all before took; progressive, so that none is redone."""
+    effort, device = bench.effort, bench.device
+    renderer = PathRenderer(PathOptions(samples=max(effort.levels), bounces=effort.bounces), device=str(device))
+    shots = [shot_of(subject, light, camera) for camera in subject.cameras]
+    prepared = seconds_of(lambda: renderer.start(shots[0]), device)
+    images: dict[int, list[Known]] = {}
+    spent: dict[int, list[float]] = {}
+    rate = 0.0  # samples of a pixel in a second, of the slowest image so far
+    levels = list(effort.levels)
+    for number, shot in enumerate(shots):
+        progress, seconds = renderer.start(shot), 0.0
+        for level in list(levels):
+            missing = level - progress.sample_count
+            if number == 0 and rate > 0.0 and missing > rate * effort.level_seconds:
+                levels = levels[: levels.index(level)]
+                break
+            took = seconds_of(lambda p=progress, m=missing: p.advance(m), device)
+            rate, seconds = missing / max(took, 1e-9), seconds + took
+            images.setdefault(level, []).append(known_of(progress))
+            spent.setdefault(level, []).append(1e3 * seconds)
+    facts = {"prepare_ms": 1e3 * prepared, "left_out": [level for level in effort.levels if level not in levels]}
+    return facts, [Rendered("path traced", f"{level} samples", images[level], spent[level]) for level in levels]
+
+
+def known_of(progress: PathProgress) -> Known:
+    """Return what is known of an image."""
+    image = progress.image()
+    return Known(image.rgb, image.alpha)
+
+
+def deferred_renderer(bench: Bench, count: int, raster: RasterOptions) -> DeferredRenderer:
+    """Return a renderer with so many shadow maps of the environment."""
+    options = bench.deferred_options(count, side=bench.effort.side)
+    return DeferredRenderer(options, raster=raster, device=str(bench.device))
+
+
+def deferred(bench: Bench, subject: Subject, light: str, count: int) -> Rendered:
+    """Return deferred images, each timed with all shadow maps drawn again."""
+    renderer = deferred_renderer(bench, count, subject.raster)
+    images, spent = [], []
+    for camera in subject.cameras:
+        frame = renderer.frame(shot_of(subject, light, camera))
+        image = frame.image()
+        images.append(Known(image.rgb, image.alpha))
+        frame.launch()
+        spent.append(1e3 * min(seconds_of(frame.launch, bench.device) for _ in range(bench.effort.repeats)))
+    return Rendered("deferred", f"N = {count}", images, spent)
+
+
+def gathered(bench: Bench, subject: Subject, light: str) -> Rendered:
+    """Return images of light gathered at every Gaussian; what all of them share is part of what each takes."""
+    relighter, device = TracedRelighter(), str(bench.device)
+    how: dict[str, Any] = {"raster": subject.raster, "samples": bench.effort.side, "device": device}
+    found: list[Any] = []
+    environment = subject.lights[light]
+    seconds = seconds_of(
+        lambda: found.extend(relighter(subject.cloud, environment, subject.cameras, **how)), bench.device
+    )
+    each = 1e3 * seconds / len(found)
+    return Rendered("per Gaussian", "128 rays", [Known(i.rgb, i.alpha) for i in found], [each] * len(found))
+
+
+def shot_of(subject: Subject, light: str, camera: Camera) -> Shot:
+    """Return a subject under one of its lights."""
+    return Shot(cloud=subject.cloud, camera=camera, environment=subject.lights[light])
+
+
+def scores(images: Sequence[Known], truth: Sequence[Known]) -> Row:
+    """Return means over views.
+
+    ``psnr`` and ``ssim`` are of the subject's box, ``solid_psnr`` where the truth is solid, ``true_coverage_psnr`` of
+    the box with the truth's coverage in place of ours: silhouettes are the geometry's. ``view_psnr`` is of each view.
+    """
+    how: dict[str, Any] = {"is_color": True, "premultiplied": True}
+    found, covered = [], []
+    for image, known in zip(images, truth, strict=True):
+        found.append(compare(image.rgb, known.rgb, alpha=image.alpha, truth_alpha=known.alpha, **how))
+        straight = image.rgb / np.maximum(image.alpha, 1e-6)[..., None]
+        covering = straight * known.alpha[..., None]
+        covered.append(compare(covering, known.rgb, alpha=known.alpha, truth_alpha=known.alpha, **how).psnr)
+    return {
+        **{name: float(np.mean([getattr(s, name) for s in found])) for name in ("psnr", "ssim", "solid_psnr")},
+        "true_coverage_psnr": float(np.mean(covered)),
+        "view_psnr": [score.psnr for score in found],
+    }
+
+
+def keep_images(bench: Bench, name: str, kept: Mapping[str, NDArray[Any]]) -> str | None:
+    """Write a subject's images, scene-linear half floats cut to the subject; returns the file's name."""
+    if bench.pictures is None:
+        return None
+    bench.pictures.mkdir(parents=True, exist_ok=True)
+    path = Path("relight_" + name.replace(", ", "_").replace(" ", "_") + ".npz")
+    np.savez_compressed(bench.pictures / path, **kept)
+    return str(path)
+
+
+def described(row: Row) -> str:
+    """Return a row in words."""
+    return (
+        f"{row['method']}, {row['setting']}: {row['psnr']:.2f} dB / {row['ssim']:.4f}, solid {row['solid_psnr']:.2f}, "
+        f"true coverage {row['true_coverage_psnr']:.2f}, {row['ms']:.2f} ms"
+    )
