@@ -2,9 +2,10 @@
 
     python benchmarks/relight.py [--device cuda:0] [--data DIR] [--out results.json] [--parts PART ...] [--quick]
 
-Parts: ``deferred``, ``path`` and ``moving`` time frames of 140,000 Gaussians; ``accuracy`` scores images of the walker and
-the runner, with true materials on the true surface, and of the demo figure, whose materials are known at every point;
-``furnace`` and ``unbiased`` ask whether light is lost or added. ``--quick`` is the demo's capture, small: does it run?
+Parts: ``deferred``, ``path`` and ``moving`` time frames of 140,000 Gaussians; ``accuracy`` scores images of the walker
+and the runner, with true materials on the true surface, and of the demo figure, whose materials are known at every
+point; ``furnace`` and ``unbiased`` ask whether light is lost or added. ``--quick`` is the demo's capture, small: does
+all of it run?
 
 ``--assets DIR`` has decomposed reconstructions, ``DIR/walker/asset.usda`` and so on, which are scored too.
 ``--pictures DIR`` gets a file of images for each subject, which ``relight_plot.py`` draws. Writes the JSON after every
@@ -244,10 +245,10 @@ def unbiased_lines(part: Row, on_cpu: bool) -> list[str]:
     """Return what z-scores say."""
     few, more = part["samples"]
     return [
-        f"\n### {part['seeds'][0]} images of {few} samples against {part['seeds'][1]} of {more}, {part['pixels']:,} pixels",
+        f"\n### {part['seeds'][0]} images of {few} samples against {part['seeds'][1]} of {more}",
         "",
-        f"- mean z {part['mean']:+.4f}, {part['mean_in_standard_errors']:+.2f} of its standard errors; root mean square "
-        f"{part['root_mean_square']:.3f}",
+        f"- {part['pixels']:,} pixels: mean z {part['mean']:+.4f}, {part['mean_in_standard_errors']:+.2f} of its "
+        f"standard errors; root mean square {part['root_mean_square']:.3f}",
         f"- largest |z| {part['largest']:.2f}, by chance {part['largest_by_chance']:.2f}",
         f"- |z| > 3: {part['beyond']:.2%} of the pixels, by chance {part['beyond_by_chance']:.2%}",
         f"- sum over the image: {100.0 * part['relative_bias']:+.3f} %, standard error "
