@@ -128,7 +128,7 @@ def deferred_table(part: Row, on_cpu: bool) -> list[str]:
             ]
             for name, row in cases.items()
         ]
-        return lines + rows_of(head, rows)
+        return lines + rows_of(head, rows) + reached_lines(part)
     head = (
         "",
         "whole frame [ms]",
@@ -156,7 +156,12 @@ def deferred_table(part: Row, on_cpu: bool) -> list[str]:
 def reached_lines(part: Row) -> list[str]:
     """Return which targets are met."""
     found = part.get("reached") or {}
-    return ["", *(f"- {name} {part['targets'][name]:g}: {'reached' if ok else 'missed'}" for name, ok in found.items())]
+    return ["", *(f"- {name} {part['targets'][name]:g}: {verdict(ok)}" for name, ok in found.items())]
+
+
+def verdict(reached: bool) -> str:
+    """Return whether a target is met, in a word."""
+    return "reached" if reached else "missed"
 
 
 def path_table(part: Row, on_cpu: bool) -> list[str]:
@@ -175,7 +180,11 @@ def path_table(part: Row, on_cpu: bool) -> list[str]:
         ]
         for name, row in part["cases"].items()
     ]
-    return [f"\n### Path tracing: {size_of(part)}, {part['bounces']} bounces", *rows_of(head, rows)]
+    lines = [f"\n### Path tracing: {size_of(part)}, {part['bounces']} bounces", *rows_of(head, rows)]
+    if first is not None and first["reached"] is not None:
+        wanted = part["targets"]["path_samples_per_second"] / 1e6
+        lines += ["", f"- {wanted:g} Msample/s of the whole image: {verdict(first['reached'])}"]
+    return lines
 
 
 def moving_table(part: Row, on_cpu: bool) -> list[str]:
@@ -224,6 +233,14 @@ def accuracy_tables(part: Row, on_cpu: bool) -> list[str]:
                 cells.append("" if other is None else f"{other['psnr']:.2f}")
                 rows.append(cells if on_cpu else [*cells, f"{row['ms']:.2f}"])
         lines += rows_of(head, rows)
+        best = {
+            light: max(row["psnr"] for row in found["rows"] if row["method"] == "path traced")
+            for light, found in subject["lights"].items()
+        }
+        if "decomposed" not in name and best:
+            light = min(best, key=lambda key: best[key])
+            met = verdict(best[light] >= part["target_psnr"])
+            lines += ["", f"- {part['target_psnr']:g} dB on perfect geometry: {best[light]:.2f} at worst, {met}"]
     return lines
 
 
@@ -238,7 +255,14 @@ def furnace_table(part: Row, on_cpu: bool) -> list[str]:
         [f"{shape}, {name}", *(f"{100.0 * row['mean_error']:+.2f} %" for row in entries)]
         for (shape, name), entries in found.items()
     ]
-    return ["\n### White furnace: mean error", *rows_of(head, rows)]
+    lines = ["\n### White furnace: mean error", *rows_of(head, rows), ""]
+    return [
+        *lines,
+        *(
+            f"- {shape}, {name}, within {part['target']:.0%}: {verdict(all(row['reached'] for row in entries))}"
+            for (shape, name), entries in found.items()
+        ),
+    ]
 
 
 def unbiased_lines(part: Row, on_cpu: bool) -> list[str]:

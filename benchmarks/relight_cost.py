@@ -61,7 +61,7 @@ def measure_deferred(bench: Bench) -> Iterator[Row]:
         with peak_memory(device) as memory:
             first = seconds_of(lambda r=renderer, s=lit: r.frame(s), device)
             frame = renderer.frame(lit)
-            drawn = frame.pixels.numpy()
+            drawn = frame.pixels.numpy().copy()  # on the CPU it is a view
             row: Row = {
                 "options": {"environment_shadows": options.environment_shadows, "bounces": options.bounces},
                 "lights": len(lights),

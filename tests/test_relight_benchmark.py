@@ -13,6 +13,7 @@ from relight_energy import z_scores
 from relight_plot import LARGEST_FILE, draw_all
 from relight_scenes import MovingFigure, posed
 
+from beam_warp.demo_environments import demo_environments
 from beam_warp.demo_figure import build_figure
 from beam_warp.devices import resolve_device
 from beam_warp.environments import EnvironmentMap
@@ -34,15 +35,20 @@ TINY = replace(
 def bench(relit_capture):
     def make(device, **changes):
         made = benchmark.bench_of_capture(relit_capture, resolve_device(device), lambda text: None)
-        return replace(made, effort=TINY, **changes)
+        return replace(made, sky=made.sky.resized(16, 32), effort=TINY, **changes)
 
     return make
 
 
 @pytest.fixture
-def few_views_around(monkeypatch):
-    """Light is gathered at points that 32 views of 384 x 384 show: here much smaller ones."""
+def small_lights(monkeypatch):
+    """What takes long by itself, smaller: environments that are made ready, views that show where surfaces are."""
+    read, demo = EnvironmentMap.read, demo_environments()
     monkeypatch.setattr("beam_warp.traced_relighting.SURROUNDING_SIDE", 32)
+    monkeypatch.setattr("relight_accuracy.EnvironmentMap.read", lambda path: read(path).resized(16, 32))
+    monkeypatch.setattr(
+        "relight_accuracy.demo_environments", lambda: {name: demo[name].resized(16, 32) for name in demo}
+    )
 
 
 def disc_alpha(size=24):
@@ -135,7 +141,7 @@ class TestBias:
             assert abs(found["beyond"] - found["beyond_by_chance"]) < 4.0 * np.sqrt(found["beyond_by_chance"] / 2000)
 
 
-def test_levels_that_take_too_long_are_left_out(bench, few_views_around):
+def test_levels_that_take_too_long_are_left_out(bench, small_lights):
     small = bench("cpu")
     small = replace(small, effort=replace(TINY, levels=(1, 2, 4096), level_seconds=0.5))
     shot = small.small_figure()
@@ -147,7 +153,7 @@ def test_levels_that_take_too_long_are_left_out(bench, few_views_around):
     assert [row["setting"] for row in found["rows"] if row["method"] == "path traced"] == ["1 samples", "2 samples"]
 
 
-def test_all_of_it_runs(device, bench, tmp_path, few_views_around):
+def test_all_of_it_runs(device, bench, tmp_path, small_lights):
     pytest.importorskip("matplotlib")
     pictures = tmp_path / "pictures"
     states = []
