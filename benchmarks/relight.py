@@ -2,9 +2,10 @@
 
     python benchmarks/relight.py [--device cuda:0] [--data DIR] [--out results.json] [--parts PART ...] [--quick]
 
-Parts: ``deferred``, ``path`` and ``moving`` time frames of 140,000 Gaussians; ``accuracy`` scores images of the walker and
-the runner, with true materials on the true surface, and of the demo figure, whose materials are known at every point;
-``furnace`` and ``unbiased`` ask whether light is lost or added. ``--quick`` is the demo's capture, small: does it run?
+Parts: ``deferred``, ``path`` and ``moving`` time frames of 140,000 Gaussians; ``accuracy`` scores images of the walker
+and the runner, with true materials on the true surface, and of the demo figure, whose materials are known at every
+point; ``furnace`` and ``unbiased`` ask whether light is lost or added. ``--quick`` is the demo's capture, small: does
+all of it run?
 
 ``--assets DIR`` has decomposed reconstructions, ``DIR/walker/asset.usda`` and so on, which are scored too.
 ``--pictures DIR`` gets a file of images for each subject, which ``relight_plot.py`` draws. Writes the JSON after every
@@ -127,7 +128,7 @@ def deferred_table(part: Row, on_cpu: bool) -> list[str]:
             ]
             for name, row in cases.items()
         ]
-        return lines + rows_of(head, rows)
+        return lines + rows_of(head, rows) + reached_lines(part)
     head = (
         "",
         "whole frame [ms]",
@@ -155,7 +156,12 @@ def deferred_table(part: Row, on_cpu: bool) -> list[str]:
 def reached_lines(part: Row) -> list[str]:
     """Return which targets are met."""
     found = part.get("reached") or {}
-    return ["", *(f"- {name} {part['targets'][name]:g}: {'reached' if ok else 'missed'}" for name, ok in found.items())]
+    return ["", *(f"- {name} {part['targets'][name]:g}: {verdict(ok)}" for name, ok in found.items())]
+
+
+def verdict(reached: bool) -> str:
+    """Return whether a target is met, in a word."""
+    return "reached" if reached else "missed"
 
 
 def path_table(part: Row, on_cpu: bool) -> list[str]:
@@ -174,7 +180,11 @@ def path_table(part: Row, on_cpu: bool) -> list[str]:
         ]
         for name, row in part["cases"].items()
     ]
-    return [f"\n### Path tracing: {size_of(part)}, {part['bounces']} bounces", *rows_of(head, rows)]
+    lines = [f"\n### Path tracing: {size_of(part)}, {part['bounces']} bounces", *rows_of(head, rows)]
+    if first is not None and first["reached"] is not None:
+        wanted = part["targets"]["path_samples_per_second"] / 1e6
+        lines += ["", f"- {wanted:g} Msample/s of the whole image: {verdict(first['reached'])}"]
+    return lines
 
 
 def moving_table(part: Row, on_cpu: bool) -> list[str]:
@@ -223,6 +233,17 @@ def accuracy_tables(part: Row, on_cpu: bool) -> list[str]:
                 cells.append("" if other is None else f"{other['psnr']:.2f}")
                 rows.append(cells if on_cpu else [*cells, f"{row['ms']:.2f}"])
         lines += rows_of(head, rows)
+        if "decomposed" not in name:
+            lines += ["", *perfect_lines(subject, part["target_psnr"])]
+    return lines
+
+
+def perfect_lines(subject: Row, target: float) -> list[str]:
+    """Return whether path tracing is as near to the truth as it should be where geometry and materials are true."""
+    lines = []
+    for light, found in subject["lights"].items():
+        best = max(row["psnr"] for row in found["rows"] if row["method"] == "path traced")
+        lines.append(f"- {light}: path traced {best:.2f} dB, {target:g} wanted: {verdict(best >= target)}")
     return lines
 
 
@@ -237,17 +258,24 @@ def furnace_table(part: Row, on_cpu: bool) -> list[str]:
         [f"{shape}, {name}", *(f"{100.0 * row['mean_error']:+.2f} %" for row in entries)]
         for (shape, name), entries in found.items()
     ]
-    return ["\n### White furnace: mean error", *rows_of(head, rows)]
+    lines = ["\n### White furnace: mean error", *rows_of(head, rows), ""]
+    return [
+        *lines,
+        *(
+            f"- {shape}, {name}, within {part['target']:.0%}: {verdict(all(row['reached'] for row in entries))}"
+            for (shape, name), entries in found.items()
+        ),
+    ]
 
 
 def unbiased_lines(part: Row, on_cpu: bool) -> list[str]:
     """Return what z-scores say."""
     few, more = part["samples"]
     return [
-        f"\n### {part['seeds'][0]} images of {few} samples against {part['seeds'][1]} of {more}, {part['pixels']:,} pixels",
+        f"\n### {part['seeds'][0]} images of {few} samples against {part['seeds'][1]} of {more}",
         "",
-        f"- mean z {part['mean']:+.4f}, {part['mean_in_standard_errors']:+.2f} of its standard errors; root mean square "
-        f"{part['root_mean_square']:.3f}",
+        f"- {part['pixels']:,} pixels: mean z {part['mean']:+.4f}, {part['mean_in_standard_errors']:+.2f} of its "
+        f"standard errors; root mean square {part['root_mean_square']:.3f}",
         f"- largest |z| {part['largest']:.2f}, by chance {part['largest_by_chance']:.2f}",
         f"- |z| > 3: {part['beyond']:.2%} of the pixels, by chance {part['beyond_by_chance']:.2%}",
         f"- sum over the image: {100.0 * part['relative_bias']:+.3f} %, standard error "

@@ -168,7 +168,7 @@ def captured_subject(
 def demo_subject(bench: Bench) -> Subject:
     """Return the demo figure as Gaussians whose materials are the mesh's own, and the mesh path traced."""
     effort, device = bench.effort, str(bench.device)
-    mesh = build_figure().at(DANCE_PHASE)
+    mesh = build_figure(effort.demo_spacing).at(DANCE_PHASE)
     bare = gaussians_on_mesh(mesh.vertices, mesh.faces, effort.perfect_gaussians)
     assert bare.normals is not None
     color, roughness = materials_at(mesh, bare.positions)

@@ -48,6 +48,7 @@ class Effort:
         levels: Samples of a pixel at which path tracing is scored, ascending.
         level_seconds: A level that would take longer, for one image, is left out.
         demo_size: Width and height of the demo figure's images.
+        demo_spacing: Of the grid that it is meshed with [m].
         truth_samples: Paths a pixel of its truth.
         furnace_gaussians: Of the white ball.
         furnace_size: Side of the furnace's images.
@@ -61,7 +62,7 @@ class Effort:
     size: tuple[int, int] = (1920, 1080)
     shadows: tuple[int, ...] = (4, 16)
     maps: tuple[int, int] = (DeferredOptions().light_map_size, DeferredOptions().environment_map_size)
-    frames: int = 100
+    frames: int = 60
     repeats: int = 5
     poses: int = 16
     path_samples: int = 16
@@ -71,9 +72,10 @@ class Effort:
     side: int = 2
     scored_shadows: tuple[int, ...] = (0, 4, 16, 32)
     levels: tuple[int, ...] = (16, 64, 256, 1024)
-    level_seconds: float = 20.0
+    level_seconds: float = 5.0
     demo_size: tuple[int, int] = (240, 360)
-    truth_samples: int = 4096
+    demo_spacing: float = 0.011
+    truth_samples: int = 2048
     furnace_gaussians: int = 20_000
     furnace_size: int = 64
     furnace_samples: int = 256
@@ -122,6 +124,7 @@ QUICK = Effort(
     levels=(2, 4),
     level_seconds=60.0,
     demo_size=(32, 48),
+    demo_spacing=0.02,
     truth_samples=16,
     furnace_gaussians=400,
     furnace_size=8,
