@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ LARGEST_T = 7.06
 either way with a probability of 2e-4."""
 
 REFERENCE_SEED = 1000
-REFERENCE_TIMES = 16
+REFERENCE_TIMES = 4
 """Of the samples of a reference, how many times as many as an image's."""
 
 BOUNCES = 4
@@ -80,13 +81,13 @@ class Held:
     def asked(self) -> str:
         """The bounds, for a table."""
         if self.low == self.high:
-            return f"{self.high:.3g}"
-        return f"at most {self.high:.3g}" if self.low == 0.0 else f"{self.low:.3g} … {self.high:.3g}"
+            return f"{self.high:.4g}"
+        return f"at most {self.high:.4g}" if self.low == 0.0 else f"{self.low:.4g} … {self.high:.4g}"
 
     @property
     def measured(self) -> str:
         """The value, for a table."""
-        return f"{self.value:.3g}" + (f" ± {self.error:.1g}" if self.error > 0.0 else "")
+        return f"{self.value:.4g}" + (f" ± {self.error:.1g}" if self.error > 0.0 else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,11 +202,12 @@ def run_relighting_case(bench: RelightingBench, case: str, stress: RelightStress
     demands = [demand for demand in stress.demands if renderer in demand.of]
     start, seconds, values, faults = time.perf_counter(), 0.0, [], []
     try:
-        for seed in range(bench.seeds if renderer == PATH else 1):
+        reference = cache(lambda: bench.draw(stress.shots, PATH, REFERENCE_SEED, times=REFERENCE_TIMES))
+        for seed in range(bench.seeds if renderer == PATH and stress.noisy else 1):
             images = bench.draw(stress.shots, renderer, seed)
             seconds = seconds or time.perf_counter() - start
             faults += [fault for fault in image_faults(images) if fault not in faults]
-            drawn = _drawn(bench, stress, renderer, seed, images)
+            drawn = Drawn(images, partial(_draw_alone, bench, stress, renderer, seed), reference)
             values.append([demand.measure(drawn) for demand in demands])
     except BeamError as error:
         return replace(known, faults=(f"refused: {error}",), seconds=time.perf_counter() - start)
@@ -217,15 +219,9 @@ def run_relighting_case(bench: RelightingBench, case: str, stress: RelightStress
     return replace(known, held=held, faults=tuple(faults), seconds=seconds)
 
 
-def _drawn(
-    bench: RelightingBench, stress: RelightStress, renderer: str, seed: int, images: Sequence[RenderedImage]
-) -> Drawn:
-    """Return images with what they can be compared with, which is drawn when it is asked for."""
-    return Drawn(
-        images,
-        lambda: [bench.draw([shot], renderer, seed)[0] for shot in stress.shots],
-        lambda: bench.draw(stress.shots, PATH, REFERENCE_SEED, times=REFERENCE_TIMES),
-    )
+def _draw_alone(bench: RelightingBench, stress: RelightStress, renderer: str, seed: int) -> list[RenderedImage]:
+    """Draw every shot with a renderer of its own."""
+    return [bench.draw([shot], renderer, seed)[0] for shot in stress.shots]
 
 
 def hold(demand: Demand, values: Sequence[float]) -> Held:

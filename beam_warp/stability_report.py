@@ -16,6 +16,8 @@ from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 from beam_warp.image_findings import EXPOSURE_STOPS as INSPECTED_STOPS
 from beam_warp.material_stability import FLAGGED, SILENT_PART, STATED, WRONG, MaterialOutcome
 from beam_warp.material_stability import markdown_table as material_table
+from beam_warp.relighting_stability import LARGEST_T, REFERENCE_TIMES, SEEDS, RelightingOutcome
+from beam_warp.relighting_stability import markdown_table as relighting_table
 from beam_warp.stability import Outcome
 from beam_warp.stress_cases import CASES
 from beam_warp.view_gains import EXPOSURE_STOPS
@@ -113,6 +115,22 @@ refusal where that is asked for.
 """
 
 
+RELIGHTING_TITLE = "## Relighting"
+
+RELIGHTING_TEXT = """\
+Subjects and lights on which renderers make acne, fireflies, glowing shells or NaN, and what the deferred renderer and
+the path tracer make of them: `beam_warp/stress_relighting.py`. What must hold is a closed form in float64, an image of
+{times} times the samples, or a bound, each stated with its reason beside the case and before it was drawn; no bound is
+fitted. That images are finite, with alpha in [0, 1] and no negative light, is asked of all.
+
+**Measured** is what one image of the deferred renderer, or {seeds} of the path tracer with a seed each, have: for the
+latter the mean with its standard error. A value is at fault if it is beyond what is **asked** by more than
+{largest_t:g} standard errors (Student's t, 2e-4), and also if those are wider than what is asked: noise is no excuse.
+What asks for the same bits, or for nothing at all, has one seed. A renderer that falls short stays in the table and
+says so.
+"""
+
+
 @dataclass(frozen=True)
 class StabilityResult:
     """Everything that one or several runs found.
@@ -122,17 +140,20 @@ class StabilityResult:
         occlusion: Of the shapes with known ambient occlusion.
         captures: Of the captures on which reconstructions fail.
         materials: Of the subjects and lights on which the measurement of materials fails.
+        relighting: Of those on which relighting fails, an outcome for each renderer.
     """
 
     outcomes: tuple[Outcome, ...] = ()
     occlusion: tuple[OcclusionOutcome, ...] = ()
     captures: tuple[CaptureOutcome, ...] = ()
     materials: tuple[MaterialOutcome, ...] = ()
+    relighting: tuple[RelightingOutcome, ...] = ()
 
     @property
     def passed(self) -> bool:
         """Whether every verdict is good."""
-        return all(outcome.passed for outcome in (*self.outcomes, *self.occlusion, *self.captures, *self.materials))
+        parts = (self.outcomes, self.occlusion, self.captures, self.materials, self.relighting)
+        return all(outcome.passed for part in parts for outcome in part)
 
     def joined(self, other: StabilityResult) -> StabilityResult:
         """Return both results as one, this one's first."""
@@ -141,6 +162,7 @@ class StabilityResult:
             self.occlusion + other.occlusion,
             self.captures + other.captures,
             self.materials + other.materials,
+            self.relighting + other.relighting,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -152,6 +174,7 @@ class StabilityResult:
             "occlusion": [outcome.as_dict() for outcome in self.occlusion],
             "captures": [outcome.as_dict() for outcome in self.captures],
             "materials": [outcome.as_dict() for outcome in self.materials],
+            "relighting": [outcome.as_dict() for outcome in self.relighting],
         }
 
 
@@ -169,6 +192,7 @@ def read_result(path: Path) -> StabilityResult:
             tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
             tuple(_record(CaptureOutcome, row) for row in record.get("captures", [])),  # older ones have none
             tuple(MaterialOutcome.from_dict(row) for row in record.get("materials", [])),
+            tuple(RelightingOutcome.from_dict(row) for row in record.get("relighting", [])),
         )
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
@@ -190,7 +214,9 @@ def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
     return kind(**values)
 
 
-def devices_of(outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome | MaterialOutcome]) -> list[str]:
+def devices_of(
+    outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome | MaterialOutcome | RelightingOutcome],
+) -> list[str]:
     """Return the devices that occur, in order."""
     return list(dict.fromkeys(outcome.device for outcome in outcomes))
 
@@ -213,12 +239,16 @@ def markdown(result: StabilityResult, command: str, before: str = "") -> str:
         command: That makes the page, for its text.
         before: The page as it is: parts that the result has nothing of stay as they are there.
     """
-    rest, *materials = before.split(MATERIALS_TITLE)
+    rest, *relighting = before.split(RELIGHTING_TITLE)
+    rest, *materials = rest.split(MATERIALS_TITLE)
     tracing, *captures = rest.split(CAPTURES_TITLE)
     parts = [
         _tracing(result, command) if result.outcomes or not before else tracing,
         _captures(result.captures) if result.captures else "".join(CAPTURES_TITLE + text for text in captures),
         _materials(result.materials) if result.materials else "".join(MATERIALS_TITLE + text for text in materials),
+        _relighting(result.relighting)
+        if result.relighting
+        else "".join(RELIGHTING_TITLE + text for text in relighting),
     ]
     return "\n".join(part.rstrip() + "\n" for part in parts if part)
 
@@ -234,6 +264,21 @@ def _materials(outcomes: Sequence[MaterialOutcome]) -> str:
             f"{sum(outcome.seconds for outcome in rows):.0f} s in all."
         )
         lines += [facts, "", material_table(rows)]
+    return "\n".join(lines)
+
+
+def _relighting(outcomes: Sequence[RelightingOutcome]) -> str:
+    """Return the part about relighting, a table for each device."""
+    text = RELIGHTING_TEXT.format(times=REFERENCE_TIMES, seeds=SEEDS, largest_t=LARGEST_T)
+    lines = [RELIGHTING_TITLE, "", text]
+    for device in devices_of(outcomes):
+        rows = [outcome for outcome in outcomes if outcome.device == device]
+        facts = (
+            f"{device}: images of up to {max(row.size[0] for row in rows)} pixels a side, up to "
+            f"{max(row.gaussians for row in rows):,} Gaussians, {max(row.samples for row in rows)} paths a pixel; "
+            f"{sum(row.passed for row in rows)} of {len(rows)} hold."
+        )
+        lines += [facts, "", relighting_table(rows)]
     return "\n".join(lines)
 
 

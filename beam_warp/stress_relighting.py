@@ -21,7 +21,7 @@ from beam_warp.kernels.brdf import ALPHA_FLOOR
 from beam_warp.lights import SUN_DIAMETER, DirectionalLight, PointLight
 from beam_warp.material_mesh import MaterialMesh
 from beam_warp.shots import RenderedImage, Shot, ShotMesh
-from beam_warp.tiled_shapes import OPACITY, Surface, rectangle, sphere_zone, tile
+from beam_warp.tiled_shapes import Surface, rectangle, sphere_zone, tile
 
 DEFERRED, PATH = "deferred", "path"
 RENDERERS = (DEFERRED, PATH)
@@ -112,11 +112,13 @@ class RelightStress:
     Attributes:
         shots: Drawn in this order by one renderer.
         demands: What must hold.
+        noisy: Whether what is asked has noise; if it has none, one seed tells.
         done: What happened to the input before, in words.
     """
 
     shots: tuple[Shot, ...]
     demands: tuple[Demand, ...]
+    noisy: bool = True
     done: str = "nothing"
 
 
@@ -145,7 +147,7 @@ class RelightStudio:
 
     def floor(self, *, wall: bool = False) -> GaussianCloud:
         """Return a floor of 2 m, tiled with flat Gaussians, with or without the wall."""
-        x, y, z = np.eye(3)
+        x, y, _ = np.eye(3)
         return _relightable(tile((rectangle(np.zeros(3), x, y, self.spacing), *([self.wall()] if wall else []))), 0.8)
 
     def wall(self) -> Surface:
@@ -164,9 +166,7 @@ class RelightStudio:
 
     def at_ball(self) -> Camera:
         """Return a camera that sees the ball from a little above."""
-        return Camera.look_at(
-            (0.0, -2.6, 0.6), (0.0, 0.0, 0.0), width=self.size, height=self.size, vertical_fov=24.0
-        )
+        return Camera.look_at((0.0, -2.6, 0.6), (0.0, 0.0, 0.0), width=self.size, height=self.size, vertical_fov=24.0)
 
     def from_above(self) -> Camera:
         """Return a camera that sees 1.8 m of the floor from 3 m above."""
@@ -214,9 +214,7 @@ def relighting_case(name: str, fails: str, must: str, *, large: bool = False) ->
 # ---- closed forms and measures --------------------------------------------------------------------------------------
 
 
-def scattered(
-    normal: ArrayLike, view: ArrayLike, lights: ArrayLike, roughness: float
-) -> NDArray[np.float64]:
+def scattered(normal: ArrayLike, view: ArrayLike, lights: ArrayLike, roughness: float) -> NDArray[np.float64]:
     """Return the dielectric GGX lobe times n·l in float64, for unit directions ``(..., 3)`` of light; 0 from below."""
     n, v, d = (np.asarray(a, np.float64) for a in (normal, view, lights))
     half = v + d
@@ -397,7 +395,7 @@ def light_inside(studio: RelightStudio) -> RelightStress:
                 what=f"outside, of the lit inner wall ({name})",
                 measure=lambda drawn, k=k: brightness(drawn.images[k]) / inner,
                 high=0.01,
-                because="all of the outside faces away from the lamp: 0; 1 % is what a layer of alpha 0.99 lets out",
+                because="all of the outside faces away from the lamp: 0, or what is not seen beside the inner wall",
             )
             for k, name in enumerate(("a point", "a sphere"))
         ),
@@ -479,8 +477,7 @@ def acne(studio: RelightStudio) -> RelightStress:
 
     return RelightStress(
         shots=tuple(
-            Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),))
-            for shadows in (True, False)
+            Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),)) for shadows in (True, False)
         ),
         demands=(
             Demand(
@@ -510,8 +507,7 @@ def peter_panning(studio: RelightStudio) -> RelightStress:
     cloud, camera, sun = studio.floor(wall=True), studio.from_above(), sun_at(GRAZING)
     return RelightStress(
         shots=tuple(
-            Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),))
-            for shadows in (True, False)
+            Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),)) for shadows in (True, False)
         ),
         demands=tuple(
             Demand(
@@ -587,7 +583,9 @@ def fully_rough(studio: RelightStudio) -> RelightStress:
 
 
 @relighting_case(
-    "firefly environment", "few samples find the texel: black images with white dots", "the mean right, and little noise"
+    "firefly environment",
+    "few samples find the texel: black images with white dots",
+    "the mean right, and little noise",
 )
 def hot_texel(studio: RelightStudio) -> RelightStress:
     """One texel of 5e4 in a dim sky, over a white plane."""
@@ -635,12 +633,16 @@ def hot_texel(studio: RelightStudio) -> RelightStress:
         ),
     )
 
-@relighting_case("black and missing environment", "0 / 0 in tables of where light comes from", "black, coverage as ever")
+
+@relighting_case(
+    "black and missing environment", "0 / 0 in tables of where light comes from", "black, coverage as ever"
+)
 def no_light(studio: RelightStudio) -> RelightStress:
     """Even light, a black map, and none."""
     cloud, camera = studio.ball(), studio.at_ball()
     return RelightStress(
         shots=tuple(Shot(cloud=cloud, camera=camera, environment=light) for light in (white(), white(0.0), None)),
+        noisy=False,
         demands=(
             Demand(
                 what="brightest value without light",
@@ -692,9 +694,7 @@ def camera_inside(studio: RelightStudio) -> RelightStress:
     """A camera in the middle of a ball, within a round Gaussian, under even light."""
     round_one = _sheet((0.0, 0.0, 0.0), 0.15, 0.5).with_arrays(scales=np.full((1, 3), 0.15, np.float32))
     cloud = _together(studio.ball(), _relightable(round_one))
-    camera = Camera.look_at(
-        (0.0, 0.0, 0.0), (0.0, 1.0, 0.2), width=studio.size, height=studio.size, vertical_fov=80.0
-    )
+    camera = Camera.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.2), width=studio.size, height=studio.size, vertical_fov=80.0)
     return RelightStress(
         shots=(Shot(cloud=cloud, camera=camera, environment=white()),),
         demands=(
@@ -707,26 +707,27 @@ def camera_inside(studio: RelightStudio) -> RelightStress:
             Demand(
                 what="coverage",
                 measure=lambda drawn: float(drawn.images[0].alpha.mean()),
-                low=0.99,
+                low=0.95,
                 high=1.0,
-                because="the ball is closed: what a layer of alpha 0.99 stops",
+                because="even amid four tiles, where most is let through, a layer stops 0.95",
             ),
         ),
     )
 
 
 @relighting_case(
-    "frames of different counts", "what was kept of the frame before: wrong sizes, old shadows", "as drawn alone, same bits"
+    "frames of different counts",
+    "what was kept of the frame before: wrong sizes, old shadows",
+    "as drawn alone, same bits",
 )
 def different_counts(studio: RelightStudio) -> RelightStress:
     """One renderer draws many Gaussians, few, none, and the first again."""
     many, few = studio.ball(base_color=0.7), studio.ball(base_color=0.4, spacing=2.0 * studio.spacing)
     light = {"environment": firefly(), "lights": (sun_at(40.0),)}
-    shots = tuple(
-        Shot(cloud=cloud, camera=studio.at_ball(), **light) for cloud in (many, few, _nothing(studio), many)
-    )
+    shots = tuple(Shot(cloud=cloud, camera=studio.at_ball(), **light) for cloud in (many, few, _nothing(studio), many))
     return RelightStress(
         shots=shots,
+        noisy=False,
         demands=(
             Demand(
                 what="largest difference from drawn alone",
@@ -757,7 +758,9 @@ def million(studio: RelightStudio) -> RelightStress:
 
 
 @relighting_case(
-    "normals that all face away", "negative cosines: black, negative or infinite", "finite, no light made, coverage as ever"
+    "normals that all face away",
+    "negative cosines: black, negative or infinite",
+    "finite, no light made, coverage as ever",
 )
 def turned_normals(studio: RelightStudio) -> RelightStress:
     """The ball as it is, and with every normal turned inwards, under even light."""
@@ -787,8 +790,8 @@ def turned_normals(studio: RelightStudio) -> RelightStress:
     "a leaking front before a dark inside", "the inside shines through: surfaces look dirty", "the front's own colour"
 )
 def leaking_front(studio: RelightStudio) -> RelightStress:
-    """A layer of opacity 0.5 of colour 0.8, and 0.5 m behind it one of 0.1 that faces away."""
-    front = _relightable(_sheet((0.0, 0.0, 0.5), 0.3, 0.5), 0.8)
+    """A layer of opacity 0.5 of colour 0.8, and five of its sizes behind it one of 0.1 that faces away."""
+    front = _relightable(_sheet((0.0, 0.0, 0.5), 0.1, 0.5), 0.8)
     back = _relightable(_sheet((0.0, 0.0, 0.0), 3.0, 0.99, up=False), 0.1)
     sun = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(3.0, 3.0, 3.0), angular_diameter=0.0)
     side = max(studio.size // 4, 4)
@@ -816,7 +819,7 @@ def far_catcher(studio: RelightStudio) -> RelightStress:
     """A catcher 30 m from a ball, under a sky and a sun."""
     middle = np.array([30.0, 0.0, -RADIUS])
     side = max(studio.size // 4, 4)
-    camera = Camera.look_at(middle + (0.0, -2.0, 1.0), middle, width=side, height=side, vertical_fov=20.0)
+    camera = Camera.look_at(middle + np.array([0.0, -2.0, 1.0]), middle, width=side, height=side, vertical_fov=20.0)
     return RelightStress(
         shots=(
             Shot(
@@ -845,7 +848,9 @@ def far_catcher(studio: RelightStudio) -> RelightStress:
 
 
 @relighting_case(
-    "shadow catcher under grazing light", "the catcher shadows itself, or loses the shadow's foot", "the wall's shadow, sharp"
+    "shadow catcher under grazing light",
+    "the catcher shadows itself, or loses the shadow's foot",
+    "the wall's shadow, sharp",
 )
 def grazing_catcher(studio: RelightStudio) -> RelightStress:
     """The wall on a catcher, a sun of 10 degrees and nothing else."""
@@ -878,7 +883,9 @@ def grazing_catcher(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case("a frame with rows of NaN", "one NaN makes every bound, and so the image, NaN", "as without them, same bits")
+@relighting_case(
+    "a frame with rows of NaN", "one NaN makes every bound, and so the image, NaN", "as without them, same bits"
+)
 def broken_rows(studio: RelightStudio) -> RelightStress:
     """The ball with 10 rows of NaN among its own, left out as reading does."""
     cloud, camera = studio.ball(base_color=0.6), studio.at_ball()
@@ -890,6 +897,7 @@ def broken_rows(studio: RelightStudio) -> RelightStress:
     light = {"environment": white(), "lights": (sun_at(40.0),)}
     return RelightStress(
         shots=tuple(Shot(cloud=c, camera=camera, **light) for c in (cloud, kept)),
+        noisy=False,
         demands=(
             Demand(
                 what="largest difference",
@@ -908,9 +916,9 @@ def full_turn(studio: RelightStudio) -> RelightStress:
     cloud, camera = studio.ball(base_color=0.6, roughness=0.3), studio.at_ball()
     return RelightStress(
         shots=tuple(
-            Shot(cloud=cloud, camera=camera, environment=firefly(), environment_rotation=turn)
-            for turn in (0.0, 360.0)
+            Shot(cloud=cloud, camera=camera, environment=firefly(), environment_rotation=turn) for turn in (0.0, 360.0)
         ),
+        noisy=False,
         demands=(
             Demand(
                 what="largest difference",

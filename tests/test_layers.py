@@ -118,6 +118,8 @@ RANKS = {
     "beam_warp.stress_cases": 9,
     "beam_warp.stress_materials": 9,
     "beam_warp.material_stability": 14,
+    "beam_warp.stress_relighting": 6,
+    "beam_warp.relighting_stability": 14,
     "beam_warp.stability": 10,
     "beam_warp.analytic_occlusion": 10,
     "beam_warp.stability_report": 15,

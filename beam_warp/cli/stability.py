@@ -1,4 +1,4 @@
-"""``beam stability``: what tracing, reconstruction and the measurement of materials fail on, on this machine."""
+"""``beam stability``: what tracing, reconstruction, materials and relighting fail on, on this machine."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stability:
-    """Trace, reconstruct and decompose what others fail on; tell what was found and what came out.
+    """Trace, reconstruct, decompose and relight what others fail on; tell what was found and what came out.
 
-    Every ray is compared with float64. Exit code 1 if one is off by more than rounding explains, or if a capture was
-    reconstructed badly, or materials measured badly, and nothing was said. One page for several devices: run it on
-    each with --json, and on the last with --beside.
+    Every ray is compared with float64. Exit code 1 if one is off by more than rounding explains, if a capture was
+    reconstructed badly, or materials measured badly, and nothing was said, or if a relit image is not what closed
+    forms say. One page for several devices: run it on each with --json, and on the last with --beside.
 
     Example: beam stability --out stability.md
     """
 
     only: Annotated[
-        Literal["tracing", "reconstruction", "materials"] | None,
+        Literal["tracing", "reconstruction", "materials", "relighting"] | None,
         arg(help="Only one of them; a page that is there keeps the others."),
     ] = None
     out: Annotated[Path | None, arg(metavar="FILE", help="Also write the results as a Markdown page.")] = None
@@ -58,6 +58,8 @@ def stability(args: Stability) -> int:
             result = result.joined(_reconstruct(args, report))
         if args.only in (None, "materials"):
             result = result.joined(_decompose(args, report))
+        if args.only in (None, "relighting"):
+            result = result.joined(_relight(args, report))
     if args.out is not None:
         joined = result
         for other in others:
@@ -121,6 +123,20 @@ def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     return StabilityResult(materials=tuple(outcomes))
 
 
+def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
+    """Render subjects and lights with both renderers."""
+    from beam_warp.relighting_stability import RelightingBench, run_relighting_cases
+    from beam_warp.stability_report import StabilityResult
+    from beam_warp.stress_relighting import RELIGHTING_CASES
+
+    outcomes = run_relighting_cases(
+        RelightingBench(device=args.device),
+        [case for case in RELIGHTING_CASES if args.large or not case.large],
+        progress=lambda done, total: report("relighting", done, total),
+    )
+    return StabilityResult(relighting=tuple(outcomes))
+
+
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
     lines = [
@@ -131,6 +147,11 @@ def _faults(result: StabilityResult) -> list[str]:
     lines += [
         f"failed: {outcome.case} on {outcome.device}: {'; '.join(outcome.faults)}"
         for outcome in (*result.captures, *result.materials)
+        if not outcome.passed
+    ]
+    lines += [
+        f"failed: {outcome.case} on {outcome.device}, {outcome.renderer}: {'; '.join(outcome.faults)}"
+        for outcome in result.relighting
         if not outcome.passed
     ]
     return lines + [
@@ -148,6 +169,8 @@ def _print_tables(result: StabilityResult) -> None:
         _print_captures(result)
     if result.materials:
         _print_materials(result)
+    if result.relighting:
+        _print_relighting(result)
 
 
 def _print_materials(result: StabilityResult) -> None:
@@ -163,6 +186,22 @@ def _print_materials(result: StabilityResult) -> None:
     for outcome in result.materials:
         *found, verdict = cells(outcome)
         table.add_row(outcome.case, *found, verdict if outcome.passed else f"[red]{verdict}[/red]")
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def _print_relighting(result: StabilityResult) -> None:
+    """Print one row a case and renderer."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from beam_warp.relighting_stability import TITLES, cells
+    from beam_warp.stability_report import devices_of
+
+    titles = (TITLES[0], *TITLES[3:5], TITLES[-1])  # how others fail and what is asked is on the page
+    table = Table(*titles, title=f"relighting on {', '.join(devices_of(result.relighting))}")
+    for outcome in result.relighting:
+        renderer, measured, _, verdict = cells(outcome)
+        table.add_row(outcome.case, renderer, measured, verdict if outcome.passed else f"[red]{verdict}[/red]")
     Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
