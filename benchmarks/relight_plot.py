@@ -66,19 +66,20 @@ def draw_speed(subjects: Mapping[str, Row], device: str, path: Path) -> Path:
     plt = _pyplot()
     panels = panels_of(subjects)
     figure, axes = plt.subplots(1, len(panels), figsize=(4.6 * len(panels), 4.2), layout="constrained", squeeze=False)
-    markers = dict(zip(subjects, MARKERS, strict=False))
+    markers = {name: MARKERS[number % len(MARKERS)] for number, name in enumerate(subjects)}
     for axis, (title, shown) in zip(axes.flat, panels.items(), strict=True):
-        for name, light in shown:
+        alone = len({name for name, _ in shown}) == 1
+        for number, (name, light) in enumerate(shown):
             for method, color in COLORS.items():
                 rows = [row for row in subjects[name]["lights"][light]["rows"] if row["method"] == method]
                 rows.sort(key=lambda row: row["ms"])
                 axis.plot(
                     [row["ms"] for row in rows],
                     [row["psnr"] for row in rows],
-                    marker=markers[name],
+                    marker=MARKERS[number % len(MARKERS)] if alone else markers[name],
                     color=color,
                     linestyle="--" if "decomposed" in name else "-",
-                    label=f"{method}, {name if len({n for n, _ in shown}) > 1 else light}",
+                    label=f"{method}, {light if alone else name}",
                 )
                 for row in rows:
                     axis.annotate(
