@@ -175,7 +175,7 @@ def placed(cloud: GaussianCloud, placement: Placement) -> GaussianCloud:
     if placement.is_identity:
         return change_axes(cloud, WORLD_AXES)
     turn = placement.orthogonal @ axes_matrix(cloud.axes, WORLD_AXES)
-    arrays = replace(placement, orthogonal=turn).apply(cloud.arrays())
+    arrays: dict[str, Any] = dict(replace(placement, orthogonal=turn).apply(cloud.arrays()))
     return GaussianCloud(**arrays, axes=WORLD_AXES)
 
 

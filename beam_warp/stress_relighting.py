@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -328,7 +329,8 @@ def _relightable(cloud: GaussianCloud, base_color: float = 1.0, roughness: float
 def _together(*clouds: GaussianCloud) -> GaussianCloud:
     """Return all Gaussians as one cloud."""
     names = clouds[0].arrays()
-    return GaussianCloud(**{name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in names})
+    arrays: dict[str, Any] = {name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in names}
+    return GaussianCloud(**arrays)
 
 
 def _nothing(studio: RelightStudio) -> GaussianCloud:
@@ -340,11 +342,11 @@ def _square(half: float, middle: ArrayLike = (0.0, 0.0, 0.0), *, catches: bool =
     """Return a level square of two triangles, white."""
     corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]]) + middle
     surface = MaterialMesh(
-        vertices=corners,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        normals=np.tile([0.0, 0.0, 1.0], (4, 1)),
-        base_color=np.ones((4, 3)),
-        roughness=np.ones(4),
+        vertices=corners.astype(np.float32),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        normals=np.tile(np.float32([0.0, 0.0, 1.0]), (4, 1)),
+        base_color=np.ones((4, 3), np.float32),
+        roughness=np.ones(4, np.float32),
     )
     return ShotMesh(surface=surface, catches_shadows=np.full(2, catches))
 

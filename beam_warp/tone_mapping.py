@@ -158,7 +158,7 @@ def _standard(linear: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _aces(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    return linear * (2.51 * linear + 0.03) / (linear * (2.43 * linear + 0.59) + 0.14)
+    return (linear * (2.51 * linear + 0.03) / (linear * (2.43 * linear + 0.59) + 0.14)).astype(np.float32)
 
 
 def _agx(linear: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from beam_warp.devices import resolve_device
 from beam_warp.path_rendering import PathOptions, PathRenderer
 from beam_warp.raster_records import RasterOptions
 from beam_warp.shots import RenderedImage, Shot
-from beam_warp.tone_mapping import display_over
+from beam_warp.tone_mapping import ViewTransform, display_over
 from beam_warp.view_state import Color
 
 MOST_PATHS = 2**20
@@ -57,7 +57,7 @@ def path_tracer(device: str | None) -> PathRenderer:
     return PathRenderer(PathOptions(samples=MOST_PATHS), device=device)
 
 
-def displayed(image: RenderedImage, transform: str, stops: float, background: Color) -> NDArray[np.uint8]:
+def displayed(image: RenderedImage, transform: ViewTransform, stops: float, background: Color) -> NDArray[np.uint8]:
     """Return what a display shows of an image over a display colour, ``(H, W, 3)``: see `tone_mapping.display_over`."""
     behind = np.asarray(background, np.uint8)
     shown = np.broadcast_to(behind, image.rgb.shape).copy()

@@ -14,6 +14,7 @@ from beam_warp.assets import GaussianCloud
 from beam_warp.cameras import Camera
 from beam_warp.errors import InvalidOptionError
 from beam_warp.lights import DirectionalLight, Light, PointLight, SpotLight
+from beam_warp.tone_mapping import ViewTransform
 
 LIT = "lit"
 """The channel that is what light makes of all the others."""
@@ -72,7 +73,7 @@ class ViewState:
     environment: str = NO_ENVIRONMENT
     rotation: float = 0.0
     exposure: float = 0.0
-    transform: str = "standard"
+    transform: ViewTransform = "standard"
     background: Color = (33, 33, 33)
     lights: tuple[Light, ...] = ()
     ground: str = NO_GROUND

@@ -29,6 +29,9 @@ Row = Mapping[str, Any]
 COLORS = {"deferred": "C0", "per Gaussian": "C2", "path traced": "C1"}
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
+LIGHT_NAMES = ("studio", "low sun")
+"""What the first light of a subject is, and the second."""
+
 COMPARED = ("walker", "runner")
 """Subjects side by side, if they are there; else all."""
 
@@ -62,49 +65,48 @@ def draw_all(results: Sequence[Row], out: Path, pictures: Path | None = None) ->
 
 
 def draw_speed(subjects: Mapping[str, Row], device: str, path: Path) -> Path:
-    """Draw milliseconds of an image against how near it comes to the truth: a panel for each light."""
+    """Draw milliseconds of an image against how near it comes to the truth: a panel for each subject."""
     plt = _pyplot()
-    panels = panels_of(subjects)
-    figure, axes = plt.subplots(1, len(panels), figsize=(4.6 * len(panels), 4.2), layout="constrained", squeeze=False)
-    markers = {name: MARKERS[number % len(MARKERS)] for number, name in enumerate(subjects)}
-    for axis, (title, shown) in zip(axes.flat, panels.items(), strict=True):
-        alone = len({name for name, _ in shown}) == 1
-        for number, (name, light) in enumerate(shown):
+    columns = min(3, len(subjects) + 1)
+    lines = -(-(len(subjects) + 1) // columns)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(3.6 * columns, 2.9 * lines), layout="constrained", squeeze=False, sharey=True
+    )
+    handles: dict[str, Any] = {}
+    for axis, (name, subject) in zip(axes.flat, subjects.items(), strict=False):
+        for number, found in enumerate(subject["lights"].values()):
             for method, color in COLORS.items():
-                rows = [row for row in subjects[name]["lights"][light]["rows"] if row["method"] == method]
-                rows.sort(key=lambda row: row["ms"])
-                axis.plot(
+                rows = sorted((row for row in found["rows"] if row["method"] == method), key=lambda row: row["ms"])
+                label = f"{method}, {LIGHT_NAMES[number % 2]}"
+                (handles[label],) = axis.plot(
                     [row["ms"] for row in rows],
                     [row["psnr"] for row in rows],
-                    marker=MARKERS[number % len(MARKERS)] if alone else markers[name],
+                    marker=MARKERS[number % len(MARKERS)],
+                    markersize=4,
                     color=color,
-                    linestyle="--" if "decomposed" in name else "-",
-                    label=f"{method}, {light if alone else name}",
+                    linestyle="-" if number == 0 else "--",
+                    label=label,
                 )
-                for row in rows:
+                for row in rows if number == 0 else ():
                     axis.annotate(
                         row["setting"].removesuffix(" samples"),
                         (row["ms"], row["psnr"]),
                         textcoords="offset points",
-                        xytext=(3, 3),
+                        xytext=(2, -9),
                         fontsize=6,
                     )
-        axis.set(xscale="log", xlabel=f"ms per image on {device}", ylabel="PSNR in the box [dB]", title=title)
+        kind = "" if "decomposed" in name or name == "demo figure" else ", true materials"
+        axis.set(xscale="log", xlabel=f"ms per image on {device}", title=f"{name}{kind}")
+        axis.title.set_fontsize(9)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("PSNR in the box [dB]")
+    for axis in axes.flat[len(subjects) :]:
+        axis.set_axis_off()
+    axes.flat[-1].legend(handles=list(handles.values()), loc="center", fontsize=8, frameon=False)
     save_small(figure, path)
     plt.close(figure)
     return path
-
-
-def panels_of(subjects: Mapping[str, Row]) -> dict[str, list[tuple[str, str]]]:
-    """Return by title which subjects are shown under which lights: a panel a light, the demo figure by itself."""
-    panels: dict[str, list[tuple[str, str]]] = {}
-    for name, subject in subjects.items():
-        for light in subject["lights"]:
-            title = name if name == "demo figure" else light
-            panels.setdefault(title, []).append((name, light))
-    return panels
 
 
 def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> Path:
@@ -116,9 +118,14 @@ def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> 
         with np.load(pictures / subject["picture"]) as kept:
             images = [shown_color(kept[f"{light}_{kind}"]) for kind in ("deferred", "path", "truth")]
         loaded.append((name, light, subject["lights"][light], images))
-    height = max(images[0].shape[0] / images[0].shape[1] for *_, images in loaded)
+    heights = [2.2 * images[0].shape[0] / images[0].shape[1] + 0.45 for *_, images in loaded]
     figure, axes = plt.subplots(
-        len(loaded), 4, figsize=(8.8, (2.2 * height + 0.45) * len(loaded)), layout="constrained", squeeze=False
+        len(loaded),
+        4,
+        figsize=(8.8, sum(heights)),
+        height_ratios=heights,
+        layout="constrained",
+        squeeze=False,
     )
     for line, (name, light, found, images) in zip(axes, loaded, strict=True):
         rows = {(row["method"], row["setting"]): row for row in found["rows"]}
