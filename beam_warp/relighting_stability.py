@@ -132,9 +132,10 @@ class RelightingOutcome:
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> RelightingOutcome:
         """Return what `as_dict` gave."""
-        values = {entry.name: record[entry.name] for entry in fields(cls)}
-        values |= {name: tuple(values[name]) for name in ("size", "faults")}
-        return cls(**values | {"held": tuple(Held(**row) for row in values["held"])})
+        values: dict[str, Any] = {entry.name: record[entry.name] for entry in fields(cls)}
+        lists: dict[str, Any] = {name: tuple(values[name]) for name in ("size", "faults")}
+        lists["held"] = tuple(Held(**row) for row in values["held"])
+        return cls(**values | lists)
 
 
 @dataclass(frozen=True, eq=False)

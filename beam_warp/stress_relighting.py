@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -336,7 +337,8 @@ def _relightable(cloud: GaussianCloud, base_color: float = 1.0, roughness: float
 def _together(*clouds: GaussianCloud) -> GaussianCloud:
     """Return all Gaussians as one cloud."""
     names = clouds[0].arrays()
-    return GaussianCloud(**{name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in names})
+    arrays: dict[str, Any] = {name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in names}
+    return GaussianCloud(**arrays)
 
 
 def _nothing(studio: RelightStudio) -> GaussianCloud:
@@ -346,13 +348,13 @@ def _nothing(studio: RelightStudio) -> GaussianCloud:
 
 def _square(half: float, middle: ArrayLike = (0.0, 0.0, 0.0), *, catches: bool = False) -> ShotMesh:
     """Return a level square of two triangles, white."""
-    corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]]) + middle
+    corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
     surface = MaterialMesh(
-        vertices=corners,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        normals=np.tile([0.0, 0.0, 1.0], (4, 1)),
-        base_color=np.ones((4, 3)),
-        roughness=np.ones(4),
+        vertices=(corners + np.asarray(middle, np.float64)).astype(np.float32),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        normals=np.tile(np.float32([0.0, 0.0, 1.0]), (4, 1)),
+        base_color=np.ones((4, 3), np.float32),
+        roughness=np.ones(4, np.float32),
     )
     return ShotMesh(surface=surface, catches_shadows=np.full(2, catches))
 
@@ -699,7 +701,7 @@ def no_light(studio: RelightStudio) -> RelightStress:
 def empty_frame(studio: RelightStudio) -> RelightStress:
     """No Gaussians: alone, and over a floor of triangles."""
     cloud, camera = _nothing(studio), studio.at_plane(45.0)
-    light = {"environment": white(), "lights": (sun_at(45.0, 0.0),)}
+    light: dict[str, Any] = {"environment": white(), "lights": (sun_at(45.0, 0.0),)}
     return RelightStress(
         shots=tuple(Shot(cloud=cloud, camera=camera, mesh=mesh, **light) for mesh in (None, _square(3.0))),
         demands=(
@@ -756,7 +758,7 @@ def camera_inside(studio: RelightStudio) -> RelightStress:
 def different_counts(studio: RelightStudio) -> RelightStress:
     """One renderer draws many Gaussians, few, none, and the first again."""
     many, few = studio.ball(base_color=0.7), studio.ball(base_color=0.4, spacing=2.0 * studio.spacing)
-    light = {"environment": firefly(), "lights": (sun_at(40.0),)}
+    light: dict[str, Any] = {"environment": firefly(), "lights": (sun_at(40.0),)}
     shots = tuple(Shot(cloud=cloud, camera=studio.at_ball(), **light) for cloud in (many, few, _nothing(studio), many))
     return RelightStress(
         shots=shots,
@@ -917,7 +919,7 @@ def broken_rows(studio: RelightStudio) -> RelightStress:
     broken = {name: np.insert(array, rows, array[rows], axis=0) for name, array in arrays.items()}
     broken["positions"][rows + np.arange(10)] = np.nan
     kept, left_out = GaussianCloud.leaving_out_invalid(**broken)
-    light = {"environment": white(), "lights": (sun_at(40.0),)}
+    light: dict[str, Any] = {"environment": white(), "lights": (sun_at(40.0),)}
     return RelightStress(
         shots=tuple(Shot(cloud=c, camera=camera, **light) for c in (cloud, kept)),
         noisy=False,
