@@ -352,7 +352,7 @@ def _square(half: float, middle: ArrayLike = (0.0, 0.0, 0.0), *, catches: bool =
     surface = MaterialMesh(
         vertices=(corners + np.asarray(middle, np.float64)).astype(np.float32),
         faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-        normals=np.tile(np.float32([0.0, 0.0, 1.0]), (4, 1)),
+        normals=np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1)),
         base_color=np.ones((4, 3), np.float32),
         roughness=np.ones(4, np.float32),
     )
