@@ -133,9 +133,9 @@ class RelightingOutcome:
     def from_dict(cls, record: Mapping[str, Any]) -> RelightingOutcome:
         """Return what `as_dict` gave."""
         values: dict[str, Any] = {entry.name: record[entry.name] for entry in fields(cls)}
-        values |= {name: tuple(values[name]) for name in ("size", "faults")}
-        values["held"] = tuple(Held(**row) for row in values["held"])
-        return cls(**values)
+        lists: dict[str, Any] = {name: tuple(values[name]) for name in ("size", "faults")}
+        lists["held"] = tuple(Held(**row) for row in values["held"])
+        return cls(**values | lists)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,12 @@ from beam_warp import (
     analytic_occlusion,
     capture_stability,
     material_stability,
+    relighting_stability,
     stability,
     stress_captures,
     stress_cases,
     stress_materials,
+    stress_relighting,
 )
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
@@ -33,6 +35,8 @@ def few_cases(monkeypatch):
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
     assert material_stability.MATERIAL_CASES
     monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [])
+    assert relighting_stability.RELIGHTING_CASES
+    monkeypatch.setattr(stress_relighting, "RELIGHTING_CASES", [])
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
 
@@ -209,6 +213,63 @@ def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
     monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [dataclasses.replace(one_light, build=build)])
     assert run("--only", "materials", "--quiet") == 1
     assert "failed: black environment on cpu: refused: environment must shed light" in capsys.readouterr().err
+
+
+@pytest.fixture
+def leaking_front(monkeypatch):
+    """Two Gaussians: paths hold what is asked, the deferred renderer does not."""
+    cases = relighting_stability.RELIGHTING_CASES
+    case = next(case for case in cases if case.name == "a leaking front before a dark inside")
+    monkeypatch.setattr(stress_relighting, "RELIGHTING_CASES", [case])
+    return case
+
+
+def test_relighting_alone(leaking_front, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("# Stability\n\nrays\n\n## Materials\n\nkept\n", encoding="utf-8")
+    assert run("--only", "relighting", "--out", page) == 1
+    out, err = capsys.readouterr()
+    assert "relighting on cpu" in out
+    assert "coaxial disc" not in out
+    assert err.startswith("failed: a leaking front before a dark inside on cpu, deferred: radiance, of the front's own")
+    assert err.count("\n") == 1
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# Stability\n\nrays\n\n## Materials\n\nkept\n\n## Relighting\n")
+    assert "1 of 2 hold." in text
+    by_paths = next(line for line in text.splitlines() if "| path |" in line)
+    assert by_paths.startswith("| a leaking front before a dark inside |")
+    assert by_paths.endswith("| ok |")
+
+
+def test_other_parts_keep_relighting(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    after = "## Materials\n\nkept\n\n## Relighting\n\nkept too\n"
+    page.write_text(f"# Stability\n\nrays of before\n\n{after}", encoding="utf-8")
+    assert run("--only", "tracing", "--out", page, "--quiet") == 0
+    text = page.read_text(encoding="utf-8")
+    assert "rays of before" not in text
+    assert text.endswith(f"\n\n{after}")
+
+
+def test_relighting_of_another_device_stands_below(leaking_front, tmp_path, capsys):
+    assert run("--only", "relighting", "--json") == 1
+    record = json.loads(capsys.readouterr().out)
+    assert [row["renderer"] for row in record["relighting"]] == ["deferred", "path"]
+    for row in record["relighting"]:
+        row["device"] = "Some GPU"
+    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
+    page = tmp_path / "page.md"
+    assert run("--only", "relighting", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 1
+    text = page.read_text(encoding="utf-8")
+    assert text.index("cpu: images of") < text.index("Some GPU: images of")
+
+
+def test_large_relighting_is_run_on_request(leaking_front, monkeypatch, capsys):
+    large = dataclasses.replace(leaking_front, large=True)
+    monkeypatch.setattr(stress_relighting, "RELIGHTING_CASES", [large])
+    assert run("--only", "relighting", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["relighting"] == []
+    assert run("--only", "relighting", "--large", "--quiet") == 1
 
 
 def test_results_that_are_none_are_refused(tmp_path, capsys):
