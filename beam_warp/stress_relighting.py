@@ -1,7 +1,7 @@
 """Subjects and lights on which relighting fails: small shots, and what must hold of their images.
 
 What must hold is a closed form, many samples of a path tracer, or a bound; each with the reason for how far an image
-may be off, stated here and not found by trying.
+may be off, derived and not fitted to what renderers give.
 """
 
 from __future__ import annotations
@@ -149,13 +149,13 @@ class RelightStudio:
         surface = sphere_zone(np.zeros(3), RADIUS, -1.0, 1.0, spacing or self.spacing)
         return _relightable(tile((surface,)), base_color, roughness)
 
-    def floor(self, *, wall: bool = False) -> GaussianCloud:
-        """Return a floor of 2 m, tiled with flat Gaussians, with or without the wall."""
+    def floor(self, wall: tuple[Surface, ...] = ()) -> GaussianCloud:
+        """Return a floor of 2 m, tiled with flat Gaussians, and a wall on it if one is given."""
         x, y, _ = np.eye(3)
-        return _relightable(tile((rectangle(np.zeros(3), x, y, self.spacing), *(self.wall() if wall else ()))), 0.8)
+        return _relightable(tile((rectangle(np.zeros(3), x, y, self.spacing), *wall)), 0.8)
 
     def wall(self) -> tuple[Surface, Surface]:
-        """Return both sides of the wall, one towards the sun: a single one, seen from behind, would be an inside."""
+        """Return both sides of the wall, the first towards the sun."""
         _, y, z = np.eye(3)
         place, height, half = WALL
         front = np.array([place - THICKNESS, 0.0, 0.5 * height])
@@ -519,14 +519,9 @@ def acne(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
-    "sun at grazing incidence, a wall",
-    "a bias that hides acne takes the shadow off the wall's foot (peter-panning)",
-    "shadows where paths have them, to a pixel",
-)
-def peter_panning(studio: RelightStudio) -> RelightStress:
-    """A sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
-    cloud, camera, sun = studio.floor(wall=True), studio.from_above(), sun_at(GRAZING)
+def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
+    """Return a sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
+    cloud, camera, sun = studio.floor(wall), studio.from_above(), sun_at(GRAZING)
     expected, judged = _wall_shadow(studio, camera, studio.spacing)
     names = ("falsely shadowed", "falsely lit")
     by_form = tuple(
@@ -554,6 +549,27 @@ def peter_panning(studio: RelightStudio) -> RelightStress:
         ),
         demands=by_form + by_paths,
     )
+
+
+@relighting_case(
+    "sun at grazing incidence, a wall",
+    "a bias that hides acne takes the shadow off the wall's foot (peter-panning)",
+    "shadows where they are, to a pixel",
+)
+def peter_panning(studio: RelightStudio) -> RelightStress:
+    """A wall of two sides."""
+    return _behind(studio, studio.wall())
+
+
+@relighting_case(
+    "sun at grazing incidence, a sheet",
+    "a layer that faces the sun is lit from its front when it is seen from behind, and lights what is in its shadow",
+    "shadows where they are, to a pixel",
+)
+def single_layer(studio: RelightStudio) -> RelightStress:
+    """The wall's shadow, of a single layer of Gaussians whose normals face the sun."""
+    front, _ = studio.wall()
+    return _behind(studio, (replace(front, points=front.points + np.array([THICKNESS, 0.0, 0.0])),))
 
 
 def _furnace(studio: RelightStudio, roughness: float) -> tuple[tuple[Shot, ...], tuple[Demand, ...]]:
