@@ -543,11 +543,21 @@ def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
         )
         for lit, what in enumerate(names)
     )
+    place, height, half = WALL
+    points = floor_points(camera)
+    near = points[..., 0] < place + 0.5 * height / np.tan(np.radians(GRAZING))
+    shadowed = expected & judged & near & (np.abs(points[..., 1]) < 0.5 * half)
+    dark = Demand(
+        what="light in the middle of the shadow",
+        measure=lambda drawn: float(arriving_part(*drawn.images)[shadowed].mean()),
+        high=0.1,
+        because="tiles let up to 0.05 through, and no more than that comes back from the lit floor by way of the wall",
+    )
     return RelightStress(
         shots=tuple(
             Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),)) for shadows in (True, False)
         ),
-        demands=by_form + by_paths,
+        demands=(*by_form, *by_paths, dark),
     )
 
 
