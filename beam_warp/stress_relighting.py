@@ -48,6 +48,9 @@ ACNE = 3.0
 WALL = (-0.5, 0.15, 0.4)
 """Where the wall stands along x, its height, and half its width [m]."""
 
+FIELD = 1.8
+"""Width of the floor that is seen from above [m]."""
+
 THICKNESS = 0.02
 """Of the wall [m]."""
 
@@ -178,8 +181,8 @@ class RelightStudio:
         return Camera.look_at((0.0, -2.6, 0.6), (0.0, 0.0, 0.0), width=self.size, height=self.size, vertical_fov=24.0)
 
     def from_above(self) -> Camera:
-        """Return a camera that sees 1.8 m of the floor from 3 m above."""
-        field = 2.0 * np.degrees(np.arctan(0.9 / 3.0))
+        """Return a camera that sees `FIELD` of the floor from 3 m above."""
+        field = 2.0 * np.degrees(np.arctan(0.5 * FIELD / 3.0))
         side = self.size
         return Camera.look_at(
             (0.0, 0.0, 3.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), width=side, height=side, vertical_fov=field
@@ -519,6 +522,14 @@ def acne(studio: RelightStudio) -> RelightStress:
     )
 
 
+def _wall_seen(studio: RelightStudio) -> float:
+    """Return how far beside the wall it is itself that is seen from above [m].
+
+    Splats are widened by 0.3 px², which makes two pixels of opaque wall of a stack of them.
+    """
+    return studio.spacing + 2.0 * FIELD / studio.size
+
+
 def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
     """Return a sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
     cloud, camera, sun = studio.floor(wall), studio.from_above(), sun_at(GRAZING)
@@ -545,8 +556,9 @@ def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
     )
     place, height, half = WALL
     points = floor_points(camera)
-    near = points[..., 0] < place + 0.5 * height / np.tan(np.radians(GRAZING))
-    shadowed = expected & judged & near & (np.abs(points[..., 1]) < 0.5 * half)
+    behind = points[..., 0] - place
+    middle = (behind > _wall_seen(studio)) & (behind < 0.5 * height / np.tan(np.radians(GRAZING)))
+    shadowed = expected & judged & middle & (np.abs(points[..., 1]) < 0.5 * half)
     dark = Demand(
         what="light in the middle of the shadow",
         measure=lambda drawn: float(arriving_part(*drawn.images)[shadowed].mean()),
@@ -916,9 +928,7 @@ def far_catcher(studio: RelightStudio) -> RelightStress:
 def grazing_catcher(studio: RelightStudio) -> RelightStress:
     """The wall on a catcher, a sun of 10 degrees and nothing else."""
     camera = studio.from_above()
-    pixel = 1.8 / studio.size
-    # Splats are widened by 0.3 px², which stacks of them from above make two pixels of an opaque wall of.
-    expected, judged = _wall_shadow(studio, camera, studio.spacing + 2.0 * pixel)
+    expected, judged = _wall_shadow(studio, camera, _wall_seen(studio))
     wall = _relightable(tile(studio.wall()), 0.8)
     return RelightStress(
         shots=(Shot(cloud=wall, camera=camera, lights=(sun_at(GRAZING),), mesh=_square(5.0, catches=True)),),
