@@ -391,6 +391,7 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
             ["--out", "x.png", "--lights", "area.json"],
             "lights[0].type must be one of directional, point, spot, got 'area'",
         ),
+        (["--out", "x.png", "--lights", "nan-light.json"], "lights[0]: position must be finite, got NaN"),
         (["--out", "o", "--capture", "c", "--fps", "9"], "fps must be left out with --capture, got 9.0"),
         (
             ["--out", "o", "--capture", "c", "--turntable", "9"],
@@ -409,6 +410,8 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
 def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "area.json").write_text(json.dumps([{"type": "area"}]))
+    lamp = {"type": "point", "position": [0, float("nan"), 0], "intensity": [1, 1, 1]}
+    (tmp_path / "nan-light.json").write_text(json.dumps([lamp]))
     pose = np.eye(4).tolist()
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps([{"time": 0, "camera_to_world": pose}]))
