@@ -26,6 +26,9 @@ LIFT = wp.constant(4.0)
 """How far rays start above a layer, in root mean squares of how far its Gaussians reach from it: as for measured
 materials (`beam_warp.surfaces`)."""
 
+LEANING_COSINE = wp.constant(0.2)
+"""Normals within 12 degrees of a right angle with the ray are those of an outline, not of a back."""
+
 GAP_IN_SIZES = wp.constant(2.0)
 """Hits that follow each other by more than this many times the middle scale of the smaller Gaussian are of different
 surfaces: neighbours on one overlap, and are turned against each other by less than that."""
@@ -102,6 +105,18 @@ class Layer:
 
 
 @wp.func
+def seen_side(normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """A normal that faces away, turned around: what is seen is the other side of a thin surface.
+
+    One that leans back just a little belongs to an outline, where shading turns it to graze the viewer.
+    """
+    result = normal
+    if wp.dot(normal, direction) > LEANING_COSINE:
+        result = -normal
+    return result
+
+
+@wp.func
 def layer_vertex(layer: Layer, origin: wp.vec3, direction: wp.vec3) -> Vertex:
     """The surface that a layer is."""
     vertex = Vertex()
@@ -112,7 +127,7 @@ def layer_vertex(layer: Layer, origin: wp.vec3, direction: wp.vec3) -> Vertex:
     vertex.normal = -direction  # normals that cancel have no direction: the one that is seen best
     size = wp.length(layer.normal)
     if size > 1.0e-6 * layer.weight:
-        vertex.normal = layer.normal / size
+        vertex.normal = seen_side(layer.normal / size, direction)
     cosine = wp.dot(vertex.normal, direction)
     spread = wp.max(layer.t_squared / layer.weight - behind * behind, 0.0)
     reach = wp.sqrt(spread * cosine * cosine + layer.thickness_squared / layer.weight)
@@ -214,7 +229,7 @@ def next_vertex(
         vertex.on_gaussian = True
         vertex.t = ray_peak(occluders.gaussians, hit, origin, direction).t
         vertex.position = origin + direction * vertex.t
-        vertex.normal = wp.vec3(shape[0], shape[1], shape[2])
+        vertex.normal = seen_side(wp.vec3(shape[0], shape[1], shape[2]), direction)
         vertex.base_color = wp.vec3(look[0], look[1], look[2])
         vertex.roughness = look[3]
     elif mesh.face >= 0:

@@ -22,7 +22,11 @@ from beam_warp.kernels.row_loads import load_row
 wp.set_module_options({"enable_backward": False})
 
 STEEPEST = wp.constant(10.0)
-"""Largest tangent of a receiver's slope against the light: 84 degrees. Beyond it, little of the light arrives."""
+"""Largest tangent of a receiver's slope against the light: 84 degrees. Beyond it a texel cannot tell what is in the way
+from the receiver itself, and little of the light arrives."""
+
+EDGE_ON = wp.constant(20.0)
+"""Tangent, 87 degrees, from which on no shadow is received; it fades in between: terminators are lit, not dirty."""
 
 LEAST_DEPTH = wp.constant(1.0e-6)
 
@@ -58,6 +62,7 @@ class Receiver:
     depth: float
     slope: wp.vec2  # of its tangent plane's depth [m/texel]
     bias: float
+    trust: float  # how far a map can tell what is in the way from the receiver itself
     inside: bool
 
 
@@ -113,6 +118,10 @@ def receive(maps: ShadowMaps, k: int, point: wp.vec3, normal: wp.vec3) -> Receiv
         texel = p[2] / view.focal[0]
         across = wp.vec2(n[0], n[1])
         facing = -wp.dot(n, p) / p[2]
+        receiver.trust = 1.0  # what faces away is behind itself
+        if facing > 0.0:
+            steep = wp.length(across) / facing
+            receiver.trust = wp.clamp((EDGE_ON - steep) / (EDGE_ON - STEEPEST), 0.0, 1.0)
         facing = wp.max(facing, wp.max(wp.length(across) / STEEPEST, 1.0e-6))
         receiver.slope = across * (texel / facing)
         receiver.bias = CURVATURE_TEXELS * (texel + wp.length(receiver.slope)) + ROUNDING * p[2]
@@ -224,7 +233,7 @@ def blocker_depth(maps: ShadowMaps, k: int, view: View, receiver: Receiver, turn
 def visible_share(maps: ShadowMaps, k: int, point: wp.vec3, normal: wp.vec3, turn: wp.vec2) -> float:
     """Share of a light that reaches a point; 1 outside of its map. Taps turn by the angle of a cosine and sine."""
     receiver = receive(maps, k, point, normal)
-    if not receiver.inside:
+    if not receiver.inside or receiver.trust <= 0.0:
         return 1.0
     view = maps.views[k]
     radius = float(1.0)
@@ -241,7 +250,7 @@ def visible_share(maps: ShadowMaps, k: int, point: wp.vec3, normal: wp.vec3, tur
             hidden += hidden_between(maps, view, receiver, place)
         else:
             hidden += hidden_at(maps, view, receiver, int(wp.floor(place[0])), int(wp.floor(place[1])))
-    return 1.0 - hidden / float(count)
+    return 1.0 - receiver.trust * hidden / float(count)
 
 
 @wp.func

@@ -51,9 +51,7 @@ SMALL = [case for case in RELIGHTING_CASES if not case.large]
 NAMES = [case.name for case in SMALL]
 
 SHORT = {
-    ("sun at grazing incidence, bare floor", DEFERRED): ("falsely shadowed must be 0", "light that arrives, of all"),
     ("sun at grazing incidence, a wall", DEFERRED): ("falsely shadowed, by paths",),
-    ("sun at grazing incidence, a sheet", PATH): ("falsely lit must be at most 0.01", "light in the middle"),
     ("roughness 0.03", DEFERRED): ("highlight of the sun",),
     ("a leaking front before a dark inside", DEFERRED): ("radiance, of the front's own",),
 }

@@ -56,7 +56,8 @@ class Evaluate:
         Path | None, arg(metavar="DIR", help="Also write the images that were scored, in the layout of the truth.")
     ] = None
     relight: Annotated[
-        tuple[str, ...], arg(metavar="NAME ...", help="How relit images are made: deferred; none leaves them out.")
+        tuple[str, ...],
+        arg(metavar="NAME ...", help="How relit images are made: deferred, traced, path; none leaves them out."),
     ] = ("deferred",)
     scaled_relighting: Annotated[bool, arg(help="Also relight with base colour times its best scale.")] = False
     samples: Annotated[int, arg(metavar="N", help="A pixel is the mean of N x N samples.")] = 2
