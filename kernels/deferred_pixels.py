@@ -60,6 +60,7 @@ def shade_gaussians_kernel(
     channels: wp.array2d[float],
     alpha: wp.array[float],
     depth: wp.array[float],
+    median_depth: wp.array[float],
     has_arriving: int,
     environment: DistantLight,
     lights: Lights,
@@ -105,7 +106,9 @@ def shade_gaussians_kernel(
         shading = shading_of(
             seen_normal(raw_normal, toward), toward, base_color, roughness, environment.light.albedo_terms
         )
-        radiance += lit_radiance(lights, shadows, shading, view.position + depth[i] * ray, random_turn(i))
+        # where the front leaks the mean lies inside the body, where no light arrives
+        place = view.position + wp.min(depth[i], median_depth[i]) * ray
+        radiance += lit_radiance(lights, shadows, shading, place, random_turn(i))
     out_image[i] = wp.vec4(radiance[0] * coverage, radiance[1] * coverage, radiance[2] * coverage, coverage)
 
 
@@ -133,6 +136,7 @@ def launch_shade_gaussians(views, images, has_arriving, environment, lights, sha
             images.channels[0],
             images.alpha,
             images.depth,
+            images.median_depth,
             int(has_arriving),
             environment,
             lights,

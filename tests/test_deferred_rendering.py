@@ -551,3 +551,28 @@ def test_options_are_checked():
     for bad in ({"environment_shadows": 3}, {"bounces": -1}, {"samples": 0}, {"layers": ("colour",)}):
         with pytest.raises(InvalidOptionError, match=next(iter(bad))):
             DeferredOptions(**bad)
+
+
+def test_where_the_front_leaks_light_still_falls_on_the_front(device):
+    """Before a far back, a front of 0.8: the mean depth lies between the two, in the shadow of the front."""
+    light = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
+    camera = Camera.look_at((0.01, 0.0, 3.0), (0.0, 0.0, 0.0), width=8, height=8, vertical_fov=4.0)
+    quarter_turn = (0.0, 0.0, 0.0, 1.0)
+    means = []
+    for opacity in (0.8, 0.99):
+        cloud = GaussianCloud(
+            positions=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+            orientations=np.array([quarter_turn, quarter_turn]),
+            scales=np.tile([1.0, 1.0, 1e-3], (2, 1)),
+            opacities=np.array([opacity, 0.99]),
+            normals=np.tile([0.0, 0.0, 1.0], (2, 1)),
+            base_color=np.full((2, 3), 0.5),
+            roughness=np.ones(2),
+            ambient_occlusion=np.ones(2),
+            axes="rfu",
+        )
+        options = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=128)
+        image = DeferredRenderer(options, device=device).draw(Shot(cloud=cloud, camera=camera, lights=(light,)))
+        means.append(image.rgb.mean() / image.alpha.mean())
+    # one surface of one material: what leaks is lit as the front is, shadowed by nothing that is nearer
+    assert means[0] == pytest.approx(means[1], rel=0.02)

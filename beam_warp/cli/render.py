@@ -28,27 +28,27 @@ class Render:
 
     See docs/sequences.md.
 
-    Example, an image: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
+    An image. Example: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
 
-    Example, a film: beam render person.usdz --environment studio.hdr --frames 0:150 --mode path --out turntable.mp4
+    A film. Example: beam render person.usdz --environment studio.hdr --frames 0:150 --mode path --out turntable.mp4
 
-    Example, numbered images: beam render person.usdz --environment studio.hdr --frames 0:150:10 --out frames/%04d.exr
+    Numbered images. Example: beam render person.usdz --environment studio.hdr --frames 0:150:10 --out frames/%04d.exr
 
-    Example, slow motion: beam render person.usdz --environment studio.hdr --speed 0.25 --fps 60 --out slow.mp4
+    Slow motion. Example: beam render person.usdz --environment studio.hdr --speed 0.25 --fps 60 --out slow.mp4
 
-    Example, a turntable: beam render person.usdz --environment studio.hdr --turns 1 --seconds 6 --out around.mp4
+    A turntable. Example: beam render person.usdz --environment studio.hdr --turns 1 --seconds 6 --out around.mp4
 
-    Example, turning light: beam render person.usdz --environment sky.hdr --rotate-per-second 60 --out light.mp4
+    Turning light. Example: beam render person.usdz --environment sky.hdr --rotate-per-second 60 --out light.mp4
 
-    Example, a camera path: beam render person.usdz --environment studio.hdr --camera path.usda --out move.mp4
+    A camera path. Example: beam render person.usdz --environment studio.hdr --camera path.usda --out move.mp4
 
-    Example, lamps and a floor: beam render person.usdz --lights lamps.json --ground plain --view agx --out stage.png
+    Lamps and a floor. Example: beam render person.usdz --lights lamps.json --ground plain --view agx --out stage.png
 
-    Example, several: beam render a.usdz b.usdz --spacing 1 --environment studio.hdr --ground shadows --out both.png
+    Several. Example: beam render a.usdz b.usdz --spacing 1 --environment studio.hdr --ground shadows --out both.png
 
-    Example, a stage: beam render stage.json --mode path --target-error 0.004 --denoise auto --out stage.mp4
+    A stage. Example: beam render stage.json --mode path --target-error 0.004 --denoise auto --out stage.mp4
 
-    Example, one channel: beam render person.usdz --channel base_color_error --out error.png
+    One channel. Example: beam render person.usdz --channel base_color_error --out error.png
     """
 
     asset: Annotated[

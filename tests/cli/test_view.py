@@ -44,7 +44,12 @@ def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights):
     words = ["view", str(asset), "--environment", str(lights), "--port", "0", "--json", "--device", "cpu"]
     code = "import sys; from beam_warp.cli.main import main; sys.exit(main(sys.argv[1:]))"
     with subprocess.Popen(
-        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a suite that runs in the background of a shell hands down that SIGINT is ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         said = ""
         while not said.endswith("}\n"):
