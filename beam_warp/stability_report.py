@@ -123,12 +123,11 @@ the path tracer make of them: `beam_warp/stress_relighting.py`. What must hold i
 {times} times the samples, or a bound, each with its reason. That images are finite, with alpha in [0, 1] and no
 negative light, is asked of all.
 
-Bounds were derived before anything was drawn, but for the 0.1 of light behind the sheet, which was set after a first look
-at what leaked there. Three cases were corrected after a first look, as
-they asked for what is not so: coverage inside a ball, whose tiles let up to 0.05 through, not 0.01; the leaking front,
-which lay so near its inside that both were one layer; and the catcher, where pixels beside the wall show the wall.
-A wall of one layer was kept as a case of its own beside the one of two sides; how dark shadows are is
-asked since then.
+Bounds were derived before anything was drawn, but for the 0.1 of light behind the sheet, which was set after a
+first look at what leaked there. Three cases were corrected after a first look, as they asked for what is not so:
+coverage inside a ball, whose tiles let up to 0.05 through, not 0.01; the leaking front, which lay so near its
+inside that both were one layer; and the catcher, where pixels beside the wall show the wall. A wall of one layer
+was kept as a case of its own beside the one of two sides; how dark shadows are is asked since then.
 
 **Measured** is what one image of the deferred renderer, or {seeds} of the path tracer with a seed each, have: for the
 latter the mean with its standard error. A value is at fault if it is beyond what is **asked** by more than
