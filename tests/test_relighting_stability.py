@@ -51,6 +51,7 @@ SMALL = [case for case in RELIGHTING_CASES if not case.large]
 NAMES = [case.name for case in SMALL]
 
 SHORT = {
+    ("sun at grazing incidence, bare floor", DEFERRED): ("light that arrives, of all",),
     ("sun at grazing incidence, a wall", DEFERRED): ("falsely shadowed, by paths",),
     ("roughness 0.03", DEFERRED): ("highlight of the sun",),
     ("a leaking front before a dark inside", DEFERRED): ("radiance, of the front's own",),
