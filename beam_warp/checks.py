@@ -5,6 +5,7 @@ All guards are phrased positively (``not (value >= low)``), so that NaN fails th
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -97,3 +98,17 @@ def require_choice(name: str, value: str, choices: tuple[str, ...]) -> str:
     if value not in choices:
         raise InvalidOptionError(f"{name} must be one of {', '.join(choices)}, got {value!r}. Choose one of them.")
     return value
+
+
+def require_package(name: str) -> Any:
+    """Import a drawing package.
+
+    Raises:
+        InvalidOptionError: It is not installed; the message names the extra.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InvalidOptionError(
+            f"{name} must be installed to draw charts, got no such package. Run pip install 'beam-warp[charts]'."
+        ) from error

@@ -26,10 +26,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
-from beam_warp.demo_figure import build_figure
-from beam_warp.environment_sampling import SampledEnvironment
-from beam_warp.environments import EnvironmentMap, texel_directions
-from beam_warp.incident_light import irradiance
+from beam_warp.demo.figure import build_figure
+from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.trace.incident import irradiance
+from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 REFERENCE_RAYS = 16_384
 SEEDS = range(1, 5)

@@ -23,14 +23,14 @@ import warp as wp
 from timing import commit
 
 from beam_warp import Scene, ambient_occlusion, converters, visibility
-from beam_warp.axes import change_axes
-from beam_warp.devices import resolve_device
-from beam_warp.environments import EnvironmentMap
-from beam_warp.materials import MaterialOptions
-from beam_warp.pipeline import RunOptions, run
-from beam_warp.reference import visibility_reference
-from beam_warp.surface_rays import ray_offsets
-from beam_warp.surfaces import estimate_normals
+from beam_warp.device.arrays import resolve_device
+from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.job import RunOptions, run
+from beam_warp.materials.normals import estimate_normals
+from beam_warp.trace.rays import ray_offsets
+from beam_warp.trace.reference import visibility_reference
+from beam_warp.world.axes import change_axes
+from beam_warp.world.environment import EnvironmentMap
 
 
 def measure_run(path: Path, light: Path, samples: int, device: str | None) -> dict:

@@ -32,8 +32,8 @@ import numpy as np
 import raster_scenes
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
 
 VERSION = "1.5.3"
 LOW_PASS = 0.3

@@ -46,19 +46,19 @@ from reconstruction_contenders import follow, ours
 from timing import commit, machine
 
 from beam_warp import converters
-from beam_warp.axes import change_axes
-from beam_warp.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.captures import Capture
-from beam_warp.demo_capture import write_demo_capture
-from beam_warp.devices import resolve_device
-from beam_warp.environment_sampling import SampledEnvironment
-from beam_warp.environments import EnvironmentMap
-from beam_warp.material_light import MaterialLight
-from beam_warp.materials import MaterialOptions, measure_materials
-from beam_warp.raster_records import RasterOptions
-from beam_warp.reconstruction_scores import truth_frames
-from beam_warp.relighters import RELIGHTERS
-from beam_warp.reporting import versions
+from beam_warp.capture.capture import Capture
+from beam_warp.demo.capture import write_demo_capture
+from beam_warp.device.arrays import resolve_device
+from beam_warp.evaluate.relighters import RELIGHTERS
+from beam_warp.jobs.report import versions
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
+from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.world.axes import change_axes
+from beam_warp.world.environment import EnvironmentMap
 
 PUBLISHED = {
     "BEAM, its own synthetic humans": {

@@ -18,17 +18,17 @@ import warp as wp
 from materials_truth import Materials
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.captured_views import CapturedView
-from beam_warp.image_path import ImagePathOptions, decompose_by_images
-from beam_warp.material_light import MaterialLight
-from beam_warp.materials import ColorEvidence, MaterialOptions, measure_materials
-from beam_warp.materials_study import without_color
-from beam_warp.raster_records import RasterOptions
-from beam_warp.scene import Scene
-from beam_warp.surfaces import SurfacePoints
-from beam_warp.view_evidence import view_evidence
+from beam_warp.capture.views import CapturedView
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
+from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
+from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.raster.records import RasterOptions
+from beam_warp.study.materials import without_color
+from beam_warp.trace.scene import Scene
+from beam_warp.world.gaussians import GaussianCloud
 
 ROUGHNESS = 0.5
 """Of every Gaussian, in every row alike."""

@@ -14,18 +14,18 @@ from device_memory import peak_memory
 from materials_contenders import OURS, Decomposed, Method, Stages, Subject, SubjectFrame, by_images, direct
 from materials_truth import SHARP, Row
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
-from beam_warp.captured_views import CapturedView
-from beam_warp.captures import Capture
-from beam_warp.demo_capture import dome_cameras
-from beam_warp.denoising import chosen_denoiser
-from beam_warp.image_path import crop_to_subject
-from beam_warp.material_light import MaterialLight
-from beam_warp.rasterizer import Rasterizer
-from beam_warp.rasterizing import upload_gaussians
-from beam_warp.reconstruction_scores import read_truth_mesh
-from beam_warp.surface_gaussians import colored_by_views, gaussians_on_mesh
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.views import CapturedView
+from beam_warp.demo.capture import dome_cameras
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.images import crop_to_subject
+from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.reconstruction.scores import read_truth_mesh
+from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.trace.denoise import chosen_denoiser
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
 
 PAPER = {"gaussians": 140_000, "views": 81, "width": 3840, "height": 2160, "seconds": 240.0, "device": "RTX 3090"}
 

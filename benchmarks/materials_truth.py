@@ -11,12 +11,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.captured_views import CapturedView
-from beam_warp.captures import Capture, CaptureRecord
-from beam_warp.environment_sampling import SampledEnvironment
-from beam_warp.environments import EnvironmentMap
-from beam_warp.evaluation import (
+from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.views import CapturedView
+from beam_warp.evaluate.relighters import Relighter
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.files import read_image, write_png
+from beam_warp.image.metrics import (
     SOLID_ALPHA,
     Score,
     block_means,
@@ -24,18 +24,19 @@ from beam_warp.evaluation import (
     compare,
     mean_scores,
 )
-from beam_warp.images import linear_to_srgb, read_image, write_png
-from beam_warp.incident_light import irradiance
-from beam_warp.materials_study import without_color
-from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize_values
-from beam_warp.reconstruction_scores import read_truth_mesh
-from beam_warp.relighters import Relighter
-from beam_warp.scene import Scene
-from beam_warp.spherical_harmonics import SH_C0
-from beam_warp.surface_gaussians import colored_by_views, gaussians_on_mesh
-from beam_warp.surfaces import SurfacePoints
-from beam_warp.view_evidence import ViewEvidence, view_evidence
+from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.materials.evidence import ViewEvidence, view_evidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.raster.gbuffer import rasterize_values
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import read_truth_mesh
+from beam_warp.study.materials import without_color
+from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.trace.incident import irradiance
+from beam_warp.trace.scene import Scene
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
 
 Row = dict[str, Any]
 

@@ -24,18 +24,18 @@ import warp as wp
 from timing import Task, commit, machine, take_turns
 from warp.geometry import IsoSurfaceMarchingCubes
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
-from beam_warp.demo import FLATNESS, TANGENTIAL_DEVIATION, _frames, _quaternions, _sample_surface
-from beam_warp.demo_figure import build_figure
-from beam_warp.depth_consistency import depth_consistency
-from beam_warp.depth_fusion import fuse_depths
-from beam_warp.depth_images import DepthImages, DepthView
-from beam_warp.devices import resolve_device
-from beam_warp.kernels.depth_pixels import DepthCamera, project_point
-from beam_warp.mesh_topology import mesh_report
-from beam_warp.mesh_unwrapping import unwrapped
-from beam_warp.meshing import draw_depths, surrounding_cameras
+from beam_warp.demo.figure import build_figure
+from beam_warp.demo.job import FLATNESS, TANGENTIAL_DEVIATION, _frames, _quaternions, _sample_surface
+from beam_warp.device.arrays import resolve_device
+from beam_warp.kernels.mesh.depth_pixels import DepthCamera, project_point
+from beam_warp.mesh.consistency import depth_consistency
+from beam_warp.mesh.depths import DepthImages, DepthView
+from beam_warp.mesh.extract import draw_depths, surrounding_cameras
+from beam_warp.mesh.fusion import fuse_depths
+from beam_warp.mesh.topology import mesh_report
+from beam_warp.mesh.unwrap import unwrapped
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
 
 RADIUS = 0.5
 TRUNCATION = 4.0

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from beam_warp import Camera, EnvironmentMap, Scene, ambient_occlusion, change_axes, rasterize, read, visibility
-from beam_warp.deferred import EnvironmentLighting, relight
+from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.render.split_sum import relight
 
 DEVICES = ("cpu", "cuda:0")
 

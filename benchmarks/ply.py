@@ -18,8 +18,9 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from beam_warp import converters
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.converters.activations import dc_from_color
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 REST = [f"f_rest_{index}" for index in range(45)]
 

@@ -44,9 +44,9 @@ from raster_stages import measure_stages
 from raster_truth import Truth, brute_force
 from timing import commit, launch_threads, machine
 
-from beam_warp.devices import resolve_device
-from beam_warp.raster_records import RasterOptions
-from beam_warp.reporting import versions
+from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.report import versions
+from beam_warp.raster.records import RasterOptions
 
 Row = dict[str, Any]
 

@@ -2,8 +2,8 @@
 
     python benchmarks/raster_gradients.py [--device cuda:0] [--out results.json]
 
-For random scenes and every hazard of ``tests/raster_hazards.py``: relative L2 errors of the gradients to each array,
-of a loss with random derivatives to every image, against complex steps of the float64 rasteriser of
+For random scenes and every hazard of ``tests/support/raster_hazards.py``: relative L2 errors of the gradients to each
+array, of a loss with random derivatives to every image, against complex steps of the float64 rasteriser of
 ``tests/reference``; beside them what one rounding of the inputs to single precision changes, which no program that
 reads single precision can be better than. Prints Markdown and writes JSON.
 """
@@ -22,17 +22,17 @@ import numpy as np
 import warp as wp
 from timing import commit, machine
 
-from beam_warp.devices import resolve_device, upload
-from beam_warp.raster_records import GaussianArrays, RasterOptions
-from beam_warp.rasterizer import Rasterizer
-from beam_warp.reporting import versions
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.jobs.report import versions
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.records import GaussianArrays, RasterOptions
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from raster_hazards import HAZARDS, in_view, make
 from reference.raster_differences import gradients, random_upstream
 from reference.rasterizing import decide
 from reference.single_precision import rounded
+from support.raster_hazards import HAZARDS, in_view, make
 
 ARRAYS = {"positions": wp.vec3, "orientations": wp.quat, "scales": wp.vec3, "opacities": float, "values": float}
 MODES = ("plane", "exact")

@@ -27,14 +27,14 @@ from raster_contenders import Drawing, Seen
 from raster_scenes import RasterScene, figure
 
 from beam_warp import converters
-from beam_warp.assets import DISPLAY_SRGB
-from beam_warp.axes import change_axes
-from beam_warp.cameras import Camera
-from beam_warp.contact_sheet import Panel, lay_out, over_background
-from beam_warp.depth_normals import DepthNormals
-from beam_warp.devices import resolve_device
-from beam_warp.images import display_image
-from beam_warp.raster_records import DepthMode, RasterOptions
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.image.files import display_image
+from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.raster.depth_normals import DepthNormals
+from beam_warp.raster.records import DepthMode, RasterOptions
+from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
 
 LARGEST_FILE = 300_000
 COLUMNS = 3

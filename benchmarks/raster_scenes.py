@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tracing_scenes import FLATNESS, JITTER, Surface, spun_orientations
 
-from beam_warp.assets import LINEAR_REC709, GaussianCloud
-from beam_warp.cameras import Camera, focal_length
-from beam_warp.spherical_harmonics import sh_color
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.world.camera import Camera, focal_length
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import sh_color
 
 BUMP = 0.06
 """Height of the bumps over the radius."""

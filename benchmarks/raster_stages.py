@@ -27,7 +27,7 @@ from raster_contenders import (
     seconds_between,
 )
 
-from beam_warp import rasterizer
+from beam_warp.raster import rasterizer
 
 STAGES = {
     "launch_project": "project",

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
-from beam_warp.reference import rotation_matrices
+from beam_warp.trace.reference import rotation_matrices
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
 
 LOW_PASS = 0.3
 NEAR = 0.01

@@ -31,15 +31,15 @@ from reconstruction_captures import write_large_capture
 from reconstruction_contenders import Contender, ModelledFrame, follow, ours, rade_gs_like, reconstruct_stressed
 from timing import commit, machine
 
-from beam_warp.capture_stability import run_capture_cases
-from beam_warp.captures import Capture
-from beam_warp.demo_capture import write_demo_capture
-from beam_warp.devices import resolve_device
-from beam_warp.reconstruction_scores import FrameScores, read_truth_mesh, score_frame, truth_frames
-from beam_warp.reporting import versions
-from beam_warp.stress_captures import CAPTURE_CASES, StressStudio, evenly, training_cameras, with_cameras
-from beam_warp.surface_distances import SAMPLE_COUNT
-from beam_warp.tracking_drift import tracking_drift
+from beam_warp.capture.capture import Capture
+from beam_warp.demo.capture import write_demo_capture
+from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.report import versions
+from beam_warp.mesh.distances import SAMPLE_COUNT
+from beam_warp.reconstruction.drift import tracking_drift
+from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, truth_frames
+from beam_warp.stability.capture_cases import CAPTURE_CASES, StressStudio, evenly, training_cameras, with_cameras
+from beam_warp.stability.captures import run_capture_cases
 
 Row = dict[str, Any]
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.captures import Capture
-from beam_warp.demo_capture import DomeCamera, dome_cameras, write_capture
-from beam_warp.environments import EnvironmentMap
-from beam_warp.material_mesh import MaterialMesh, vertex_normals
-from beam_warp.reconstruction_scores import read_truth_mesh
+from beam_warp.capture.capture import Capture
+from beam_warp.demo.capture import DomeCamera, dome_cameras, write_capture
+from beam_warp.reconstruction.scores import read_truth_mesh
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.mesh import MaterialMesh, vertex_normals
 
 FloatArray = NDArray[np.float64]
 

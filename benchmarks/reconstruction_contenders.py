@@ -14,19 +14,19 @@ from typing import Any, Protocol
 import trimesh
 import warp as wp
 
-from beam_warp.assets import GaussianCloud, GaussianSequence
-from beam_warp.cameras import Camera
-from beam_warp.capture_findings import Finding
-from beam_warp.capture_stability import Reconstructed
-from beam_warp.captured_views import CapturedView
-from beam_warp.captures import Capture
-from beam_warp.devices import resolve_device
-from beam_warp.raster_records import RasterOptions
-from beam_warp.stress_captures import TRACKING_LOST, Detection, detections_of, training_cameras
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.findings import Finding
+from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import resolve_device
+from beam_warp.raster.records import RasterOptions
+from beam_warp.stability.capture_cases import TRACKING_LOST, Detection, detections_of, training_cameras
+from beam_warp.stability.captures import Reconstructed
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 class StepsLike(Protocol):
-    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.FrameSteps`."""
+    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.job.FrameSteps`."""
 
     def begin(self, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
         """Fit a key frame."""
@@ -68,9 +68,9 @@ def rade_gs_like(gaussian_count: int, device: str | None, iterations: int | None
 
 
 def _of_preset(name: str, preset: str, count: int, device: str | None, changes: dict[str, Any]) -> Contender:
-    from beam_warp.gaussian_fitting import FitOptions
-    from beam_warp.meshing import mesh_of_gaussians
-    from beam_warp.reconstruction_steps import FitAndTrack
+    from beam_warp.mesh.extract import mesh_of_gaussians
+    from beam_warp.reconstruction.fit import FitOptions
+    from beam_warp.reconstruction.steps import FitAndTrack
 
     options = FitOptions.of_preset(preset, gaussian_count=count, **changes)
     return Contender(
@@ -125,10 +125,10 @@ def follow(
 
 
 def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[Capture], Reconstructed]:
-    """Return what `beam_warp.capture_stability` tries: inspect, leave out what cannot be used, fit and track."""
+    """Return what `beam_warp.stability.captures` tries: inspect, leave out what cannot be used, fit and track."""
 
     def reconstruct(capture: Capture) -> Reconstructed:
-        from beam_warp.capture_inspection import require_reconstructable
+        from beam_warp.capture.inspect import require_reconstructable
 
         ready = require_reconstructable(capture)
         detections = list(

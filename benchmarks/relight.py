@@ -32,12 +32,12 @@ from relight_energy import measure_furnace, measure_unbiased
 from relight_scenes import FULL, ON_CPU, QUICK, Bench, Row
 from timing import commit, machine
 
-from beam_warp.captures import Capture
-from beam_warp.demo_capture import write_demo_capture
-from beam_warp.demo_environments import sunset
-from beam_warp.devices import resolve_device
-from beam_warp.environments import EnvironmentMap
-from beam_warp.reporting import versions
+from beam_warp.capture.capture import Capture
+from beam_warp.demo.capture import write_demo_capture
+from beam_warp.demo.lights import sunset
+from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.report import versions
+from beam_warp.world.environment import EnvironmentMap
 
 SKY = "sunrise"
 """The HDRI that figures stand under: its sun is small and bright."""

@@ -20,26 +20,26 @@ from relight_scenes import Bench, Row, seconds_of
 from scipy.spatial import cKDTree
 
 from beam_warp import converters
-from beam_warp.assets import GaussianCloud
-from beam_warp.axes import change_axes
-from beam_warp.cameras import Camera
-from beam_warp.capture_matching import match_frames
-from beam_warp.captures import Capture
-from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
-from beam_warp.demo_environments import demo_environments
-from beam_warp.demo_figure import build_figure
-from beam_warp.environments import EnvironmentMap
-from beam_warp.evaluation import bounding_box, compare
-from beam_warp.lighting import ambient_occlusion
-from beam_warp.material_mesh import MaterialMesh
-from beam_warp.mesh_path_tracing import TracedMesh, trace_radiance
-from beam_warp.path_rendering import PathOptions, PathProgress, PathRenderer
-from beam_warp.raster_records import RasterOptions
-from beam_warp.reconstruction_scores import truth_frames
-from beam_warp.relighters import TracedRelighter
-from beam_warp.scene import Scene
-from beam_warp.shots import Shot
-from beam_warp.surface_gaussians import gaussians_on_mesh
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.matching import match_frames
+from beam_warp.demo.figure import build_figure
+from beam_warp.demo.lights import demo_environments
+from beam_warp.evaluate.relighters import TracedRelighter
+from beam_warp.image.metrics import bounding_box, compare
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
+from beam_warp.render.path import PathOptions, PathProgress, PathRenderer
+from beam_warp.study.true_surface import gaussians_on_mesh
+from beam_warp.trace.mesh_paths import TracedMesh, trace_radiance
+from beam_warp.trace.occlusion import ambient_occlusion
+from beam_warp.trace.scene import Scene
+from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.mesh import MaterialMesh
+from beam_warp.world.shot import Shot
 
 TARGET_PSNR = 36.0
 """Of path traced images of perfect geometry against the truth [dB]."""

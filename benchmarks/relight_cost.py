@@ -11,13 +11,13 @@ import warp as wp
 from device_memory import peak_memory
 from relight_scenes import LAMPS, SUN_AND_LAMP, Bench, MovingFigure, Row, frame_times, ground, posed, seconds_of
 
-from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
-from beam_warp.lights import Light
-from beam_warp.path_rendering import PathOptions, PathRenderer
-from beam_warp.rasterizer import Rasterizer
-from beam_warp.scene import Scene
-from beam_warp.shots import Shot
-from beam_warp.step_graphs import StepGraphs
+from beam_warp.device.graphs import StepGraphs
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
+from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.trace.scene import Scene
+from beam_warp.world.lights import Light
+from beam_warp.world.shot import Shot
 
 TARGETS = {
     "environment_fps": 600.0,

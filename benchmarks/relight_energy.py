@@ -13,13 +13,13 @@ import trimesh
 from numpy.typing import NDArray
 from relight_scenes import LAMPS, Bench, Row, ground
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
-from beam_warp.deferred_rendering import DeferredOptions, DeferredRenderer
-from beam_warp.environments import EnvironmentMap
-from beam_warp.path_rendering import PathOptions, PathRenderer
-from beam_warp.shots import ImageRenderer, Shot
-from beam_warp.surface_gaussians import gaussians_on_mesh
+from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
+from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.study.true_surface import gaussians_on_mesh
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.shot import ImageRenderer, Shot
 
 ROUGHNESS = (0.03, 0.1, 0.3, 0.6, 1.0)
 TARGET_ERROR = 0.01

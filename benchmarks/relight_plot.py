@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.images import linear_to_srgb
+from beam_warp.image.color import linear_to_srgb
 
 HERE = Path(__file__).parent
 

@@ -13,16 +13,16 @@ import raster_scenes
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.captures import Capture
-from beam_warp.deferred_rendering import DeferredOptions
-from beam_warp.devices import upload
-from beam_warp.environments import EnvironmentMap
-from beam_warp.lights import DirectionalLight, Light, PointLight
-from beam_warp.material_mesh import MaterialMesh
-from beam_warp.quaternions import product
-from beam_warp.raster_records import GaussianArrays
-from beam_warp.shots import Shot, ShotMesh
+from beam_warp.capture.capture import Capture
+from beam_warp.device.arrays import upload
+from beam_warp.raster.records import GaussianArrays
+from beam_warp.render.deferred import DeferredOptions
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.lights import DirectionalLight, Light, PointLight
+from beam_warp.world.mesh import MaterialMesh
+from beam_warp.world.quaternions import product
+from beam_warp.world.shot import Shot, ShotMesh
 
 Row = dict[str, Any]
 

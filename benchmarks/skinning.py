@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from beam_warp.devices import device_label, resolve_device
-from beam_warp.joint_graph import JointGraph, joint_spacing, nearest_joints, proximity_weights, stretch
-from beam_warp.joint_selection import select_joints
-from beam_warp.skinning import Anchors, Skin
+from beam_warp.device.arrays import device_label, resolve_device
+from beam_warp.reconstruction.joint_selection import select_joints
+from beam_warp.reconstruction.joints import JointGraph, joint_spacing, nearest_joints, proximity_weights, stretch
+from beam_warp.reconstruction.skinning import Anchors, Skin
 
 AROUND = 40
 """Points that a joint's true rotation is fitted to."""

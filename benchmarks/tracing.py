@@ -38,9 +38,9 @@ from tracing_scenes import Rays, brute_force_visibility, bumpy_torus, camera_ray
 
 import beam_warp
 from beam_warp import GaussianCloud, Scene, visibility
-from beam_warp.devices import resolve_device
-from beam_warp.reporting import versions
-from beam_warp.tracing import ACCEPTANCES, TraceOptions
+from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.report import versions
+from beam_warp.trace.transmittance import ACCEPTANCES, TraceOptions
 
 SCENE_BUILDS: dict[str, dict[str, Any]] = {
     "wide": {"backend": "wide"},

@@ -18,10 +18,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
-from beam_warp.kernels.launching import launch
-from beam_warp.reference import rotation_matrices
+from beam_warp.kernels.common.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+from beam_warp.kernels.common.launching import launch
+from beam_warp.trace.reference import rotation_matrices
+from beam_warp.world.gaussians import GaussianCloud
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,7 +58,7 @@ def pack_gaussians(cloud: GaussianCloud) -> PackedGaussians:
     rows[:, 1:, :3] = rotations.transpose(0, 2, 1) / scales[:, :, None]
     rows[:, 1, 3] = radius_squared
     halves = np.sqrt(radius_squared)[:, None] * np.linalg.norm(rotations * scales[:, None, :], axis=2)
-    halves = halves * 1.00001 + 2.4e-7 * np.abs(centers)  # as in kernels/bounds.py
+    halves = halves * 1.00001 + 2.4e-7 * np.abs(centers)  # as in kernels/trace/bounds.py
     return PackedGaussians(rows, np.concatenate([centers - halves, centers + halves], axis=1).astype(np.float32))
 
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import Camera
-from beam_warp.kernels.constants import ALPHA_MAX, ALPHA_MIN
-from beam_warp.reference import rotation_matrices
+from beam_warp.kernels.common.constants import ALPHA_MAX, ALPHA_MIN
+from beam_warp.trace.reference import rotation_matrices
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
 
 RING_RADIUS = 0.4
 TUBE_RADIUS = 0.13
@@ -157,7 +157,7 @@ def camera_rays(cloud: GaussianCloud, width: int, height: int) -> Rays:
 
 
 def brute_force_visibility(cloud: GaussianCloud, rays: Rays) -> NDArray[np.float64]:
-    """Return what `beam_warp.reference.visibility_reference` does, fast enough for 500 rays and 4 M Gaussians.
+    """Return what `beam_warp.trace.reference.visibility_reference` does, fast enough for 500 rays and 4 M Gaussians.
 
     Only Gaussians whose centre lies within their largest support radius of the ray's line are evaluated; the others
     have alpha < 1/255 and do not count.

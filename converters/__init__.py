@@ -11,13 +11,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beam_warp.assets import GaussianSequence
 from beam_warp.converters.numbering import numbered_files, require_no_stale_frames
 from beam_warp.converters.numbering import numbered_path as numbered_path
 from beam_warp.converters.options import Activation, MaterialActivation, ReadOptions
 from beam_warp.converters.options import WriteOptions as WriteOptions
 from beam_warp.converters.staging import require_writable
 from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.world.gaussians import GaussianSequence
 
 if TYPE_CHECKING:
     from beam_warp.converters.inspection import Inspection
@@ -66,7 +66,7 @@ def read(
 
     Args:
         path: File, or folder of numbered files; frames of a folder are read when they are asked for.
-        source_axes: Axes of a PLY (see `beam_warp.axes`); None takes the file's word, else ``rdf``.
+        source_axes: Axes of a PLY (see `beam_warp.world.axes`); None takes the file's word, else ``rdf``.
         meters_per_unit: Length of a PLY's unit [m]; None takes the file's word, else 1.
         material_activation: Whose material channels a PLY holds; None reads only those that state their form.
         activation: ``linear`` for a PLY with linear scales and opacities, ``log`` to accept one that looks so.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.world.harmonics import SH_C0
 
 LOG_SCALE_LIMITS = (-30.0, 20.0)
 """Natural logs of a believable standard deviation: below is nothing, above is a wrong activation."""

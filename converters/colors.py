@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
 from beam_warp.converters.activations import color_from_dc, dc_from_color
-from beam_warp.images import linear_to_srgb
+from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb
+from beam_warp.world.gaussians import GaussianCloud
 
 CAPTURED = "captured"
 BASE_COLOR_ONLY = "baseColorOnly"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import DISPLAY_SRGB
 from beam_warp.converters.activations import dc_from_color, exp_scale
 from beam_warp.converters.ply_checks import require_log_scales, require_types
 from beam_warp.converters.ply_container import Element, PlyHeader, malformed, read_table
+from beam_warp.image.color import DISPLAY_SRGB
 
 CHUNK_ROWS = 256
 

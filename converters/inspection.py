@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.assets import GaussianCloud, GaussianSequence
-from beam_warp.axes import handedness
 from beam_warp.converters.compressed_ply import is_compressed
 from beam_warp.converters.numbering import numbered_files
 from beam_warp.converters.ply_container import PlyHeader, read_header
+from beam_warp.world.axes import handedness
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 _MATERIALS = ("base_color", "roughness", "ambient_occlusion", "normals")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from beam_warp.axes import TARGETS, require_axes
 from beam_warp.checks import require_choice, require_count, require_number
+from beam_warp.world.axes import TARGETS, require_axes
 
 Activation = Literal["log", "linear"]
 MaterialActivation = Literal["linear", "r3dg", "gsir", "irgs"]
@@ -19,7 +19,7 @@ class ReadOptions:
     """What a file does not say about itself. A value given here wins over what the file says.
 
     Attributes:
-        source_axes: Axis code of the file (see `beam_warp.axes`).
+        source_axes: Axis code of the file (see `beam_warp.world.axes`).
         meters_per_unit: Length of one unit of the file [m].
         activation: ``log`` if scales are natural logs and opacities logits, as 3DGS training leaves them; ``linear``
             if both are linear. None means ``log``, with files that look linear refused.

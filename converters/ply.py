@@ -14,9 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.asset_metadata import LOW_PASS_RANGE, raster_metadata
-from beam_warp.assets import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, GaussianCloud, GaussianSequence, sh_degree_of
-from beam_warp.axes import AXIS_CODES
 from beam_warp.checks import require_choice, require_number
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
@@ -33,6 +30,10 @@ from beam_warp.converters.producers import (
     material_properties,
 )
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, SchemaVersionError
+from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.world.axes import AXIS_CODES
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, sh_degree_of
+from beam_warp.world.metadata import LOW_PASS_RANGE, raster_metadata
 
 DEFAULT_AXES = "rdf"
 """Axes of a PLY that does not say: those of COLMAP, in which 3DGS is trained."""

@@ -14,9 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp._version import __version__
-from beam_warp.asset_metadata import stated_raster
-from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709, GaussianCloud, GaussianSequence
-from beam_warp.axes import TARGETS, change_axes
 from beam_warp.converters.activations import log_scale, logit
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, display_radiance, resize_bands
 from beam_warp.converters.numbering import numbered_path
@@ -24,7 +21,11 @@ from beam_warp.converters.options import WriteOptions
 from beam_warp.converters.ply_container import RASTER_WORDS
 from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.schema import SCHEMA_VERSION
+from beam_warp.world.axes import TARGETS, change_axes
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.metadata import stated_raster
 
 MAX_FILE_BYTES = 2**31 - 1
 """Importers index with signed 32-bit integers."""
@@ -45,7 +46,7 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
 
     Raises:
         InvalidOptionError: The beam profile is asked for and there are no materials, or the metadata state how the
-            Gaussians are to be drawn in other words than those of `beam_warp.asset_metadata`.
+            Gaussians are to be drawn in other words than those of `beam_warp.world.metadata`.
         OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
     """
     paths = output_paths(sequence, path)

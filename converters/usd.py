@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from beam_warp.assets import GaussianCloud, GaussianSequence
-from beam_warp.axes import TARGETS, change_axes
 from beam_warp.converters.colors import resize_bands
 from beam_warp.converters.options import ReadOptions, WriteOptions
 from beam_warp.errors import InvalidOptionError
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
+from beam_warp.world.axes import TARGETS, change_axes
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 def read(path: Path, options: ReadOptions) -> GaussianSequence:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Vt
 
 from beam_warp._version import __version__
-from beam_warp.asset_metadata import stated_capture_frames, stated_raster
-from beam_warp.assets import LINEAR_REC709, GaussianCloud, GaussianSequence
+from beam_warp.image.color import LINEAR_REC709
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
 from beam_warp.schema.layout import (
     ASSET_PATH,
@@ -28,6 +27,8 @@ from beam_warp.schema.layout import (
     to_vt,
 )
 from beam_warp.schema.survey import UP_AXES, Survey, display_color, stored_arrays
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.metadata import stated_capture_frames, stated_raster
 
 KERNEL_EXTENT = 3.0
 """OpenUSD's Gaussian kernel ends at three standard deviations."""

@@ -15,9 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom
 
-from beam_warp.assets import WORLD_AXES
-from beam_warp.axes import axes_matrix
-from beam_warp.cameras import Camera
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidOptionError
 from beam_warp.schema import register
@@ -25,6 +22,9 @@ from beam_warp.schema.dependencies import layer_files
 from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.placement import placement_of
 from beam_warp.schema.stage_queries import stage_axes, stage_meters
+from beam_warp.world.axes import axes_matrix
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import WORLD_AXES
 
 MAX_SAMPLES = 1_000_000
 """Most times at which a camera is looked at before it is used."""

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import Observability
 from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.schema.rules import Fault, Rule, entering
+from beam_warp.world.gaussians import Observability
 
 KNOWN_FLAGS = sum(Observability)
 

@@ -38,7 +38,7 @@ class Channel:
     """One array of a cloud and its place in a file.
 
     Attributes:
-        name: Field of `beam_warp.assets.GaussianCloud`, or ``metallic``, which a cloud does not hold.
+        name: Field of `beam_warp.world.gaussians.GaussianCloud`, or ``metallic``, which a cloud does not hold.
         usd_name: Attribute of the float variant; the half variant has the suffix ``h``.
         type_name: USD type of the float variant, or of the only one.
         half_type_name: USD type of the half variant; None if there is none.

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import sh_degree_of
 from beam_warp.errors import AssetFormatError
-from beam_warp.quaternions import product, quaternion_of
-from beam_warp.spherical_harmonics import sh_transform
+from beam_warp.world.gaussians import sh_degree_of
+from beam_warp.world.harmonics import sh_transform
+from beam_warp.world.quaternions import product, quaternion_of
 
 SIMILARITY_TOLERANCE = 1e-5
 """Largest deviation of L L^T / s^2 from the identity: matrices are often stored after a float32 step (1e-7 each)."""

@@ -12,14 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom
 
-from beam_warp.asset_metadata import (
-    UNSTATED_RASTER,
-    capture_frames_metadata,
-    raster_metadata,
-)
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence, Topology
 from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
+from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, register
 from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, Channel, from_vt
@@ -35,6 +30,12 @@ from beam_warp.schema.stage_queries import (
     splat_prims,
     stage_axes,
     stage_meters,
+)
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, Topology
+from beam_warp.world.metadata import (
+    UNSTATED_RASTER,
+    capture_frames_metadata,
+    raster_metadata,
 )
 
 _MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"})

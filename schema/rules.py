@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from beam_warp.assets import COLOR_SPACES, LINEAR_REC709, MAX_SH_DEGREE
 from beam_warp.errors import AssetFormatError
+from beam_warp.image.color import COLOR_SPACES, LINEAR_REC709
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE
 from beam_warp.schema.placement import placement_of
@@ -29,6 +29,7 @@ from beam_warp.schema.stage_queries import (
     sequence_prim,
     splat_prims,
 )
+from beam_warp.world.gaussians import MAX_SH_DEGREE
 
 
 class Fault(NamedTuple):

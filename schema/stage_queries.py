@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from beam_warp.assets import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.errors import AssetFormatError
+from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API
 from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, Channel
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.images import linear_to_srgb, srgb_to_linear
+from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
 from beam_warp.schema.layout import CHANNELS
-from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 
 UP_AXES = {"rub": "Y", "rfu": "Z"}
 """Axes that a stage can hold: right-handed, x right, and the up axis that says the rest."""

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from pxr import Sdf
 
-from beam_warp.assets import GaussianSequence
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.schema import register
@@ -27,6 +26,7 @@ from beam_warp.schema.authoring import (
 from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
 from beam_warp.schema.staging import publish, staged_folder
 from beam_warp.schema.survey import survey_sequence
+from beam_warp.world.gaussians import GaussianSequence
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
@@ -54,7 +54,7 @@ def write_asset(
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
             ``normal_source``, ``roughness_source``, ``radiance_meaning``, ``source_axes`` and ``source_units``, and
-            those of `beam_warp.asset_metadata`, set the attributes of these names; all keys but ``notes`` are kept in
+            those of `beam_warp.world.metadata`, set the attributes of these names; all keys but ``notes`` are kept in
             ``customData`` of ``/Asset``.
         path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
             ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
@@ -66,7 +66,7 @@ def write_asset(
 
     Raises:
         InvalidOptionError: Axes, file name or options break their contract, or the metadata that of
-            `beam_warp.asset_metadata`.
+            `beam_warp.world.metadata`.
         InvalidArrayError: The frames do not hold the same arrays.
         OutputError: The files cannot be written, or a package would reach 4 GiB. Nothing is left behind.
     """

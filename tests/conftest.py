@@ -11,7 +11,7 @@ os.environ.setdefault("PYTHONSAFEPATH", "1")
 
 
 def _devices() -> list[str]:
-    from beam_warp.devices import resolve_device
+    from beam_warp.device.arrays import resolve_device
 
     return ["cpu", *(["cuda:0"] if resolve_device().is_cuda else [])]
 
@@ -39,7 +39,7 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def tiny_capture(tmp_path_factory):
     """A capture of the demo figure with truth: 6 training cameras and 1 test camera, 2 frames of 64 x 64. Read only."""
-    from beam_warp.demo_capture import write_demo_capture
+    from beam_warp.demo.capture import write_demo_capture
 
     folder = tmp_path_factory.mktemp("captures") / "tiny"
     return write_demo_capture(folder, frame_count=2, camera_count=6, test_camera_count=1, size=64, device="cpu")
@@ -48,8 +48,8 @@ def tiny_capture(tmp_path_factory):
 @pytest.fixture(scope="session")
 def relit_capture(tmp_path_factory):
     """The same with truth under two more lights: 2 frames of 48 x 48 from 1 training and 2 test cameras. Read only."""
-    from beam_warp.demo_capture import write_demo_capture
-    from beam_warp.demo_environments import stage, sunset
+    from beam_warp.demo.capture import write_demo_capture
+    from beam_warp.demo.lights import stage, sunset
 
     return write_demo_capture(
         tmp_path_factory.mktemp("captures") / "relit",

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from beam_warp import converters, stage_files
-from beam_warp.assets import GaussianCloud, GaussianSequence
-from beam_warp.images import write_exr
-from beam_warp.lights import LIGHT_TYPES
+from beam_warp import converters
+from beam_warp.image.files import write_exr
+from beam_warp.stage import files
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.lights import LIGHT_TYPES
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -96,12 +97,12 @@ def test_the_stages_page_lists_every_field():
         listed[section.splitlines()[0]] = {
             name for pair in cells for cell in pair for name in re.findall(r"`([^`]+)`", cell)
         }
-    assert listed["The format"] == {stage_files.KEY, *stage_files.FIELDS}
-    assert listed["Assets"] - {"identified"} == set(stage_files.ASSET_FIELDS)
-    assert listed["Meshes"] - {'"auto"'} == {"ground", *stage_files.MESH_FIELDS, *stage_files.GROUND_FIELDS}
-    assert listed["Environment"] == set(stage_files.ENVIRONMENT_FIELDS)
+    assert listed["The format"] == {files.KEY, *files.FIELDS}
+    assert listed["Assets"] - {"identified"} == set(files.ASSET_FIELDS)
+    assert listed["Meshes"] - {'"auto"'} == {"ground", *files.MESH_FIELDS, *files.GROUND_FIELDS}
+    assert listed["Environment"] == set(files.ENVIRONMENT_FIELDS)
     kinds = {"fixed", "orbit", "keyframes", "file"}
-    cameras = {*stage_files.FIXED_FIELDS, *stage_files.ORBIT_FIELDS, *stage_files.FILE_FIELDS, "interpolation"}
+    cameras = {*files.FIXED_FIELDS, *files.ORBIT_FIELDS, *files.FILE_FIELDS, "interpolation"}
     assert listed["Camera"] == {*kinds, *cameras}
     for name, kind in LIGHT_TYPES.items():
         row = next(line for line in sections[-4].splitlines() if line.startswith(f"| `{name}`"))

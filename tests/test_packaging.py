@@ -52,8 +52,8 @@ def test_schema_files_and_type_marker_are_in_the_wheel(wheel_names):
         "schema/schema.usda",
         "schema/SPEC.md",
         "py.typed",
-        "chart_page.js",
-        "capture_page.js",
+        "study/page.js",
+        "capture/page.js",
     ):
         assert f"beam_warp/{name}" in wheel_names
 

@@ -12,16 +12,16 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
-from beam_warp.asset_metadata import numbers_of_frames
-from beam_warp.axes import change_axes
-from beam_warp.chart_image import require_package, write_image
-from beam_warp.chart_page import write_page
-from beam_warp.charts import Settings, Study, Table, read_table, run_study, table_paths
-from beam_warp.checks import require_number
+from beam_warp.checks import require_number, require_package
 from beam_warp.cli.console import ProgressCallback, print_json, progress
-from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.tiled_shapes import still_life
+from beam_warp.study.page import write_page
+from beam_warp.study.picture import write_image
+from beam_warp.study.table import Settings, Study, Table, read_table, run_study, table_paths
+from beam_warp.world.axes import change_axes
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.metadata import numbers_of_frames
+from beam_warp.world.shapes import still_life
 
 REFERENCE_PART = 0.35
 """References may take this part of the budget; where they would take longer, fewer points are measured."""
@@ -221,9 +221,9 @@ def chart(command: Chart) -> int:
 def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
-    from beam_warp.devices import resolve_device
-    from beam_warp.tracing_plan import TracingPlan
-    from beam_warp.tracing_study import tracing_study
+    from beam_warp.device.arrays import resolve_device
+    from beam_warp.study.tracing import tracing_study
+    from beam_warp.study.tracing_plan import TracingPlan
 
     plan = TracingPlan(
         backends=args.backends,
@@ -240,7 +240,7 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
         seed=args.seed,
     )
     if args.environment is None:
-        from beam_warp.demo_environments import sunset
+        from beam_warp.demo.lights import sunset
 
         environment, environment_name = sunset(), "the built-in low sun"
     else:
@@ -285,9 +285,9 @@ def _run(study: Study, out: Path, seconds: float, report: ProgressCallback) -> t
 def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
     """Read or make the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
-    from beam_warp.devices import resolve_device
-    from beam_warp.materials_plan import MaterialsPlan
-    from beam_warp.materials_study import materials_study
+    from beam_warp.device.arrays import resolve_device
+    from beam_warp.study.materials import materials_study
+    from beam_warp.study.materials_plan import MaterialsPlan
 
     plan = MaterialsPlan(
         paths=args.paths,
@@ -314,10 +314,10 @@ def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[
 
 def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallback) -> Any:
     """Return what is decomposed; a built-in capture is written to the folder."""
-    from beam_warp.captures import Capture
-    from beam_warp.demo_capture import write_demo_capture
-    from beam_warp.frame_inputs import CaptureImages
-    from beam_warp.materials_study import MaterialsSubject
+    from beam_warp.capture.capture import Capture
+    from beam_warp.demo.capture import write_demo_capture
+    from beam_warp.materials.frame import CaptureImages
+    from beam_warp.study.materials import MaterialsSubject
 
     if args.capture is None:
         if args.asset is not None:

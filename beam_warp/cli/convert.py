@@ -14,10 +14,10 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.assets import GaussianCloud
 from beam_warp.cli.console import print_json, progress, run_command
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
 from beam_warp.errors import InvalidOptionError
+from beam_warp.world.gaussians import GaussianCloud
 
 _CONVERT_HELP = """Convert Gaussians between PLY and USD, axes, units and profiles.
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import print_json, progress
-from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError
+from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
-    from beam_warp.pipeline import OverviewOptions, RunOptions, RunResult
+    from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def decompose(args: Decompose) -> int:
     environment = EnvironmentMap.read(light_of(args.measuring, capture, args.sequence)).rotated(args.measuring.rotate)
     sequence = converters.read(args.sequence)
 
-    from beam_warp.pipeline import run as run_pipeline
+    from beam_warp.materials.job import run as run_pipeline
 
     with progress(args.quiet or args.json) as report:
         result = run_pipeline(
@@ -151,10 +151,10 @@ def run_options(
     Raises:
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
-    from beam_warp.frame_inputs import RoughnessTexture
-    from beam_warp.image_path import ImagePathOptions
-    from beam_warp.materials import MaterialOptions
-    from beam_warp.pipeline import RunOptions
+    from beam_warp.materials.direct import MaterialOptions
+    from beam_warp.materials.frame import RoughnessTexture
+    from beam_warp.materials.images import ImagePathOptions
+    from beam_warp.materials.job import RunOptions
 
     stated = measuring.roughness
     if isinstance(stated, Path) != (measuring.roughness_mesh is not None):
@@ -181,8 +181,8 @@ def run_options(
 
 def overview_options(measuring: Measuring) -> OverviewOptions:
     """Return what the contact sheet shows."""
-    from beam_warp.contact_sheet import Relighting
-    from beam_warp.pipeline import OverviewOptions
+    from beam_warp.materials.job import OverviewOptions
+    from beam_warp.render.sheet import Relighting
 
     light = measuring.relight
     return OverviewOptions(

@@ -43,7 +43,7 @@ class Demo:
 
 def demo(args: Demo) -> int:
     """Run the demo and print its scores."""
-    from beam_warp.demo import DemoOptions, run_demo
+    from beam_warp.demo.job import DemoOptions, run_demo
 
     options = DemoOptions(
         frame_count=args.frames,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 if TYPE_CHECKING:
-    from beam_warp.raster_records import RasterOptions
+    from beam_warp.raster.records import RasterOptions
 
 Antialiased = Annotated[
     Literal["yes", "no"] | None,
@@ -28,7 +28,7 @@ def raster_options(metadata: Mapping[str, str], antialiased: str | None, low_pas
     Raises:
         InvalidOptionError: The low-pass is out of range, or the metadata say something else than a filter.
     """
-    from beam_warp.raster_records import RasterOptions
+    from beam_warp.raster.records import RasterOptions
 
     given: dict[str, Any] = {} if antialiased is None else {"antialiased": antialiased == "yes"}
     if low_pass is not None:

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import converters
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.console import print_json, progress
 
 if TYPE_CHECKING:
-    from beam_warp.asset_evaluation import Evaluation
-    from beam_warp.assets import GaussianSequence
-    from beam_warp.material_scores import ImageScore, MaterialScores
-    from beam_warp.raster_records import RasterOptions
-    from beam_warp.temporal_scores import Deviation
+    from beam_warp.evaluate.asset import Evaluation
+    from beam_warp.evaluate.materials import ImageScore, MaterialScores
+    from beam_warp.evaluate.steadiness import Deviation
+    from beam_warp.raster.records import RasterOptions
+    from beam_warp.world.gaussians import GaussianSequence
 
 ASSET_NAME = "asset.usda"
 """What `beam run` calls its result."""
@@ -86,7 +86,7 @@ def evaluate(args: Evaluate) -> int:
         inner if inner.is_file() else args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid
     )
 
-    from beam_warp.asset_evaluation import EvaluateOptions, evaluate_asset
+    from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
 
     options = EvaluateOptions(
         frames=args.capture_frames or None,
@@ -113,7 +113,7 @@ def _raster(args: Evaluate, sequence: GaussianSequence) -> RasterOptions:
     """Return how splats are drawn: as the asset states, unless it is overruled."""
     from dataclasses import replace
 
-    from beam_warp.material_scores import stated_raster
+    from beam_warp.evaluate.materials import stated_raster
 
     options = stated_raster(sequence.metadata)
     if args.low_pass is not None:

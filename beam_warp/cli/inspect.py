@@ -8,11 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from beam_warp.capture_drawing import headline, verdict, write_picture
-from beam_warp.capture_inspection import MAX_IMAGES, inspect_capture
-from beam_warp.capture_page import write_page
-from beam_warp.captures import Capture
-from beam_warp.chart_image import require_package
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.inspect import MAX_IMAGES, inspect_capture
+from beam_warp.capture.page import write_page
+from beam_warp.capture.picture import headline, verdict, write_picture
+from beam_warp.checks import require_package
 from beam_warp.cli.console import print_json, progress
 from beam_warp.errors import OutputError
 

@@ -16,22 +16,22 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp._version import __version__
-from beam_warp.asset_metadata import numbers_of_frames
-from beam_warp.assets import WORLD_AXES, GaussianCloud
-from beam_warp.axes import change_axes
-from beam_warp.cameras import Camera
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
 from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.images import write_png
+from beam_warp.image.files import write_png
+from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
+from beam_warp.world.metadata import numbers_of_frames
 
 if TYPE_CHECKING:
     import trimesh
 
-    from beam_warp.depth_images import DepthImages
-    from beam_warp.raster_records import RasterOptions
+    from beam_warp.mesh.depths import DepthImages
+    from beam_warp.raster.records import RasterOptions
 
 UNWRAP_FACES = 50_000
 """Triangles of the mesh that is unwrapped, about; cutting charts takes half a minute for so many."""
@@ -91,7 +91,7 @@ def mesh(args: Mesh) -> int:
     """Mesh the frames that are not there yet, and say what was found."""
     started = time.perf_counter()
     if args.unwrap:
-        from beam_warp.mesh_unwrapping import require_unwrapping
+        from beam_warp.mesh.unwrap import require_unwrapping
 
         require_unwrapping()
     capture = None if args.capture is None else Capture.read(args.capture)
@@ -154,7 +154,7 @@ def _mesh_frame(
     canonical: bool,
 ) -> dict[str, Any]:
     """Write the files of a frame unless they are there, and return its report."""
-    from beam_warp.meshing import surrounding_cameras
+    from beam_warp.mesh.extract import surrounding_cameras
 
     seen_from = surrounding_cameras(cloud, side=args.size) if cameras is None else cameras
     path = converters.numbered_path(args.out / f"mesh.{args.format}", frame)
@@ -177,12 +177,12 @@ def _write_meshes(
     args: Mesh, options: RasterOptions, cloud: GaussianCloud, cameras: Sequence[Camera], path: Path, canonical: bool
 ) -> dict[str, Any]:
     """Fuse a frame, write what was asked for, and return what was found."""
-    from beam_warp.depth_consistency import depth_consistency
-    from beam_warp.depth_fusion import fuse_depths
-    from beam_warp.mesh_files import write_mesh
-    from beam_warp.mesh_preview import shaded_image
-    from beam_warp.mesh_topology import mesh_report
-    from beam_warp.meshing import draw_depths
+    from beam_warp.mesh.consistency import depth_consistency
+    from beam_warp.mesh.extract import draw_depths
+    from beam_warp.mesh.files import write_mesh
+    from beam_warp.mesh.fusion import fuse_depths
+    from beam_warp.mesh.preview import shaded_image
+    from beam_warp.mesh.topology import mesh_report
 
     color = args.color
     if color is None:
@@ -205,9 +205,9 @@ def _write_meshes(
 
 def _write_canonical(args: Mesh, images: DepthImages, surface: trimesh.Trimesh) -> dict[str, Any]:
     """Unwrap a frame, fused again with a larger voxel if it has too many triangles: that stays manifold."""
-    from beam_warp.depth_fusion import fuse_depths
-    from beam_warp.mesh_files import write_mesh
-    from beam_warp.mesh_unwrapping import unwrapped
+    from beam_warp.mesh.files import write_mesh
+    from beam_warp.mesh.fusion import fuse_depths
+    from beam_warp.mesh.unwrap import unwrapped
 
     while len(surface.faces) > UNWRAP_FACES:
         # Triangles are as many as squares of a voxel fit on the surface, and a few less where details vanish.
@@ -244,7 +244,7 @@ def _read_report(path: Path) -> dict[str, Any]:
 
 def _write_text(path: Path, text: str) -> None:
     """Write a text in one step."""
-    from beam_warp.images import replacing
+    from beam_warp.image.files import replacing
 
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

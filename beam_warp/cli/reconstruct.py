@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import print_json, progress
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
-    from beam_warp.reconstruction import FrameSteps, Part, ReconstructOptions
+    from beam_warp.reconstruction.job import FrameSteps, Part, ReconstructOptions
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def reconstruct(args: Reconstruct) -> int:
     options = options_of(args.modelling, capture)
     steps = steps_of(args.modelling, capture, args.seed, args.device)
 
-    from beam_warp.reconstruction import reconstruct as reconstruct_capture
-    from beam_warp.reconstruction import reconstruct_part
+    from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
+    from beam_warp.reconstruction.job import reconstruct_part
 
     if part is not None:
         with progress(args.quiet or args.json) as report:
@@ -108,9 +108,9 @@ def summary(report: dict[str, Any]) -> str:
 
 def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | None) -> FrameSteps:
     """Return the steps that the words ask for."""
-    from beam_warp.gaussian_fitting import FitOptions
-    from beam_warp.reconstruction_steps import FitAndTrack
-    from beam_warp.tracking import TrackOptions
+    from beam_warp.reconstruction.fit import FitOptions
+    from beam_warp.reconstruction.steps import FitAndTrack
+    from beam_warp.reconstruction.track import TrackOptions
 
     asked: dict[str, Any] = {"target_psnr": modelling.target_psnr, "seed": seed}
     if modelling.gaussians is not None:
@@ -126,7 +126,7 @@ def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | No
 
 def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     """Return which frames are reconstructed, and in which segments."""
-    from beam_warp.reconstruction import ReconstructOptions
+    from beam_warp.reconstruction.job import ReconstructOptions
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
     return ReconstructOptions(segment_length=modelling.segment_length, frames=frames)
@@ -160,7 +160,7 @@ def part_of(words: str) -> Part:
     Raises:
         InvalidOptionError: It is none.
     """
-    from beam_warp.reconstruction import Part
+    from beam_warp.reconstruction.job import Part
 
     number, slash, count = words.partition("/")
     if not (slash and number.isdecimal() and count.isdecimal()):

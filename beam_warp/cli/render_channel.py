@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beam_warp import converters
-from beam_warp.asset_metadata import numbers_of_frames
-from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
-from beam_warp.axes import change_axes
-from beam_warp.captures import Capture
-from beam_warp.channel_images import OBSERVABILITY, channel_range, see_channel
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import raster_options
 from beam_warp.cli.render_views import View, capture_views, still_camera
-from beam_warp.devices import resolve_device
-from beam_warp.frame_output import FramePattern, Still, numbered, parse_target, require_folder
-from beam_warp.images import write_exr, write_png
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.files import write_exr, write_png
+from beam_warp.render.channels import OBSERVABILITY, channel_range, see_channel
+from beam_warp.stage.output import FramePattern, Still, numbered, parse_target, require_folder
+from beam_warp.world.axes import change_axes
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.metadata import numbers_of_frames
 
 if TYPE_CHECKING:
     from beam_warp.cli.render import Render
-    from beam_warp.raster_records import RasterOptions
+    from beam_warp.raster.records import RasterOptions
 
 
 def render_channel(args: Render) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from beam_warp.checks import require_choice, require_range
 from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.frame_output import IMAGE_SUFFIXES, Film, FramePattern, parse_target, require_folder
+from beam_warp.stage.output import IMAGE_SUFFIXES, Film, FramePattern, parse_target, require_folder
 
 if TYPE_CHECKING:
     from beam_warp.cli.render import Render
@@ -86,7 +86,7 @@ def _require_one_camera(args: Render) -> None:
 
 def _require_channel(args: Render) -> None:
     """Refuse a channel that is none, and what a channel has no use for."""
-    from beam_warp.channel_images import DRAWABLE
+    from beam_warp.render.channels import DRAWABLE
 
     require_choice("channel", args.channel or "", DRAWABLE)
     _refuse(args, (*_LIT, *_LIGHTING), "with --channel", "", ": a channel is drawn on grey, and without light")

@@ -8,26 +8,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beam_warp.asset_metadata import numbers_of_frames
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import raster_options
 from beam_warp.cli.render_stage import Staged, staged
 from beam_warp.cli.render_views import capture_views, image_size
-from beam_warp.deferred_options import LAYERS, DeferredOptions
-from beam_warp.devices import resolve_device
-from beam_warp.frame_output import Film, FramePattern, Still, numbered, parse_target
-from beam_warp.frame_renderers import DeferredFrames, PathFrames
-from beam_warp.frame_times import FrameTimes, frame_times
-from beam_warp.path_rendering import PathOptions
-from beam_warp.pictures import BLACK, PictureOptions, PictureWriter
-from beam_warp.render_jobs import Frame, FrameRenderer, RenderJob, Tally
-from beam_warp.video import INSTALL, VideoOptions, find_ffmpeg
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
+from beam_warp.render.options import LAYERS, DeferredOptions
+from beam_warp.render.path import PathOptions
+from beam_warp.stage.frame_times import FrameTimes, frame_times
+from beam_warp.stage.jobs import Frame, FrameRenderer, RenderJob, Tally
+from beam_warp.stage.output import Film, FramePattern, Still, numbered, parse_target
+from beam_warp.stage.pictures import BLACK, PictureOptions, PictureWriter
+from beam_warp.stage.renderers import DeferredFrames, PathFrames
+from beam_warp.world.metadata import numbers_of_frames
 
 if TYPE_CHECKING:
     from beam_warp.cli.render import Render
-    from beam_warp.stages import Stage
+    from beam_warp.stage.stage import Stage
 
 
 @dataclass

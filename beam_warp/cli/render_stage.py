@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.camera_paths import CameraPath, FixedCamera, OrbitPath, read_camera_path
-from beam_warp.cameras import Camera
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.render_checks import is_stage
 from beam_warp.cli.render_views import DEFAULT_FOV, still_camera
-from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError
-from beam_warp.frame_times import SECONDS_RANGE, SPEED_RANGE
-from beam_warp.lights import read_lights
-from beam_warp.stage_environments import StageEnvironment
-from beam_warp.stage_meshes import Ground
-from beam_warp.stages import Stage
+from beam_warp.stage.camera_paths import CameraPath, FixedCamera, OrbitPath, read_camera_path
+from beam_warp.stage.environments import StageEnvironment
+from beam_warp.stage.frame_times import SECONDS_RANGE, SPEED_RANGE
+from beam_warp.stage.meshes import Ground
+from beam_warp.stage.stage import Stage
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.lights import read_lights
 
 if TYPE_CHECKING:
-    from beam_warp.captures import Capture
+    from beam_warp.capture.capture import Capture
     from beam_warp.cli.render import Render
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beam_warp.assets import GaussianCloud
-from beam_warp.cameras import MAX_SIDE, Camera, bulk
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.world.camera import MAX_SIDE, Camera, bulk
+from beam_warp.world.gaussians import GaussianCloud
 
 if TYPE_CHECKING:
     from beam_warp.cli.render import Render

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
-from beam_warp.assets import GaussianSequence
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.console import ProgressCallback, print_json, progress
 from beam_warp.cli.decompose import (
@@ -23,11 +22,12 @@ from beam_warp.cli.decompose import (
     run_options,
 )
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
-from beam_warp.environments import EnvironmentMap
 from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianSequence
 
 if TYPE_CHECKING:
-    from beam_warp.reconstruction import Reconstruction
+    from beam_warp.reconstruction.job import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def run(args: Run) -> int:
     if args.fps is not None:
         require_number("frames_per_second", args.fps, 1e-3, 1e6)
 
-    from beam_warp.pipeline import run as run_pipeline
+    from beam_warp.materials.job import run as run_pipeline
 
     options = run_options(
         args.measuring, capture, preset="direct", seed=args.seed, device=args.device, persistent=args.persistent
@@ -127,8 +127,8 @@ def _read(args: Run) -> GaussianSequence:
 
 
 def _reconstruct(args: Run, capture: Capture, report: ProgressCallback) -> Reconstruction:
-    from beam_warp.frame_store import make_folders
-    from beam_warp.reconstruction import reconstruct
+    from beam_warp.jobs.store import make_folders
+    from beam_warp.reconstruction.job import reconstruct
 
     steps = steps_of(args.modelling, capture, args.seed, args.device)
     folder = args.out / "reconstruction"

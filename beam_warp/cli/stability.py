@@ -14,7 +14,7 @@ from beam_warp.cli.console import ProgressCallback, print_json, progress
 from beam_warp.errors import OutputError
 
 if TYPE_CHECKING:
-    from beam_warp.stability_report import StabilityResult
+    from beam_warp.stability.page import StabilityResult
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def stability(args: Stability) -> int:
     if args.out is not None and not args.out.parent.is_dir():
         raise OutputError(f"out must be in a folder that exists, got {args.out.parent}. Create it first.")
 
-    from beam_warp.stability_report import StabilityResult, read_result, write_page
+    from beam_warp.stability.page import StabilityResult, read_result, write_page
 
     others = [read_result(path) for path in args.beside]
     result = StabilityResult()
@@ -78,10 +78,10 @@ def stability(args: Stability) -> int:
 
 def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Trace the scenes and the shapes."""
-    from beam_warp.analytic_occlusion import SHAPES, measure_shapes
-    from beam_warp.stability import run_cases
-    from beam_warp.stability_report import StabilityResult
-    from beam_warp.stress_cases import CASES
+    from beam_warp.stability.analytic_occlusion import SHAPES, measure_shapes
+    from beam_warp.stability.page import StabilityResult
+    from beam_warp.stability.tracing import run_cases
+    from beam_warp.stability.tracing_cases import CASES
 
     cases = [case for case in CASES if args.large or not case.large]
     return StabilityResult(
@@ -92,10 +92,10 @@ def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
 
 def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Reconstruct the captures."""
-    from beam_warp.capture_stability import run_capture_cases
-    from beam_warp.stability_report import StabilityResult
-    from beam_warp.stress_captures import CAPTURE_CASES
-    from beam_warp.stressed_reconstruction import LARGE, QUICK, reconstructing
+    from beam_warp.stability.capture_cases import CAPTURE_CASES
+    from beam_warp.stability.captures import run_capture_cases
+    from beam_warp.stability.page import StabilityResult
+    from beam_warp.stability.reconstruct import LARGE, QUICK, reconstructing
 
     effort = LARGE if args.large else QUICK
     with tempfile.TemporaryDirectory() as folder:
@@ -111,9 +111,9 @@ def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
 
 def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Measure materials."""
-    from beam_warp.material_stability import run_material_cases
-    from beam_warp.stability_report import StabilityResult
-    from beam_warp.stress_materials import MATERIAL_CASES, MaterialStudio
+    from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialStudio
+    from beam_warp.stability.materials import run_material_cases
+    from beam_warp.stability.page import StabilityResult
 
     outcomes = run_material_cases(
         MaterialStudio(args.device),
@@ -125,9 +125,9 @@ def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
 
 def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Render subjects and lights with both renderers."""
-    from beam_warp.relighting_stability import RelightingBench, run_relighting_cases
-    from beam_warp.stability_report import StabilityResult
-    from beam_warp.stress_relighting import RELIGHTING_CASES
+    from beam_warp.stability.page import StabilityResult
+    from beam_warp.stability.relighting import RelightingBench, run_relighting_cases
+    from beam_warp.stability.relighting_cases import RELIGHTING_CASES
 
     outcomes = run_relighting_cases(
         RelightingBench(device=args.device),
@@ -178,8 +178,8 @@ def _print_materials(result: StabilityResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.material_stability import TITLES, cells
-    from beam_warp.stability_report import devices_of
+    from beam_warp.stability.materials import TITLES, cells
+    from beam_warp.stability.page import devices_of
 
     titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
     table = Table(*titles, title=f"materials on {', '.join(devices_of(result.materials))}")
@@ -194,8 +194,8 @@ def _print_relighting(result: StabilityResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.relighting_stability import TITLES, cells
-    from beam_warp.stability_report import devices_of
+    from beam_warp.stability.page import devices_of
+    from beam_warp.stability.relighting import TITLES, cells
 
     titles = (TITLES[0], *TITLES[3:5], TITLES[-1])  # how others fail and what is asked is on the page
     table = Table(*titles, title=f"relighting on {', '.join(devices_of(result.relighting))}")
@@ -210,8 +210,8 @@ def _print_captures(result: StabilityResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.capture_stability import TITLES, cells
-    from beam_warp.stability_report import devices_of
+    from beam_warp.stability.captures import TITLES, cells
+    from beam_warp.stability.page import devices_of
 
     titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
     table = Table(*titles, title=f"stress captures on {', '.join(devices_of(result.captures))}")
@@ -226,7 +226,7 @@ def _print_tracing(result: StabilityResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from beam_warp.stability_report import allowed_by, devices_of
+    from beam_warp.stability.page import allowed_by, devices_of
 
     console = Console(width=None if sys.stdout.isatty() else 200)
     device = ", ".join(devices_of(result.outcomes))

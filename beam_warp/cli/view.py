@@ -14,13 +14,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import converters
-from beam_warp.assets import GaussianSequence
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.console import print_json
 from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
-from beam_warp.demo_environments import stage, studio, sunset
-from beam_warp.environments import EnvironmentMap
+from beam_warp.demo.lights import stage, studio, sunset
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianSequence
 
 ASSET_NAME = "asset.usda"
 """What `beam run` calls its result."""
@@ -76,7 +76,7 @@ def view(args: View) -> int:
     lights = environments(args.environment)
     sequence = _read(args)
 
-    from beam_warp.viewing import Viewer, ViewOptions
+    from beam_warp.view.viewer import Viewer, ViewOptions
 
     options = ViewOptions(
         host=args.host,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from beam_warp import GaussianSequence, write
-from beam_warp.charts import read_table
 from beam_warp.cli.main import main
-from beam_warp.images import write_exr
-from beam_warp.tiled_shapes import still_life
+from beam_warp.image.files import write_exr
+from beam_warp.study.table import read_table
+from beam_warp.world.shapes import still_life
 
 QUICK = (
     *("--device", "cpu", "--points", 8, "--reference-rays", 64, "--repeats", 1, "--rays", 4, 8),
@@ -63,9 +63,9 @@ def test_quiet_and_budget(scene, tmp_path, capsys):
 
 
 def test_stop_keeps_what_was_measured(scene, tmp_path, capsys, monkeypatch):
-    from beam_warp import tracing_study
+    from beam_warp.study import tracing
 
-    measure, measured = tracing_study._Bench.measure, []
+    measure, measured = tracing._Bench.measure, []
 
     def stop_later(self, settings):
         if len(measured) == 2:
@@ -73,7 +73,7 @@ def test_stop_keeps_what_was_measured(scene, tmp_path, capsys, monkeypatch):
         measured.append(settings)
         return measure(self, settings)
 
-    monkeypatch.setattr(tracing_study._Bench, "measure", stop_later)
+    monkeypatch.setattr(tracing._Bench, "measure", stop_later)
     assert beam("chart", "tracing", scene, "--out", tmp_path, *QUICK) == 130
     assert "tracing.partial.csv: call again to continue" in capsys.readouterr().err
     assert len(read_table(tmp_path / "tracing.partial.csv").rows) == 2
@@ -130,7 +130,7 @@ MATERIALS = (
 
 
 def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("beam_warp.materials_study.GAUSSIANS", {False: 500})
+    monkeypatch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 500})
     assert beam("chart", "materials", "--capture", tiny_capture.folder, "--out", tmp_path, *MATERIALS, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["measured"] == report["planned"] == 6  # auto and 0.02 m directly, 0.02 m by images
@@ -143,11 +143,11 @@ def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, ca
 
 
 def test_materials_of_an_asset(tiny_capture, tmp_path, capsys):
-    from beam_warp.environments import EnvironmentMap
-    from beam_warp.materials_study import MaterialsSubject
+    from beam_warp.study.materials import MaterialsSubject
+    from beam_warp.world.environment import EnvironmentMap
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beam_warp.materials_study.GAUSSIANS", {False: 300})
+        patch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 300})
         light = EnvironmentMap.read(tiny_capture.environment_path)
         cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud
     (tmp_path / "figure").mkdir()

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from beam_warp import __version__, converters
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
 from beam_warp.cli.convert import main
 from beam_warp.converters import WriteOptions
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 @pytest.fixture

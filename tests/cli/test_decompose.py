@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from figure_asset import figure_asset
+from support.figure_asset import figure_asset
 
 from beam_warp import GaussianSequence, read, write
 from beam_warp.cli import decompose as command
 from beam_warp.cli.main import main
-from beam_warp.environments import EnvironmentMap
-from beam_warp.images import write_exr
+from beam_warp.image.files import write_exr
+from beam_warp.world.environment import EnvironmentMap
 
 
 @pytest.fixture(scope="module")

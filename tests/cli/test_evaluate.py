@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from figure_asset import figure_asset
 from PIL import Image
+from support.figure_asset import figure_asset
 
 from beam_warp import converters
 from beam_warp.cli.main import main
-from beam_warp.images import read_image
+from beam_warp.image.files import read_image
 
 
 @pytest.fixture(scope="module")

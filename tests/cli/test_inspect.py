@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
-from sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
+from support.sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
 
 from beam_warp.cli.main import main
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from beam_warp import converters
-from beam_warp.assets import GaussianCloud, GaussianSequence
-from beam_warp.cameras import Camera
 from beam_warp.cli.main import main
-from beam_warp.mesh_files import read_mesh
-from beam_warp.raster_records import RasterOptions
+from beam_warp.mesh.files import read_mesh
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 FAST = ("--size", "48", "--voxel", "0.05", "--device", "cpu")
 

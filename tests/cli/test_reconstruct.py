@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from fake_steps import FakeSteps, write_capture
+from support.fake_steps import FakeSteps, write_capture
 
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import progress, rate_in_words
 from beam_warp.cli.main import main
 from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of

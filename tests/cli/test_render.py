@@ -8,15 +8,16 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from beam_warp import converters
-from beam_warp.assets import WORLD_AXES, GaussianCloud, GaussianSequence
-from beam_warp.axes import change_axes
-from beam_warp.cameras import Camera
-from beam_warp.captures import Capture
+from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import run_command
 from beam_warp.cli.render import Render, render
-from beam_warp.images import linear_to_srgb, read_image, write_exr
-from beam_warp.raster_records import RasterOptions
-from beam_warp.rasterizing import rasterize
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.files import read_image, write_exr
+from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 
 SIDE = ["--width", "48"]
 

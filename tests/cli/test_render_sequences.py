@@ -10,16 +10,16 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from beam_warp import converters
-from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cli import render_relit
 from beam_warp.cli.console import run_command
 from beam_warp.cli.main import main
 from beam_warp.cli.render import Render, render
 from beam_warp.cli.render_checks import require_consistent
-from beam_warp.images import read_image, write_exr
-from beam_warp.lights import PointLight
-from beam_warp.shots import RenderedImage
-from beam_warp.video import find_ffmpeg
+from beam_warp.image.files import read_image, write_exr
+from beam_warp.image.video import find_ffmpeg
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.lights import PointLight
+from beam_warp.world.shot import RenderedImage
 
 needs_ffmpeg = pytest.mark.skipif(find_ffmpeg() is None, reason="there is no ffmpeg here")
 
@@ -439,7 +439,7 @@ def test_one_stage_or_several_assets(walk, light, tmp_path, capsys):
 
 
 def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("beam_warp.frame_output.os.access", lambda *_: False)
+    monkeypatch.setattr("beam_warp.stage.output.os.access", lambda *_: False)
     assert run(*common, "--out", tmp_path / "x.png", "--frame", 0) == 2
     assert "out must be in a folder that can be written" in capsys.readouterr().err
 

@@ -6,12 +6,12 @@ import sys
 
 import numpy as np
 import pytest
-from shapes import cloud_of, sphere_points, tiles
+from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, write
-from beam_warp.assets import DISPLAY_SRGB
 from beam_warp.cli.main import main
-from beam_warp.images import write_exr
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.image.files import write_exr
 
 
 @pytest.fixture

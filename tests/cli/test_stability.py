@@ -7,20 +7,18 @@ import pytest
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from beam_warp import (
-    analytic_occlusion,
-    capture_stability,
-    material_stability,
-    relighting_stability,
-    stability,
-    stress_captures,
-    stress_cases,
-    stress_materials,
-    stress_relighting,
-)
 from beam_warp.cli.console import run_command
 from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
+from beam_warp.stability import analytic_occlusion
+from beam_warp.stability import capture_cases as stress_captures
+from beam_warp.stability import captures as capture_stability
+from beam_warp.stability import material_cases as stress_materials
+from beam_warp.stability import materials as material_stability
+from beam_warp.stability import relighting as relighting_stability
+from beam_warp.stability import relighting_cases as stress_relighting
+from beam_warp.stability import tracing as stability
+from beam_warp.stability import tracing_cases as stress_cases
 
 BLACK_CAMERA = stress_captures.capture_case_of("black camera")
 
@@ -94,15 +92,15 @@ def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
 @pytest.fixture
 def one_capture(monkeypatch, tiny_capture):
     """A case that is run for real, of as few steps as there can be, on a capture that is there."""
-    from beam_warp import stressed_reconstruction
-    from beam_warp.stress_captures import StressStudio
+    from beam_warp.stability import reconstruct
+    from beam_warp.stability.capture_cases import StressStudio
 
-    class Effort(stressed_reconstruction.StressEffort):
+    class Effort(reconstruct.StressEffort):
         def studio(self, folder, device):
             return StressStudio(folder, given=tiny_capture, device=device)
 
     effort = Effort(size=64, camera_count=6, gaussian_count=300, fit=(4, 2), levels=(1, 1, 1), refinement=1)
-    monkeypatch.setattr(stressed_reconstruction, "QUICK", effort)
+    monkeypatch.setattr(reconstruct, "QUICK", effort)
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [BLACK_CAMERA])
 
 
@@ -149,7 +147,7 @@ def test_captures_of_another_device_stand_below(one_capture, tmp_path, capsys):
 
 
 def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
-    from beam_warp.stress_captures import CaptureStress, Detection
+    from beam_warp.stability.capture_cases import CaptureStress, Detection
 
     broken = dataclasses.replace(
         BLACK_CAMERA,

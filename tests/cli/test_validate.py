@@ -7,9 +7,9 @@ import sys
 import pytest
 from pxr import Sdf
 
-from beam_warp.assets import GaussianCloud, GaussianSequence
 from beam_warp.cli.validate import main
 from beam_warp.schema.writer import write_asset
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ import urllib.request
 
 import numpy as np
 import pytest
-from figure_asset import figure_asset
+from support.figure_asset import figure_asset
 
 from beam_warp import converters
 from beam_warp.cli.main import main
 from beam_warp.cli.view import environments
 from beam_warp.errors import AssetFormatError, MissingFileError
-from beam_warp.images import write_exr
+from beam_warp.image.files import write_exr
 
 
 def beam(*words):

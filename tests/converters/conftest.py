@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.gaussians import GaussianCloud
 
 
 @pytest.fixture(scope="session")

@@ -8,9 +8,9 @@ import plyfile
 import pytest
 
 from beam_warp import converters
-from beam_warp.assets import DISPLAY_SRGB
 from beam_warp.errors import AssetFormatError
-from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.harmonics import SH_C0
 
 EPSILON = float(np.finfo(np.float32).eps)
 

@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from beam_warp import converters
-from beam_warp.assets import LINEAR_REC709, GaussianSequence
-from beam_warp.axes import axes_matrix
 from beam_warp.converters import WriteOptions
 from beam_warp.converters.activations import LOGIT_LIMIT
 from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, SchemaVersionError
-from beam_warp.spherical_harmonics import sh_color
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.world.axes import axes_matrix
+from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.harmonics import sh_color
 
 EPSILON = np.finfo(np.float32).eps
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beam_warp import converters
-from beam_warp.assets import GaussianSequence
 from beam_warp.converters import WriteOptions
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
+from beam_warp.world.gaussians import GaussianSequence
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from beam_warp.ggx import DIELECTRIC_F0, schlick_weight, smith_lambda, specular_albedo
+from beam_warp.light.ggx import DIELECTRIC_F0, schlick_weight, smith_lambda, specular_albedo
 
 AROUND, ACROSS = 16, 16
 """Midpoint grid over visible normals, and over the cosine-weighted hemisphere."""

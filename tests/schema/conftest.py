@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from beam_warp.assets import DISPLAY_SRGB, GaussianCloud, GaussianSequence
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 def make_cloud(seed=0, count=6, *, degree=1, relightable=True, axes="rub", **changes):

@@ -5,10 +5,10 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
-from beam_warp.cameras import Camera
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.schema import register
 from beam_warp.schema.cameras import read_usd_camera
+from beam_warp.world.camera import Camera
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 

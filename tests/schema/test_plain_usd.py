@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from beam_warp.schema.writer import write_asset
-from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.world.harmonics import SH_C0
 
 PROGRAM = """
 import json, sys

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from beam_warp.errors import AssetFormatError, MissingFileError, SchemaVersionError
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
-from beam_warp.spherical_harmonics import sh_color
+from beam_warp.world.harmonics import sh_color
 
 TURN = Rotation.from_euler("xyz", [30, -50, 110], degrees=True)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, Vt
 
-from beam_warp.asset_metadata import stated_raster
-from beam_warp.assets import GaussianSequence
 from beam_warp.errors import InvalidOptionError
 from beam_warp.schema.layout import HALF_ABSOLUTE, HALF_EPSILON
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
+from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.metadata import stated_raster
 
 
 def assert_same(got, wanted, full_float):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdValidation, Vt
 
-from beam_warp.assets import GaussianSequence
 from beam_warp.schema import MATERIAL_API, PLUGIN_FOLDER, SEQUENCE_API
 from beam_warp.schema.layout import to_vt
 from beam_warp.schema.report import Report
 from beam_warp.schema.validator import ALL_RULES, HOST_VALIDATOR, check_rules, validate, validate_stage
 from beam_warp.schema.writer import write_asset
+from beam_warp.world.gaussians import GaussianSequence
 
 
 class Asset:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from beam_warp import validate
-from beam_warp.asset_metadata import stated_capture_frames, stated_raster
 from beam_warp.schema import reader
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
+from beam_warp.world.metadata import stated_capture_frames, stated_raster
 
 OLD_ASSET = Path(__file__).parent / "asset_1_0.usda"
 """Written by the package as it was at version 1.0 of the schema."""

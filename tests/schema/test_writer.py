@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
-from beam_warp.assets import GaussianSequence
 from beam_warp.errors import BeamError, InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.schema import writer
 from beam_warp.schema.writer import write_asset
-from beam_warp.spherical_harmonics import SH_C0
+from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 
 
 @pytest.fixture

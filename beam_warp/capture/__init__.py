@@ -1,0 +1,1 @@
+"""Multi-view captures: loaders, lenses, inspection, and how a report of one looks."""

@@ -1,0 +1,90 @@
+"""What a frame of a capture is made of, as one digest: two frames with the same digest reconstruct to the same bytes.
+
+A digest covers everything that a record states (camera, lens, names) and the *content* of its files, so a capture may
+be moved or copied. Reading gigabytes again to learn that nothing has changed would be slow; so, as version control
+does, the content is read again only when a file's path, size, times or inode are others than when it was last read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+from beam_warp.capture.capture import CaptureRecord
+from beam_warp.digests import content_digest, described, fields_of
+from beam_warp.errors import MissingFileError
+
+UNREAD_FIELDS = frozenset({"truth_path", "relit_paths"})
+"""Fields of a record that reconstruction never reads."""
+
+
+class CaptureDigests:
+    """Digests of frames; what they were found from is kept in a folder, one small file for each frame."""
+
+    def __init__(self, folder: Path) -> None:
+        """Keep what is learnt in a folder that exists."""
+        self._folder = folder
+
+    def of(self, frame: int, records: Sequence[CaptureRecord], pool: Executor) -> str:
+        """Return the digest of the records of one frame, in their order; files are read by the pool.
+
+        Raises:
+            MissingFileError: A file is not there or cannot be read.
+        """
+        memory = self._folder / f"frame_{frame:06d}.json"
+        known = _remembered(memory)
+        paths = sorted({path for record in records for path in files_of(record)})
+        found = dict(zip(paths, pool.map(lambda path: content_digest(path, known), paths), strict=True))
+        fresh = {str(path): [*stamp, digest] for path, (stamp, digest) in found.items() if stamp is not None}
+        if fresh != known:
+            _remember(memory, fresh)
+        content = [
+            described(
+                {name: value for name, value in fields_of(record) if name not in UNREAD_FIELDS},
+                lambda path: [path.suffix.lower(), found[path][1]],
+            )
+            for record in records
+        ]
+        return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def files_of(record: CaptureRecord) -> list[Path]:
+    """Return the files of a record that reconstruction reads."""
+    return [value for name, value in fields_of(record) if isinstance(value, Path) and name not in UNREAD_FIELDS]
+
+
+def require_files(records: Iterable[CaptureRecord]) -> None:
+    """Refuse records whose files are not there, before any work starts.
+
+    Raises:
+        MissingFileError: Names the first one and says how many there are.
+    """
+    missing = [path for record in records for path in files_of(record) if not path.is_file()]
+    if missing:
+        raise MissingFileError(
+            f"images of the capture must exist, got none at {missing[0]} ({len(missing)} missing in all). "
+            "Restore them, or leave their records out."
+        )
+
+
+def _remembered(path: Path) -> dict[str, list[Any]]:
+    """Read what is known of a frame's files; whatever is wrong with the memory, the files are read instead."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): list(entry) for name, entry in content.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+def _remember(path: Path, content: Mapping[str, Any]) -> None:
+    """Keep what is known; that it cannot be kept costs time and nothing else."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with contextlib.suppress(OSError):
+        temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        temporary.replace(path)

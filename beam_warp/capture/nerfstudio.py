@@ -1,0 +1,283 @@
+"""Captures in nerfstudio's layout: a ``transforms.json`` beside the images.
+
+Intrinsics for all records or for each one, and a camera-to-world pose in OpenGL axes (x right, y up, looking down
+-z), turned here into `Camera`'s OpenCV axes. What nerfstudio does not have and a performance needs is read from
+further fields of a record: ``time``, ``frame``, ``camera``, ``split``, ``color_space``, and, for measuring errors,
+``truth`` and ``relit``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.lenses import COEFFICIENT_NAMES, MAX_COEFFICIENT, Lens
+from beam_warp.capture.records import (
+    COLOR_SPACES,
+    MASK_FOLDER,
+    MAX_RECORDS,
+    CaptureContents,
+    CaptureRecord,
+    Photograph,
+    SparsePoints,
+    camera_name_of,
+    mask_beside,
+)
+from beam_warp.capture.undistort import Intrinsics
+from beam_warp.converters.ply_container import read_header, read_table
+from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
+from beam_warp.image.color import srgb_to_linear
+
+FILE_NAME = "transforms.json"
+"""The file that makes a folder a capture."""
+
+MAX_FILE_BYTES = 2**30
+"""Largest file read: a million records take about half of it."""
+
+MAX_FRAME = 10**9
+"""Largest frame number."""
+
+LENS_MODELS = {
+    **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
+    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+}
+"""Camera models of nerfstudio that are read, and what undistorts them: all but the last one are the same to it too."""
+
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def read(path: Path, keep: float) -> CaptureContents:
+    """Read a ``transforms.json``; see `captures.Capture.read`."""
+    content = _read_json(path)
+    root = path.parent
+    listed = content.get("frames")
+    if not isinstance(listed, list) or not 0 < len(listed) <= MAX_RECORDS:
+        raise AssetFormatError(
+            f"frames must be a list of 1 to {MAX_RECORDS} records, got "
+            f"{len(listed) if isinstance(listed, list) else _shown(listed)} at {path}. List the images there."
+        )
+    splits = {
+        name: split
+        for split in ("train", "val", "test")
+        for name in _Fields(content, str(path)).texts(f"{split}_filenames")
+    }
+    has_masks = (root / MASK_FOLDER).is_dir()
+    records, seen = [], {}
+    for index, entry in enumerate(listed):
+        where = f"{path}, frames[{index}]"
+        if not isinstance(entry, dict):
+            raise AssetFormatError(f"record must be an object, got {_shown(entry)} at {where}. Write it as one.")
+        record = _record(_Fields({**_shared(content), **entry}, where), root, splits, keep, has_masks)
+        if record.name in seen:
+            raise AssetFormatError(
+                f"camera and frame must be another pair in each record, got {record.name} "
+                f"at {where} and frames[{seen[record.name]}]. Number the frames or name the cameras apart."
+            )
+        seen[record.name] = index
+        records.append(record)
+    fields = _Fields(content, str(path))
+    environment = root / fields.text("environment", "environment.exr")
+    if "environment" in content and not environment.is_file():
+        raise MissingFileError(f"environment must be a file, got {environment} (named in {path}). Correct the name.")
+    return CaptureContents(
+        folder=root,
+        records=tuple(records),
+        frames_per_second=fields.number("fps", low=1e-3, high=1e6) if "fps" in content else None,
+        environment_path=environment if environment.is_file() else None,
+        read_points=partial(read_points, root / fields.text("ply_file_path")) if "ply_file_path" in content else None,
+    )
+
+
+def read_points(path: Path) -> SparsePoints:
+    """Read the points of a PLY file; colours, if any, are bytes of sRGB.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: It is damaged, or has no positions, or some that are not finite.
+    """
+    header = read_header(path)
+    table = read_table(header, "vertex")
+    if missing := [name for name in "xyz" if name not in table.names]:
+        raise AssetFormatError(f"points must have x, y and z, got no {missing[0]} in {path}. Export points.")
+    positions = table.columns(tuple("xyz"), np.float64)
+    if not np.isfinite(positions).all():
+        raise AssetFormatError(f"points must be finite, got NaN or infinity in {path}. Drop those points.")
+    names = ("red", "green", "blue")
+    if not all(name in table.names for name in names):
+        return SparsePoints(positions)
+    element = header.element("vertex")
+    codes = {column.code for column in element.properties if column.name in names} if element else set()
+    if codes != {"u1"}:
+        raise AssetFormatError(f"colours of points must be bytes, got {sorted(codes)} in {path}. Export them as uchar.")
+    colors = srgb_to_linear(table.columns(names, np.float64) / 255.0).astype(np.float32)
+    return SparsePoints(positions, colors)
+
+
+class _Fields:
+    """One JSON object, read field by field; errors name the field and the place."""
+
+    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+        self.values = values
+        self.where = where
+
+    def number(self, name: str, default: float | None = None, *, low: float, high: float) -> float:
+        """Return a finite number in range."""
+        value = self._get(name, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not (low <= value <= high):
+            raise self.error(name, f"a number in [{low:g}, {high:g}]", value)
+        return float(value)
+
+    def integer(self, name: str, default: int | None = None, *, low: int, high: int) -> int:
+        """Return an integer in range, also where a writer made it ``320.0``."""
+        value = self.number(name, default, low=low, high=high)
+        if value != math.floor(value):
+            raise self.error(name, "an integer", value)
+        return int(value)
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """Return a text that is not empty."""
+        value = self._get(name, default)
+        if not isinstance(value, str) or not value or "\0" in value:
+            raise self.error(name, "a text", value)
+        return value
+
+    def texts(self, name: str) -> list[str]:
+        """Return a list of texts, empty if it is not there."""
+        value = self.values.get(name, [])
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise self.error(name, "a list of texts", value)
+        return value
+
+    def file_stem(self, name: str, default: str) -> str:
+        """Return a text that is safe in a file name."""
+        value = self.text(name, default)
+        if value in (".", "..") or any(c in '/\\:*?"<>|' or not c.isprintable() for c in value):
+            raise self.error(name, "fit for a file name", value)
+        return value
+
+    def paths(self, name: str, root: Path) -> dict[str, Path]:
+        """Return named files, none if the field is not there."""
+        value = self.values.get(name, {})
+        if not isinstance(value, dict) or not all(isinstance(item, str) and item for item in value.values()):
+            raise self.error(name, "an object of file names", value)
+        return {key: root / item for key, item in value.items()}
+
+    def matrix(self, name: str) -> NDArray[np.float64]:
+        """Return a 4 x 4 matrix; nerfstudio also writes it without its last row."""
+        value = self._get(name, None)
+        try:
+            matrix = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            matrix = np.zeros(0)
+        if matrix.shape == (3, 4):
+            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise self.error(name, "a 4 x 4 matrix of finite numbers", value)
+        return matrix
+
+    def error(self, name: str, contract: str, value: Any) -> AssetFormatError:
+        """Say what a field must be."""
+        found = _shown(value) if value is not None else "nothing"
+        return AssetFormatError(f"{name} must be {contract}, got {found} at {self.where}. Correct the file.")
+
+    def _get(self, name: str, default: Any) -> Any:
+        value = self.values.get(name)
+        return default if value is None else value
+
+
+_SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "camera_model", "color_space")
+
+
+def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that hold for every record unless the record says otherwise."""
+    return {name: content[name] for name in _SHARED_NAMES if name in content}
+
+
+def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float, has_masks: bool) -> CaptureRecord:
+    """Read one record."""
+    model = fields.text("camera_model", "OPENCV")
+    if model not in LENS_MODELS:
+        raise fields.error("camera_model", f"one of {', '.join(LENS_MODELS)}", model)
+    photograph = Photograph(
+        Intrinsics(
+            fields.integer("w", low=1, high=2**16),
+            fields.integer("h", low=1, high=2**16),
+            fields.number("fl_x", low=1e-3, high=1e9),
+            fields.number("fl_y", low=1e-3, high=1e9),
+            fields.number("cx", low=-1e9, high=1e9),
+            fields.number("cy", low=-1e9, high=1e9),
+        ),
+        _lens(fields, LENS_MODELS[model]),
+        model,
+        fields.where,
+    )
+    camera, undistortion = photograph.undistort(
+        fields.matrix("transform_matrix") @ _OPENGL_TO_OPENCV, "transform_matrix", keep
+    )
+    file_path = fields.text("file_path")
+    beside = mask_beside(root, file_path) if has_masks else None
+    return CaptureRecord(
+        camera_name=fields.file_stem("camera", camera_name_of(file_path)),
+        frame=fields.integer("frame", 0, low=0, high=MAX_FRAME),
+        time=fields.number("time", 0.0, low=-1e9, high=1e9),
+        split=fields.text("split", splits.get(file_path, "train")),
+        camera=camera,
+        image_path=root / file_path,
+        mask_path=root / fields.text("mask_path") if fields.values.get("mask_path") is not None else beside,
+        color_space=_color_space(fields),
+        truth_path=root / fields.text("truth") if fields.values.get("truth") is not None else None,
+        relit_paths=fields.paths("relit", root),
+        undistortion=undistortion,
+    )
+
+
+def _lens(fields: _Fields, model: str) -> Lens:
+    coefficients = tuple(
+        fields.number(name, 0.0, low=-MAX_COEFFICIENT, high=MAX_COEFFICIENT) for name in COEFFICIENT_NAMES
+    )
+    try:
+        return Lens(coefficients, model)
+    except BeamError as error:
+        raise AssetFormatError(f"{model} has no pinhole at {fields.where}: {error}") from error
+
+
+def _color_space(fields: _Fields) -> str | None:
+    if fields.values.get("color_space") is None:
+        return None
+    name = fields.text("color_space")
+    if name not in COLOR_SPACES:
+        raise fields.error("color_space", f"one of {', '.join(COLOR_SPACES)}", name)
+    return COLOR_SPACES[name]
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Read one JSON object from a file."""
+    if not path.is_file():
+        raise MissingFileError(f"capture must be a folder with {FILE_NAME}, got {path} (no such file). Check the path.")
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise AssetFormatError(
+                f"capture must be smaller than {MAX_FILE_BYTES} bytes, got more at {path}. Split it."
+            )
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MissingFileError(f"capture must be readable, got {path} ({error.strerror}). Check the rights.") from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise AssetFormatError(f"capture must be JSON in UTF-8, got {reason} at {path}. Correct the file.") from error
+    if not isinstance(content, dict):
+        raise AssetFormatError(f"capture must be a JSON object, got {_shown(content)} at {path}. Correct the file.")
+    return content
+
+
+def _shown(value: Any) -> str:
+    """Show a value in a message, shortened."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

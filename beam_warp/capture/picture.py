@@ -1,0 +1,388 @@
+"""A capture's report as one picture: the rig from two sides, what most cameras see, images with masks, findings."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.findings import Finding
+from beam_warp.capture.images import Glimpse
+from beam_warp.capture.inspect import SPLIT, CaptureReport
+from beam_warp.capture.records import SparsePoints
+from beam_warp.capture.rigs import frustum_corners, meeting_point
+from beam_warp.checks import require_package
+from beam_warp.converters.staging import staged_outputs
+from beam_warp.errors import BeamError
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.world.camera import Camera
+
+GREY = "#555555"
+WIDTH = 12.0
+RESOLUTION = 100
+SHOWN_GLIMPSES = 24
+SHOWN_POINTS = 3000
+COLUMNS = 8
+
+COLORS = {"train": "#0072B2", "other": "#E08214", "left out": "#C51B1B"}
+"""Of cameras: those that are trained from, the others, and those that are left out."""
+
+SEVERITY_COLORS = {"error": "#C51B1B", "warning": "#B36B00", "note": "#555555"}
+OUTLINE = "#00E5FF"
+VOLUME = "#2E8B57"
+BACKGROUND = 0.2
+"""Display grey behind subjects: dark ones stay visible, and white ones too."""
+
+DEPTH_SHARE = 0.16
+"""Depth at which frustums are drawn, in distances to what the cameras look at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A capture's cameras, as they are drawn.
+
+    Attributes:
+        cameras: By name.
+        kinds: By name, of `COLORS`.
+        depth: Of the drawn frustums [m].
+        volume: Corners of the common volume, ``(8, 3)``, or None.
+        points: Sparse points and their display colours, ``(P, 3)`` each.
+    """
+
+    cameras: dict[str, Camera]
+    kinds: dict[str, str]
+    depth: float
+    volume: NDArray[np.float64] | None
+    points: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+    @classmethod
+    def of(cls, report: CaptureReport) -> Rig:
+        """Gather what is drawn."""
+        poses = np.array([camera.camera_to_world for camera in report.cameras.values()])
+        point = meeting_point(poses)
+        if point is None:
+            point = poses[:, :3, 3].mean(axis=0) if report.volume is None else np.mean(report.volume, axis=0)
+        distance = float(np.median(np.linalg.norm(poses[:, :3, 3] - point, axis=1)))
+        left = {}
+        for record in report.capture.select(split=SPLIT):
+            left.setdefault(record.camera_name, []).append(record.name in report.left_out)
+        kinds = {
+            name: "other" if name not in left else "left out" if all(left[name]) else "train" for name in report.cameras
+        }
+        volume = None
+        if report.volume is not None:
+            low, high = report.volume
+            volume = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i, j, k in BOX])
+        return cls(report.cameras, kinds, DEPTH_SHARE * (distance or 1.0), volume, _shown_points(report))
+
+    def labels(self) -> dict[str, str]:
+        """Return the names of cameras without what those of one kind have in common at their start."""
+        found = {}
+        for kind in COLORS:
+            names = [name for name, own in self.kinds.items() if own == kind]
+            short = _common_start(names)
+            found |= {name: name[short:] for name in names}
+        return found
+
+
+BOX = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+"""Corners of a box: which of low and high each coordinate is."""
+
+BOX_EDGES = tuple(
+    (a, b) for a in range(8) for b in range(a + 1, 8) if sum(x != y for x, y in zip(BOX[a], BOX[b], strict=True)) == 1
+)
+
+
+def _common_start(names: Sequence[str]) -> int:
+    """Return how many leading characters names share, up to the last sign that parts words."""
+    if len(names) < 2:
+        return 0
+    same = 0
+    while same < min(map(len, names)) and len({name[same] for name in names}) == 1:
+        same += 1
+    start = names[0][:same]
+    return max(start.rfind(sign) for sign in "_-. ") + 1
+
+
+def _shown_points(report: CaptureReport) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return evenly many of a capture's points within reach, and their display colours."""
+    try:
+        found: SparsePoints | None = report.capture.points()
+    except BeamError:  # inspection reports it
+        found = None
+    if found is None or not len(found.positions):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    positions = found.positions
+    near = np.ones(len(positions), bool)
+    if report.volume is not None:
+        low, high = report.volume
+        near = ((positions > low - 0.5 * (high - low)) & (positions < high + 0.5 * (high - low))).all(axis=1)
+    index = np.flatnonzero(near)[:: max(1, int(near.sum()) // SHOWN_POINTS)]
+    colors = np.full((len(index), 3), 0.4) if found.colors is None else linear_to_srgb(found.colors[index])
+    return positions[index], np.clip(colors, 0.0, 1.0)
+
+
+def shown_glimpses(report: CaptureReport) -> list[Glimpse]:
+    """Return the images to show, of the first frame that was looked at: what is left out, and evenly many others."""
+    if not report.glimpses:
+        return []
+    first = min(glimpse.record.frame for glimpse in report.glimpses)
+    found = sorted(
+        (glimpse for glimpse in report.glimpses if glimpse.record.frame == first),
+        key=lambda glimpse: (glimpse.record.split != SPLIT, glimpse.record.camera_name),
+    )
+    bad = [place for place, glimpse in enumerate(found) if glimpse.record.name in report.left_out][:SHOWN_GLIMPSES]
+    rest = [place for place in range(len(found)) if place not in bad]
+    even = np.linspace(0, len(rest) - 1, min(len(rest), SHOWN_GLIMPSES - len(bad)))
+    return [found[place] for place in sorted({*bad, *(rest[round(p)] for p in even)})]
+
+
+def display_pixels(glimpse: Glimpse) -> NDArray[np.uint8]:
+    """Return an image over the background, ``(H, W, 3)``."""
+    if glimpse.alpha is None:
+        return glimpse.pixels
+    alpha = glimpse.alpha[..., None]
+    return np.rint(glimpse.pixels * alpha + 255.0 * BACKGROUND * (1.0 - alpha)).astype(np.uint8)
+
+
+def headline(report: CaptureReport) -> str:
+    """Return a capture's size in one line."""
+    capture = report.capture
+    splits = ", ".join(f"{len(capture.select(split=split)):,} {split}" for split in capture.splits)
+    return (
+        f"{len(report.cameras)} cameras, {len(capture.frames)} frame{'s' if len(capture.frames) != 1 else ''}, "
+        f"{len(capture.records):,} images ({splits}); {len(report.glimpses)} looked at"
+    )
+
+
+def verdict(report: CaptureReport) -> str:
+    """Return what the findings come to."""
+    errors, warnings = len(report.of("error")), len(report.of("warning"))
+    if errors:
+        return f"cannot be reconstructed: {errors} error{'s' if errors != 1 else ''}, {warnings} warnings"
+    return "ready" if not warnings else f"ready, with {warnings} warning{'s' if warnings != 1 else ''}"
+
+
+def write_picture(report: CaptureReport, path: Path) -> None:
+    """Draw a report as a PNG.
+
+    Raises:
+        InvalidOptionError: matplotlib is not installed.
+        OutputError: The file cannot be written.
+    """
+    require_package("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    glimpses = shown_glimpses(report)
+    lines = _finding_lines(report.findings)
+    aspect = max((g.pixels.shape[0] / g.pixels.shape[1] for g in glimpses), default=1.0)
+    columns = -(-len(glimpses) // max(1, -(-len(glimpses) // COLUMNS))) or 1  # rows as even as they can be
+    cell = (WIDTH - 0.6) / max(columns, 5)
+    thumb = (cell - 0.1, (cell - 0.1) * aspect)
+    rows = -(-len(glimpses) // columns)
+    heights = {"title": 0.8, "rig": 5.0, "images": rows * (thumb[1] + 0.28) + 0.1, "findings": 0.35 + 0.19 * len(lines)}
+    total = sum(heights.values())
+    figure = Figure(figsize=(WIDTH, total), facecolor="white")
+    FigureCanvasAgg(figure)
+
+    def place(left: float, top: float, width: float, height: float) -> Any:
+        return figure.add_axes((left / WIDTH, 1.0 - (top + height) / total, width / WIDTH, height / total))
+
+    color = SEVERITY_COLORS["error"] if report.of("error") else "#222222"
+    figure.text(
+        0.3 / WIDTH, 1 - 0.36 / total, report.capture.folder.resolve().name, size=17, weight="bold", va="center"
+    )
+    figure.text(0.3 / WIDTH, 1 - 0.64 / total, headline(report), size=10, color=GREY, va="center")
+    figure.text(1 - 0.3 / WIDTH, 1 - 0.36 / total, verdict(report), size=12, color=color, ha="right", va="center")
+    rig = Rig.of(report)
+    _legend(figure, rig, total)
+    _draw_rig(place(0.1, 0.8, 6.9, 4.9), rig, _outside_view(rig, report.up))
+    _draw_plan(place(7.55, 1.05, 4.2, 4.2), rig)
+    top = heights["title"] + heights["rig"]
+    for number, glimpse in enumerate(glimpses):
+        row, column = divmod(number, columns)
+        axes = place(0.3 + column * cell, top + row * (thumb[1] + 0.28) + 0.22, *thumb)
+        _draw_glimpse(axes, glimpse, rig.kinds[glimpse.record.camera_name])
+    top += heights["images"] + 0.2
+    for number, (text, ink) in enumerate(lines):
+        figure.text(0.3 / WIDTH, 1 - (top + 0.19 * number) / total, text, size=9, color=ink, va="center")
+    with staged_outputs() as staging:
+        figure.savefig(staging.path_for(path), format="png", dpi=RESOLUTION, pil_kwargs={"optimize": True})
+
+
+def _finding_lines(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+    lines = [
+        ("    " * (number > 0) + line, SEVERITY_COLORS[finding.severity])
+        for finding in findings
+        for number, line in enumerate(textwrap.wrap(str(finding), 165))
+    ]
+    return lines or [("Nothing wrong was found.", "#2E7D32")]
+
+
+def _legend(figure: Any, rig: Rig, total: float) -> None:
+    """Say what colours mean, once."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(color=color, label=text) for text, color in legend_entries(rig)]
+    figure.legend(
+        handles=handles,
+        loc="center right",
+        bbox_to_anchor=(1 - 0.2 / WIDTH, 1 - 0.66 / total),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=9,
+        handlelength=0.9,
+        handleheight=0.9,
+        handletextpad=0.5,
+        columnspacing=1.4,
+        borderpad=0.0,
+    )
+
+
+def legend_entries(rig: Rig) -> list[tuple[str, str]]:
+    """Return what is drawn in which colour."""
+    names = {"train": "trained from", "other": "other cameras", "left out": "left out"}
+    entries = [(names[kind], COLORS[kind]) for kind in COLORS if kind in rig.kinds.values()]
+    return entries + ([("what most see", VOLUME)] if rig.volume is not None else [])
+
+
+def _outside_view(rig: Rig, up: NDArray[np.float64]) -> Camera:
+    """Return a camera that sees all cameras, from a little above."""
+    points = [camera.position for camera in rig.cameras.values()]
+    points += [corner for camera in rig.cameras.values() for corner in frustum_corners(camera, rig.depth)]
+    points += [] if rig.volume is None else list(rig.volume)
+    return Camera.frame_points(
+        np.array(points), azimuth=25.0, elevation=24.0, width=690, height=490, vertical_fov=28.0, margin=1.03
+    )
+
+
+def _draw_rig(axes: Any, rig: Rig, view: Camera) -> None:
+    """Draw frustums in perspective, far ones first and paler."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    axes.set_xlim(0, view.width)
+    axes.set_ylim(view.height, 0)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    depths = {name: float(view.project(camera.position[None])[0, 2]) for name, camera in rig.cameras.items()}
+    near, far = min(depths.values()), max(depths.values())
+    positions, colors = rig.points
+    if len(positions):
+        x, y, _ = view.project(positions).T
+        axes.scatter(x, y, s=1.2, c=colors, linewidths=0, zorder=2, rasterized=True)
+    if rig.volume is not None:
+        corners = view.project(rig.volume)[:, :2]
+        edges = [corners[list(edge)] for edge in BOX_EDGES]
+        axes.add_collection(LineCollection(edges, colors=VOLUME, linewidths=1.2, zorder=3))
+        origin, size = rig.volume[0], float((rig.volume[7] - rig.volume[0]).min()) * 0.35
+        for axis, (name, color) in enumerate((("x", "#C51B1B"), ("y", "#2E7D32"), ("z", "#1A4FB4"))):
+            tip = origin + size * np.eye(3)[axis]
+            (x0, y0, _), (x1, y1, _) = view.project(np.array([origin, tip]))
+            axes.annotate("", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "-|>", "color": color, "lw": 1.6}, zorder=4)
+            x2, y2, _ = view.project((origin + 1.18 * (tip - origin))[None])[0]
+            axes.text(x2, y2, name, size=9, color=color, ha="center", va="center", weight="bold", zorder=4)
+    labels = rig.labels()
+    for order, name in enumerate(sorted(depths, key=lambda name: -depths[name])):
+        camera, color = rig.cameras[name], COLORS[rig.kinds[name]]
+        weight = 1.0 - 0.6 * (depths[name] - near) / max(far - near, 1e-12)
+        corners = view.project(np.concatenate([frustum_corners(camera, rig.depth), camera.position[None]]))[:, :2]
+        face = PolyCollection([corners[:4]], facecolors=color, edgecolors=color, alpha=None, linewidths=1.1)
+        face.set_facecolor((*_rgb(color), 0.10 + 0.12 * weight))
+        face.set_edgecolor((*_rgb(color), weight))
+        face.set_zorder(5 + order)
+        axes.add_collection(face)
+        sides = [np.array([corners[4], corner]) for corner in corners[:4]]
+        axes.add_collection(LineCollection(sides, colors=[(*_rgb(color), weight)], linewidths=0.8, zorder=5 + order))
+        style = {"color": color, "alpha": 0.5 + 0.5 * weight, "path_effects": halo, "zorder": 99}
+        axes.text(*corners[4], labels[name], size=7, ha="center", va="bottom", **style)
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    return tuple(int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))  # type: ignore[return-value]
+
+
+def _draw_plan(axes: Any, rig: Rig) -> None:
+    """Draw the rig from above: z towards the eye."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    positions, colors = rig.points
+    if len(positions):
+        axes.scatter(positions[:, 0], positions[:, 1], s=0.8, c=colors, linewidths=0)
+    if rig.volume is not None:
+        low, high = rig.volume[0], rig.volume[7]
+        axes.add_patch(Rectangle(low[:2], *(high - low)[:2], fill=True, fc=(*_rgb(VOLUME), 0.12), ec=VOLUME, lw=1.2))
+    labels = rig.labels()
+    for name, camera in rig.cameras.items():
+        color = COLORS[rig.kinds[name]]
+        corners = frustum_corners(camera, rig.depth)
+        outline = np.concatenate([camera.position[None], corners])[:, :2]
+        axes.add_patch(Polygon(_hull(outline), closed=True, fc=(*_rgb(color), 0.15), ec=color, lw=0.9))
+        away = camera.position[:2] - corners.mean(axis=0)[:2]
+        length = float(np.linalg.norm(away))
+        shift = away / length * 0.45 * rig.depth if length > 0.2 * rig.depth else np.array([0.0, 0.45 * rig.depth])
+        axes.text(*(camera.position[:2] + shift), labels[name], size=6.5, color=color, ha="center", va="center")
+    corners = [frustum_corners(camera, 1.6 * rig.depth) for camera in rig.cameras.values()]
+    every = np.concatenate([*corners, [camera.position for camera in rig.cameras.values()]])
+    if rig.volume is not None:
+        every = np.concatenate([every, rig.volume])
+    middle = 0.5 * (every.max(axis=0) + every.min(axis=0))[:2]
+    reach = 0.54 * float((every.max(axis=0) - every.min(axis=0))[:2].max()) + 0.3 * rig.depth
+    axes.set_xlim(middle[0] - reach, middle[0] + reach)
+    axes.set_ylim(middle[1] - reach, middle[1] + reach)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=8, colors=GREY, length=3)
+    axes.set_xlabel("x [m]", size=9, color=GREY)
+    axes.set_ylabel("y [m]", size=9, color=GREY, labelpad=1)
+    axes.set_title("from above", size=10, color=GREY, loc="left", pad=4)
+    for side in axes.spines.values():
+        side.set_color("#BBBBBB")
+    axes.grid(color="#EEEEEE", lw=0.8)
+    axes.set_axisbelow(True)
+
+
+def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners of the convex hull of a few points ``(N, 2)``, in order (Andrew's monotone chain)."""
+    order = sorted(map(tuple, points.tolist()))
+
+    def chain(row: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        found: list[tuple[float, ...]] = []
+        for p in row:
+            while len(found) > 1 and (
+                (found[-1][0] - found[-2][0]) * (p[1] - found[-2][1])
+                <= (found[-1][1] - found[-2][1]) * (p[0] - found[-2][0])
+            ):
+                found.pop()
+            found.append(p)
+        return found[:-1]
+
+    return np.array(chain(order) + chain(reversed(order)))
+
+
+def _draw_glimpse(axes: Any, glimpse: Glimpse, kind: str) -> None:
+    """Draw an image with the outline of its mask, under its name and exposure."""
+    pixels = display_pixels(glimpse)
+    height, width = pixels.shape[:2]
+    axes.imshow(pixels, interpolation="bilinear", extent=(0, width, height, 0))
+    if glimpse.alpha is not None and glimpse.alpha.min() < 0.5 < glimpse.alpha.max():
+        axes.contour(
+            np.arange(width) + 0.5, np.arange(height) + 0.5, glimpse.alpha, levels=[0.5], colors=OUTLINE, linewidths=0.7
+        )
+    axes.set_xlim(0, width)
+    axes.set_ylim(height, 0)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_color(COLORS[kind])
+        side.set_linewidth(1.0 if kind != "left out" else 2.5)
+    name = glimpse.record.camera_name
+    axes.set_title(name if len(name) <= 18 else "…" + name[-17:], size=7, color=COLORS[kind], loc="left", pad=2)
+    if glimpse.exposure is not None:
+        axes.set_title(f"{glimpse.exposure:+.1f} EV", size=7, color=GREY, loc="right", pad=2)

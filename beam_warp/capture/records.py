@@ -1,0 +1,293 @@
+"""One image of a capture, and what the files of a capture hold together; loaders make them, `captures` gives them out.
+
+Images are read when they are asked for and never kept: a capture of any length costs the memory of its records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.capture.lenses import Lens
+from beam_warp.capture.undistort import COLORS, Intrinsics, Undistortion
+from beam_warp.capture.views import CapturedView
+from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
+from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.image.files import Image, read_image
+from beam_warp.world.camera import Camera
+
+MAX_RECORDS = 2**22
+"""Most images of one capture."""
+
+ALPHA_ROUNDING = 2.0**-10
+"""Alpha this far outside [0, 1] is the rounding of a half float, two of which are added by a renderer's filter."""
+
+COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
+"""What ``color_space`` may say of image files, for all records or one; without it each format's custom holds."""
+
+IMAGE_FOLDER = "images"
+MASK_FOLDER = "masks"
+"""Where a capture names no masks, ``images/a/0.jpg`` has ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """Points on the scene's surfaces, as structure from motion finds them.
+
+    Attributes:
+        positions: World positions [m], ``(P, 3)`` float64.
+        colors: Scene-linear Rec.709, ``(P, 3)`` float32; None where the file has none.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureRecord:
+    """One image of a capture.
+
+    Attributes:
+        camera_name: Which camera took it; fit for a file name.
+        frame: Which frame of the performance it shows, from 0.
+        time: When it was taken [s].
+        split: What it is for: ``train``, ``test``, ….
+        camera: The pinhole that `image` was taken by.
+        image_path: The image file, as photographed.
+        mask_path: An image file, as photographed, that is white where the subject is; None if there is none.
+        color_space: Of the image file, `assets.LINEAR_REC709` or `DISPLAY_SRGB`; None for the custom of its format.
+        truth_path: An EXR of exact channels, where the capture is synthetic.
+        relit_paths: By name of the light, the exact image under it.
+        undistortion: What straightens the files, all of them, as they are read; None where a pinhole took them.
+    """
+
+    camera_name: str
+    frame: int
+    time: float
+    split: str
+    camera: Camera
+    image_path: Path
+    mask_path: Path | None = None
+    color_space: str | None = None
+    truth_path: Path | None = None
+    relit_paths: Mapping[str, Path] = field(default_factory=dict)
+    undistortion: Undistortion | None = None
+
+    @property
+    def name(self) -> str:
+        """``CAMERA_FRAME``, which names the record's files and no other's."""
+        return f"{self.camera_name}_{self.frame:04d}"
+
+    @property
+    def is_distorted(self) -> bool:
+        """True if the file must be undistorted before a pinhole fits it, as `image` does."""
+        return self.undistortion is not None
+
+    def mask(self) -> NDArray[np.bool_]:
+        """Return which pixels of `image` were photographed, ``(H, W)``: all unless `Capture.read` keeps more."""
+        if self.undistortion is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=bool)
+        return self.undistortion.mask()
+
+    def image(self) -> Image:
+        """Read the image, undistorted.
+
+        Raises:
+            MissingFileError: It is not there.
+            AssetFormatError: It is damaged, or its size is not the camera's.
+        """
+        return self._undistorted(self._photograph())
+
+    def view(self) -> CapturedView:
+        """Read what reconstruction sees: scene-linear colour, undistorted, and the coverage of the subject.
+
+        Coverage is the image's alpha; a mask file multiplies it, or stands for it where the image has none. The mask
+        is applied to the photograph before that is undistorted, so that edges of both are filtered alike. Without
+        either, coverage is not known: alpha is None. Nothing is kept: each call reads the files again.
+
+        Raises:
+            MissingFileError: The image or the mask that the capture names is not there.
+            AssetFormatError: One is damaged, not of the camera's size, or holds values that no image has.
+        """
+        image = self._photograph()
+        if self.mask_path is not None:
+            image = _masked(image, self._sized(read_image(self.mask_path), "mask"))
+        image = self._undistorted(image)
+        rgba = image.linear_rgba()
+        alpha = None if image.alpha is None else rgba[..., 3]
+        if alpha is not None:
+            if not ((alpha >= -ALPHA_ROUNDING) & (alpha <= 1.0 + ALPHA_ROUNDING)).all():
+                raise AssetFormatError(
+                    f"alpha must lie in [0, 1], got {np.nanmin(alpha):g} to {np.nanmax(alpha):g}"
+                    f"{' and NaN' if np.isnan(alpha).any() else ''} at {self.image_path}. Export the image again."
+                )
+            alpha = np.clip(alpha, 0.0, 1.0)
+        if not np.isfinite(rgba).all():
+            raise AssetFormatError(
+                f"image must be finite, got NaN or infinity in {int((~np.isfinite(rgba)).any(axis=-1).sum())} pixels "
+                f"at {self.image_path}. Export it again, or repair those pixels."
+            )
+        return CapturedView(name=self.name, camera=self.camera, color=rgba[..., :3], alpha=alpha)
+
+    def truth(self) -> Image:
+        """Read the exact channels, undistorted like the image.
+
+        Raises:
+            MissingFileError: The record has none, or the file is not there.
+            AssetFormatError: It is damaged, or its size is not the camera's.
+        """
+        if self.truth_path is None:
+            raise MissingFileError(f"truth must be given for {self.name}, got none. Choose a record that has it.")
+        return self._undistorted(self._sized(read_image(self.truth_path), "image"))
+
+    def relit(self, light: str) -> Image:
+        """Read the exact image under another light, undistorted like the image.
+
+        Raises:
+            MissingFileError: The record has none of that name, or the file is not there.
+            AssetFormatError: It is damaged, or its size is not the camera's.
+        """
+        if light not in self.relit_paths:
+            raise MissingFileError(
+                f"light must be one that {self.name} is known under ({', '.join(self.relit_paths) or 'none'}), got "
+                f"{light!r}. Choose one of them."
+            )
+        return self._undistorted(self._sized(read_image(self.relit_paths[light]), "image"))
+
+    def _photograph(self) -> Image:
+        return self._sized(read_image(self.image_path, color_space=self.color_space), "image")
+
+    def _sized(self, image: Image, what: str) -> Image:
+        if (image.width, image.height) != (self.camera.width, self.camera.height):
+            raise AssetFormatError(
+                f"{what} must be {self.camera.width} x {self.camera.height} as the capture says, "
+                f"got {image.width} x {image.height} at {image.path}. Correct the size there, or the {what}."
+            )
+        return image
+
+    def _undistorted(self, image: Image) -> Image:
+        return image if self.undistortion is None else self.undistortion.image(image)
+
+
+def _masked(image: Image, mask: Image) -> Image:
+    """Return an image whose alpha is multiplied by a mask's brightness, as the file has it: coverage has no curve."""
+    rgb = mask.rgb()
+    coverage = rgb[..., 0] if (rgb == rgb[..., :1]).all() else rgb.mean(axis=-1, dtype=np.float32)
+    channels = dict(image.channels)
+    if image.premultiplied:
+        if image.color_space == DISPLAY_SRGB:
+            raise AssetFormatError(
+                f"image must be scene-linear or have straight alpha to be masked, got sRGB premultiplied at "
+                f"{image.path}. State its colour space, or convert it."
+            )
+        channels.update((name, channels[name] * coverage) for name in COLORS if name in channels)
+    channels["A"] = coverage if image.alpha is None else image.alpha * coverage
+    return replace(image, channels=channels)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureContents:
+    """Images of a scene from many places and times, as a loader found them.
+
+    Attributes:
+        folder: Where it is.
+        records: One for each image, in file order.
+        frames_per_second: Rate of the performance [1/s]; None if the file does not say.
+        environment_path: The light of the capture as a lat-long image; None if there is none.
+        read_points: Reads its sparse points; None if it has none.
+        notes: What had to be assumed or was left out, each a sentence.
+    """
+
+    folder: Path
+    records: tuple[CaptureRecord, ...]
+    frames_per_second: float | None = None
+    environment_path: Path | None = None
+    read_points: Callable[[], SparsePoints] | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frames there are images of, ascending."""
+        return tuple(sorted({record.frame for record in self.records}))
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits there are, ascending."""
+        return tuple(sorted({record.split for record in self.records}))
+
+    def select(self, *, split: str | None = None, frames: Collection[int] | None = None) -> tuple[CaptureRecord, ...]:
+        """Return the records of a split, of some frames, or of both, in file order."""
+        return tuple(
+            record
+            for record in self.records
+            if (split is None or record.split == split) and (frames is None or record.frame in frames)
+        )
+
+    def points(self) -> SparsePoints | None:
+        """Read the sparse points of the scene; None if the capture has none.
+
+        Raises:
+            MissingFileError: The file that it names is not there.
+            AssetFormatError: It is damaged.
+        """
+        return None if self.read_points is None else self.read_points()
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """How a lens bent what the photographs of a camera show.
+
+    Attributes:
+        intrinsics: Those that go with the lens.
+        lens: What bent them.
+        model: The file's name of the lens, for messages.
+        where: The file's place that says so, for messages.
+    """
+
+    intrinsics: Intrinsics
+    lens: Lens
+    model: str
+    where: str
+
+    def undistort(self, pose: ArrayLike, pose_name: str, keep: float) -> tuple[Camera, Undistortion | None]:
+        """Return the pinhole that stands for a photograph, and what straightens it: None where it is straight.
+
+        Args:
+            pose: Camera to world in `Camera`'s axes, ``(4, 4)``.
+            pose_name: What the file calls it, for messages.
+            keep: See `captures.Capture.read`.
+
+        Raises:
+            AssetFormatError: The lens cannot be inverted, or the pose is not rigid; the message names the place.
+        """
+        try:
+            undistortion = Undistortion.fit(self.lens, self.intrinsics, keep)
+        except BeamError as error:
+            raise AssetFormatError(f"{self.model} has no pinhole at {self.where}: {error}") from error
+        try:
+            camera = undistortion.camera(pose)
+        except BeamError as error:
+            raise AssetFormatError(f"{pose_name} is no camera pose at {self.where}: {error}") from error
+        return camera, None if self.lens.is_straight else undistortion
+
+
+def camera_name_of(file_path: str) -> str:
+    """Name a camera after its image, where a capture does not: folders and stem, joined."""
+    image = PurePosixPath(file_path.replace("\\", "/"))
+    return "_".join([*(part for part in image.parts[:-1] if part not in ("/", "..")), image.stem])
+
+
+def mask_beside(root: Path, file_path: str) -> Path | None:
+    """Return the mask that lies in a capture's folder of masks where the image lies in that of images, if it does."""
+    image = PurePosixPath(file_path.replace("\\", "/"))
+    parts = image.parts[1:] if image.parts[:1] == (IMAGE_FOLDER,) else image.parts
+    inner = PurePosixPath(*parts)
+    for name in (inner.with_suffix(".png"), inner.with_name(inner.name + ".png")):
+        path = root / MASK_FOLDER / name
+        if path.is_file():
+            return path
+    return None

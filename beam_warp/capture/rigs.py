@@ -1,0 +1,220 @@
+"""What cameras have in common: the place they look at, the volume that most of them see, and which way is up.
+
+All answers are robust: a minority of wrong cameras does not move them far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.checks import require_number
+from beam_warp.errors import InvalidOptionError
+from beam_warp.world.camera import Camera
+
+MIN_SPREAD = 1e-4
+"""Least eigenvalue of the mean of I - a a^T over unit axes a for them to meet: within 0.6 degrees they do not."""
+
+GRID = 32
+"""Points along each side of the grid on which the common volume is found, twice: the second within the first's box."""
+
+MAX_CAMERAS = 64
+"""Most cameras that are asked what they see; of more, evenly many are."""
+
+LEAST_SHARE = 1.0 / 3.0
+"""Where no point is seen by this share of the cameras, they have no volume in common."""
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def meeting_point(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the point of least summed distance to the optical axes, ``(3,)``; None where these are nearly parallel.
+
+    Found by least squares with weights of one over the distance, so that stray cameras count little.
+
+    Args:
+        poses: Camera to world in `Camera`'s axes, ``(N, 4, 4)``.
+    """
+    positions, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    if len(poses) < 2 or not np.linalg.eigvalsh(across.mean(axis=0))[0] > MIN_SPREAD:
+        return None
+    weights = np.ones(len(poses))
+    scale = float(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).max())
+    point = np.zeros(3)
+    for _ in range(50):
+        normal = np.einsum("n,nij->ij", weights, across)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, positions))
+        distance = np.linalg.norm(np.einsum("nij,nj->ni", across, point - positions), axis=1)
+        weights = 1.0 / np.maximum(distance, 1e-3 * scale + 1e-300)
+        weights /= weights.max()
+    return point
+
+
+def up_direction(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """Return the mean of the cameras' upward directions, ``(3,)``: of length 1 where all agree, 0 where none do."""
+    return np.mean([-camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
+
+
+def seen_by(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which points ``(N, 3)`` are in a camera's image."""
+    x, y, depth = camera.project(points).T
+    return (depth > 0.0) & (x >= 0.0) & (x <= camera.width) & (y >= 0.0) & (y <= camera.height)
+
+
+def frustum_corners(camera: Camera, depth: float) -> NDArray[np.float64]:
+    """Return the world positions of an image's corners at a depth [m]: from the top left one, clockwise, ``(4, 3)``."""
+    x = (np.array([0.0, camera.width, camera.width, 0.0]) - camera.center_x) / camera.focal_x
+    y = (np.array([0.0, 0.0, camera.height, camera.height]) - camera.center_y) / camera.focal_y
+    local = depth * np.stack([x, y, np.ones(4)], axis=-1)
+    return local @ camera.camera_to_world[:3, :3].T + camera.position
+
+
+def frustum_volume(
+    cameras: Sequence[Camera], *, share: float = 0.75
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the box that holds what most cameras see.
+
+    Looked for up to twice as far as from the cameras to the place they look at; of cameras that are nearly parallel,
+    up to four times as far as they are apart.
+
+    Args:
+        cameras: At least two.
+        share: Of the cameras that must see a point; where none is seen by so many, 0.8 of the most that see any.
+
+    Returns:
+        The lower and upper corner [m], ``(3,)`` each.
+
+    Raises:
+        InvalidOptionError: There are fewer than two cameras, no point is seen by two and by `LEAST_SHARE` of them, or
+            ``share`` is out of range.
+    """
+    require_number("share", share, 0.0, 1.0)
+    if len(cameras) < 2:
+        raise InvalidOptionError(
+            f"cameras must be at least 2 to have a volume in common, got {len(cameras)}. Add some."
+        )
+    step = -(-len(cameras) // MAX_CAMERAS)
+    asked = list(cameras)[::step] if step > 1 else list(cameras)
+    center, reach = _region(asked)
+    low, high = center - reach, center + reach
+    needed: int | None = None
+    for _ in range(2):
+        points, cell = _grid(low, high)
+        counts = np.sum([seen_by(camera, points) for camera in asked], axis=0)
+        most = int(counts.max())
+        if needed is None:
+            if most < max(2, int(np.ceil(LEAST_SHARE * len(asked)))):
+                raise InvalidOptionError(
+                    f"cameras must have a volume in common, got no point that more than {most} of {len(asked)} see. "
+                    "Check the poses: their axes, their units, and that they are camera-to-world."
+                )
+            needed = max(2, min(int(np.ceil(share * len(asked))), int(np.ceil(0.8 * most))))
+        inside = points[counts >= needed]
+        if not len(inside):
+            break
+        low, high = inside.min(axis=0) - cell, inside.max(axis=0) + cell
+    return low, high
+
+
+def _grid(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres of `GRID` cells a side, ``(GRID^3, 3)``, and half a cell."""
+    cell = (high - low) / GRID
+    index = np.stack(np.meshgrid(*(np.arange(GRID) + 0.5,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return low + index * cell, 0.5 * cell
+
+
+def _region(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
+    """Return where to look for what cameras have in common: a centre, and how far from it."""
+    poses = np.array([camera.camera_to_world for camera in cameras])
+    positions = poses[:, :3, 3]
+    point = meeting_point(poses)
+    if point is not None:
+        reach = float(np.median(np.linalg.norm(positions - point, axis=1)))
+        if reach > 0.0:
+            return point, reach
+    middle = np.median(positions, axis=0)
+    extent = 2.0 * float(np.linalg.norm(positions - middle, axis=1).max())
+    reach = 2.0 * (extent if extent > 0.0 else 1.0)
+    return middle + reach * poses[:, :3, 2].mean(axis=0), reach
+
+
+def facing_share(cameras: Sequence[Camera], poses: NDArray[np.float64] | None = None) -> float | None:
+    """Return the share of cameras that have the place where their axes meet in front of them and in the image.
+
+    Args:
+        cameras: Whose sides and focal lengths count.
+        poses: Others to judge them by than their own, ``(N, 4, 4)``.
+
+    Returns:
+        From 0 to 1; None where the axes are nearly parallel.
+    """
+    own = np.array([camera.camera_to_world for camera in cameras]) if poses is None else poses
+    point = meeting_point(own)
+    if point is None:
+        return None
+    facing = 0
+    for camera, pose in zip(cameras, own, strict=True):
+        x, y, z = (point - pose[:3, 3]) @ pose[:3, :3]
+        if z > 1e-6 * (1e-300 + float(np.linalg.norm(pose[:3, 3]))):
+            column, row = camera.focal_x * x / z + camera.center_x, camera.focal_y * y / z + camera.center_y
+            facing += 0.0 <= column <= camera.width and 0.0 <= row <= camera.height
+    return facing / len(cameras)
+
+
+NO_UP, ONE_UP = 0.3, 0.7
+"""Length of the mean upward direction below which cameras have no up in common, and above which they do."""
+
+UP_MARGIN = 0.2
+"""Mistakes whose cameras agree on up, and on z as up, within this are not told apart."""
+
+POSE_MISTAKES = {
+    "OpenCV poses were given as OpenGL's, or the other way round: negate the second and third column": lambda q: (
+        q @ _FLIP
+    ),
+    "world-to-camera poses in OpenCV axes were given: invert them, and negate the second and third column": lambda q: (
+        np.linalg.inv(q @ _FLIP)
+    ),
+    "world-to-camera poses in OpenGL axes were given: invert them": lambda q: np.linalg.inv(q @ _FLIP) @ _FLIP,
+    "world-to-camera poses were given: invert them": np.linalg.inv,
+}
+"""How poses go wrong that were written as nerfstudio's, and what undoes it from what was then read."""
+
+
+def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: float = 0.8) -> tuple[str, ...]:
+    """Return which mistakes in writing the poses, if undone, make the cameras look at a common place.
+
+    Poses are doubted whose cameras do not face one, or do with no up in common where those of a mistake undone have
+    one: the inverses of poses around a subject look at a common place too, rolled in all ways.
+
+    Args:
+        cameras: At least three, or nothing can be said.
+        doubt: Cameras of which this share or more face a common place are right as they are.
+        trust: Share that must face one once the mistake is undone.
+
+    Returns:
+        The likeliest first, by how far the cameras agree on up; others follow if they agree nearly as well. Empty if
+        the poses are not doubted, or no mistake is known that explains them.
+    """
+    if len(cameras) < 3:
+        return ()
+    poses = np.array([camera.camera_to_world for camera in cameras])
+    share = facing_share(cameras)
+    if share is None:
+        return ()
+    undone = {name: undo(poses) for name, undo in POSE_MISTAKES.items()}
+    agreed = {name: _up_length(q) for name, q in undone.items() if (facing_share(cameras, q) or 0.0) >= trust}
+    if share >= doubt:
+        if _up_length(poses) >= NO_UP:
+            return ()
+        agreed = {name: length for name, length in agreed.items() if length >= ONE_UP}
+    # Turning the world changes nothing that cameras tell of each other: of such twins, the one with z up is meant.
+    likely = {name: length - 0.5 * float(undone[name][:, 2, 1].mean()) for name, length in agreed.items()}
+    best = max(likely.values(), default=0.0)
+    return tuple(sorted((name for name in likely if likely[name] >= best - UP_MARGIN), key=lambda name: -likely[name]))
+
+
+def _up_length(poses: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(poses[:, :3, 1].mean(axis=0)))

@@ -1,0 +1,90 @@
+"""What one camera saw at one moment, as every step of reconstruction reads it: scene-linear colour and coverage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.checks import require_array, require_count, require_finite, require_range
+from beam_warp.errors import InvalidArrayError
+from beam_warp.world.camera import Camera
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CapturedView:
+    """An image, its camera and its coverage.
+
+    Attributes:
+        name: Names the view in messages and files.
+        camera: The pinhole that took it.
+        color: Scene-linear Rec.709, premultiplied by ``alpha`` where there is one, ``(H, W, 3)`` float32.
+        alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None where it is not known.
+
+    Raises:
+        InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
+    """
+
+    name: str
+    camera: Camera
+    color: NDArray[np.float32]
+    alpha: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        """Check sizes and values once."""
+        size = (self.camera.height, self.camera.width)
+        color = require_array("color", self.color, (*size, 3))
+        require_finite("color", color)
+        object.__setattr__(self, "color", color)
+        if self.alpha is not None:
+            alpha = require_array("alpha", self.alpha, size)
+            require_range("alpha", alpha, 0.0, 1.0)
+            object.__setattr__(self, "alpha", alpha)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> CapturedView:
+        """Return a part of the view, with the camera that sees just that.
+
+        Raises:
+            InvalidArrayError: The part reaches out of the image.
+        """
+        if not (0 <= left < left + width <= self.camera.width and 0 <= top < top + height <= self.camera.height):
+            raise InvalidArrayError(
+                f"crop must lie in {self.camera.width} x {self.camera.height} pixels, got {width} x {height} at "
+                f"{left}, {top}. Cut it down."
+            )
+        part = (slice(top, top + height), slice(left, left + width))
+        return replace(
+            self,
+            camera=self.camera.cropped(left, top, width, height),
+            color=np.ascontiguousarray(self.color[part]),
+            alpha=None if self.alpha is None else np.ascontiguousarray(self.alpha[part]),
+        )
+
+    def reduced(self, factor: int) -> CapturedView:
+        """Return the view at a whole fraction of its resolution, each pixel the mean of ``factor`` x ``factor``.
+
+        Rows and columns beyond the last whole pixel are left out.
+
+        Raises:
+            InvalidArrayError: Nothing would be left.
+        """
+        require_count("factor", factor)
+        width, height = self.camera.width // factor, self.camera.height // factor
+        if not (width and height):
+            raise InvalidArrayError(
+                f"factor must leave a pixel of {self.camera.width} x {self.camera.height}, got {factor}. "
+                "Choose a smaller one."
+            )
+
+        def mean(image: ArrayLike) -> NDArray[np.float32]:
+            whole = np.asarray(image)[: height * factor, : width * factor]
+            blocks = whole.reshape(height, factor, width, factor, *whole.shape[2:])
+            return blocks.mean(axis=(1, 3), dtype=np.float32)
+
+        return replace(
+            self,
+            camera=self.camera.reduced(factor),
+            color=mean(self.color),
+            alpha=None if self.alpha is None else mean(self.alpha),
+        )

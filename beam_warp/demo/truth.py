@@ -1,0 +1,119 @@
+"""What views of the demo figure should show, by path tracing, and how near a decomposition comes to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.image.files import display_image
+from beam_warp.image.metrics import SOLID_ALPHA, Score, compare, least_squares_scale, mean_scores
+from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.raster.gbuffer import GBuffer, rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.render.sheet import display_exposure
+from beam_warp.render.split_sum import relight
+from beam_warp.trace.mesh_paths import TracedChannels, TracedMesh, trace_channels, trace_radiance
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+
+CHANNEL_SAMPLES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a view should show: channels, coverage, and radiance by light."""
+
+    camera: Camera
+    alpha: NDArray[np.float32]
+    channels: TracedChannels
+    radiance: Mapping[str, NDArray[np.float32]]
+
+    @classmethod
+    def of(cls, traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap], paths: int) -> Truth:
+        """Path trace a view under every light, at least one, with so many paths a pixel."""
+        images = {name: trace_radiance(traced, camera, light, sample_count=paths) for name, light in lights.items()}
+        channels = trace_channels(traced, camera, sample_count=CHANNEL_SAMPLES, visibility_count=CHANNEL_SAMPLES)
+        alpha = next(iter(images.values())).alpha
+        return cls(camera, alpha, channels, {name: image.rgb for name, image in images.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Relit:
+    """What the Gaussians show in a view: channels and coverage, and radiance by light."""
+
+    buffer: GBuffer
+    radiance: Mapping[str, NDArray[np.float32]]
+
+
+def relit_views(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    lightings: Mapping[str, EnvironmentLighting],
+    *,
+    raster: RasterOptions,
+    device: str | None = None,
+) -> list[Relit]:
+    """Draw a relightable cloud for some cameras, and light what they see."""
+    buffers = rasterize(cloud, cameras, options=raster, device=device)
+    return [
+        Relit(buffer, {name: relight(buffer, lighting) for name, lighting in lightings.items()}) for buffer in buffers
+    ]
+
+
+def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, Any]:
+    """Return mean scores over views, unscaled, with the scale of base colour that would fit best beside them."""
+    scores: dict[str, list[Score]] = {}
+    scales, normals = [], []
+    for truth, view in zip(truths, views, strict=True):
+        found = view.buffer.channels
+        both: dict[str, Any] = {"alpha": view.buffer.alpha, "truth_alpha": truth.alpha}
+        for name, is_color in (("ambient_occlusion", False), ("base_color", True)):
+            scores.setdefault(name, []).append(
+                compare(found[name], getattr(truth.channels, name), is_color=is_color, premultiplied=False, **both)
+            )
+        for name, image in truth.radiance.items():
+            scores.setdefault(f"relit_{name}", []).append(
+                compare(view.radiance[name], image, is_color=True, premultiplied=True, **both)
+            )
+        solid = truth.alpha > SOLID_ALPHA
+        scales.append(least_squares_scale(found["base_color"], truth.channels.base_color, solid))
+        cosine = (found["normals"] * truth.channels.normals).sum(axis=-1)[solid]
+        normals.append(float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))))
+    return {
+        **mean_scores(scores),
+        "base_color_scale": np.mean(scales, axis=0).tolist(),
+        "normals_median_error_degrees": float(np.mean(normals)),
+    }
+
+
+def comparison(truth: Truth, view: Relit, lightings: Mapping[str, EnvironmentLighting]) -> NDArray[np.uint8]:
+    """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
+
+    def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:
+        return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
+
+    found, known = view.buffer.channels, truth.channels
+    pairs = [
+        ("ambient occlusion", gray(found["ambient_occlusion"]), gray(known.ambient_occlusion)),
+        ("base colour", display_image(found["base_color"]) / 255.0, display_image(known.base_color) / 255.0),
+    ]
+    for name, lighting in lightings.items():
+        stops = display_exposure(lighting)
+        ours = display_color(view.radiance[name], view.buffer.alpha, stops)
+        pairs.append((name, ours, display_color(truth.radiance[name], truth.alpha, stops)))
+    alphas = view.buffer.alpha[..., None], truth.alpha[..., None]
+    above: list[Panel] = [(f"{title}, ours", over_background(a, alphas[0])) for title, a, _ in pairs]
+    below: list[Panel] = [(f"{title}, truth", over_background(b, alphas[1])) for title, _, b in pairs]
+    return lay_out([*above, *below], len(pairs))
+
+
+def display_color(image: NDArray[np.floating], alpha: NDArray[np.floating], stops: float = 0.0) -> NDArray[np.floating]:
+    """Return premultiplied radiance as straight display colour in [0, 1]."""
+    straight = np.divide(image, alpha[..., None], out=np.zeros_like(image), where=alpha[..., None] > 0.0)
+    return display_image(straight, stops) / 255.0

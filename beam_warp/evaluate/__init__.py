@@ -1,0 +1,1 @@
+"""Scores of an asset against the exact channels of a capture."""

@@ -1,0 +1,94 @@
+"""What a camera sees of a relightable cloud, a pixel being the mean of several samples: what is scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.image.metrics import block_means
+from beam_warp.raster.gbuffer import MATERIAL_CHANNELS, RADIANCE, UNIT_CHANNELS, rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import seen_radiance
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+SAMPLES = 2
+"""Side of the square of samples of a pixel: truth is filtered by a box over the pixel, and so are the samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMaterials:
+    """One view of a cloud.
+
+    Attributes:
+        camera: The camera that sees it, of one sample a pixel.
+        alpha: Coverage in [0, 1], ``(H, W)``.
+        depth: Mean distance along the optical axis [m], ``(H, W)``.
+        channels: By name as in `GaussianCloud`, the mean over what the pixel sees, *not* multiplied by alpha,
+            ``(H, W)`` or ``(H, W, 3)``; ``normals`` are of unit length.
+        radiance: Captured colour, scene-linear and multiplied by alpha, ``(H, W, 3)``; None where it was not drawn.
+
+    All are float32; depth and channels are 0 where alpha is 0.
+    """
+
+    camera: Camera
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    channels: Mapping[str, NDArray[np.float32]]
+    radiance: NDArray[np.float32] | None
+
+    def layers(self) -> dict[str, NDArray[np.float32]]:
+        """Return the layers of an image file, named as in a capture's truth; R, G and B are the radiance, if any."""
+        layers = {"A": self.alpha, "depth": self.depth}
+        for name, array in self.channels.items():
+            prefix, parts = ("normal", "XYZ") if name == "normals" else (name, "RGB")
+            if array.ndim == 2:
+                layers[prefix] = array
+            else:
+                layers.update({f"{prefix}.{part}": array[..., i] for i, part in enumerate(parts)})
+        if self.radiance is not None:
+            layers.update({part: self.radiance[..., i] for i, part in enumerate("RGB")})
+        return layers
+
+
+def draw_materials(
+    cloud: GaussianCloud,
+    camera: Camera,
+    *,
+    channels: Sequence[str] = MATERIAL_CHANNELS,
+    radiance: bool = False,
+    raster: RasterOptions | None = None,
+    samples: int = SAMPLES,
+    device: str | None = None,
+) -> DrawnMaterials:
+    """Draw a cloud; see `beam_warp.raster.gbuffer.rasterize` for what it refuses.
+
+    Args:
+        cloud: Gaussians in the world's axes.
+        camera: From where.
+        channels: Which of the cloud's arrays.
+        radiance: Draw the captured colour too.
+        raster: How splats are drawn: as they were when the Gaussians were fitted.
+        samples: Side of the square of samples of a pixel.
+        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+    """
+    names = (*channels, *((RADIANCE,) if radiance else ()))
+    buffer = rasterize(cloud, camera.supersampled(samples), channels=names, options=raster, device=device)
+    alpha = block_means(buffer.alpha, samples)
+
+    def mean(layer: NDArray[np.float32], unit: bool = False) -> NDArray[np.float32]:
+        extra = (...,) + (None,) * (layer.ndim - 2)
+        sums = block_means(layer * buffer.alpha[extra], samples)
+        weight = np.linalg.norm(sums, axis=-1, keepdims=True) if unit else alpha[extra]
+        return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0.0)
+
+    return DrawnMaterials(
+        camera,
+        alpha,
+        mean(buffer.depth),
+        {name: mean(buffer.channels[name], name in UNIT_CHANNELS) for name in channels},
+        block_means(seen_radiance(buffer, cloud), samples).astype(np.float32) if radiance else None,
+    )

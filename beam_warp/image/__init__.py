@@ -1,0 +1,1 @@
+"""Pictures: files, colour, tone, film, panels, and how far two images differ."""

@@ -1,0 +1,37 @@
+"""Colour spaces by name, and the one home of the sRGB transfer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+DISPLAY_SRGB = "srgb_rec709_display"
+"""Colour space of what a usual 3DGS training leaves: display-referred sRGB, composited in gamma space."""
+
+LINEAR_REC709 = "lin_rec709_scene"
+"""Scene-linear Rec.709: the space of every material channel and of all lighting."""
+
+COLOR_SPACES = (DISPLAY_SRGB, LINEAR_REC709)
+
+
+def srgb_to_linear(srgb: ArrayLike) -> NDArray[Any]:
+    """Decode display sRGB to linear light (IEC 61966-2-1), any shape, odd about zero so that any value has an inverse.
+
+    The knee is 12.92 × 0.0031308, the image of `linear_to_srgb`'s, so that each is the exact inverse of the other.
+    """
+    value = np.asarray(srgb)
+    value = value if value.dtype.kind == "f" else value.astype(np.float64)
+    size = np.abs(value)
+    low = size <= 12.92 * 0.0031308
+    return np.copysign(np.where(low, size / 12.92, ((size + 0.055) / 1.055) ** 2.4), value)
+
+
+def linear_to_srgb(linear: ArrayLike) -> NDArray[Any]:
+    """Encode linear light as display sRGB (IEC 61966-2-1), any shape, odd about zero; values above 1 stay above 1."""
+    value = np.asarray(linear)
+    value = value if value.dtype.kind == "f" else value.astype(np.float64)
+    size = np.abs(value)
+    low = size <= 0.0031308
+    return np.copysign(np.where(low, size * 12.92, 1.055 * np.maximum(size, 0.0031308) ** (1 / 2.4) - 0.055), value)

@@ -1,0 +1,384 @@
+"""Image files and the one home of the sRGB transfer: OpenEXR, Radiance HDR, PNG and JPEG.
+
+A file's values are never re-interpreted in silence: an `Image` says whether it is scene-linear or display-referred and
+whether its colour is multiplied by alpha. OpenEXR and Pillow are imported where a file is read or written: whoever
+only encodes a colour, such as a PLY converter, does not wait for them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.checks import require_array, require_choice, require_finite, require_number
+from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError, OutputError
+from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
+from beam_warp.image.hdr import read_radiance_hdr
+
+MAX_SIDE = 32_768
+"""Largest width or height read or written [px]."""
+
+MAX_PIXELS = 512 * 2**20
+"""Largest number of pixels read; checked in the header, before anything is allocated."""
+
+MAX_CHANNELS = 64
+"""Most channels read from one EXR."""
+
+SUFFIXES = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
+"""Files that are read, by the end of their lower-case names."""
+
+HALF_MAX = 65504.0
+"""Largest finite half-precision value."""
+
+
+def display_image(linear_rgb: ArrayLike, exposure_stops: float = 0.0) -> NDArray[np.uint8]:
+    """Turn linear radiance into 8-bit sRGB: exposure, clip to [0, 1], sRGB, round to nearest; no tone curve.
+
+    View transforms are in `beam_warp.image.tone`; what comes out of them is encoded here.
+
+    Args:
+        linear_rgb: Linear Rec.709, ``(H, W, 3)``, finite.
+        exposure_stops: Gain in powers of two.
+
+    Raises:
+        InvalidArrayError: The shape is another, or a value is not finite.
+    """
+    linear = require_array("linear_rgb", linear_rgb, (None, None, 3))
+    require_finite("linear_rgb", linear)
+    gain = 2.0 ** require_number("exposure_stops", exposure_stops, -64, 64)
+    with np.errstate(over="ignore"):  # what is brighter than float32 is white
+        exposed = linear * gain
+    return np.rint(linear_to_srgb(np.clip(exposed, 0.0, 1.0)) * 255.0).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """The channels of one image file.
+
+    Attributes:
+        path: Where it came from; named in errors.
+        channels: Name → ``(H, W)`` array: float32, or uint32 for integer channels of an EXR. Colour is R, G, B (or
+            Y alone), opacity is A in [0, 1]. PNG and JPEG values are scaled to [0, 1].
+        color_space: `LINEAR_REC709` or `DISPLAY_SRGB`, for the colour channels.
+        premultiplied: True if the colour is multiplied by A.
+    """
+
+    path: Path
+    channels: Mapping[str, NDArray[Any]]
+    color_space: str
+    premultiplied: bool
+
+    @property
+    def height(self) -> int:
+        """Number of rows."""
+        return next(iter(self.channels.values())).shape[0]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return next(iter(self.channels.values())).shape[1]
+
+    @property
+    def alpha(self) -> NDArray[np.float32] | None:
+        """Opacity ``(H, W)``, or None where the file has none."""
+        return self.channels.get("A")
+
+    def stack(self, *names: str) -> NDArray[Any]:
+        """Return the named channels as ``(H, W, len(names))``.
+
+        Raises:
+            AssetFormatError: The file lacks one of them.
+        """
+        missing = [name for name in names if name not in self.channels]
+        if missing:
+            raise AssetFormatError(
+                f"image must have the channels {', '.join(names)}, got {', '.join(self.channels)} in {self.path}. "
+                "Write the missing ones or name others."
+            )
+        return np.stack([self.channels[name] for name in names], axis=-1)
+
+    def rgb(self) -> NDArray[np.float32]:
+        """Return the colour as the file has it, ``(H, W, 3)``; a grey image gives its Y three times."""
+        return self.stack(*("YYY" if "Y" in self.channels and "R" not in self.channels else "RGB"))
+
+    def linear_rgba(self) -> NDArray[np.float32]:
+        """Return scene-linear Rec.709 with alpha premultiplied, ``(H, W, 4)``; alpha is 1 where the file has none."""
+        rgb = self.rgb()
+        alpha = np.ones(rgb.shape[:2], np.float32) if self.alpha is None else self.alpha
+        weight = np.float32(1.0) if self.premultiplied else alpha[..., None]
+        if self.color_space == DISPLAY_SRGB:
+            if self.premultiplied and self.alpha is not None:  # the curve applies to the colour, not to its product
+                rgb = np.divide(rgb, alpha[..., None], out=np.zeros_like(rgb), where=alpha[..., None] > 0)
+                weight = alpha[..., None]
+            rgb = srgb_to_linear(rgb)
+        return np.concatenate([rgb * weight, alpha[..., None]], axis=-1)
+
+
+SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
+"""Formats whose values are not cut at white, unless their colour space says otherwise."""
+
+
+def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) -> Image:
+    """Read an .exr, .hdr, .png, .jpg or .jpeg file.
+
+    Args:
+        path: The file.
+        color_space: State it if the file departs from the custom of its format: EXR and HDR scene-linear with
+            premultiplied alpha, PNG and JPEG display sRGB with straight alpha.
+
+    Returns:
+        Its channels. An EXR's data window is laid into its display window: zeros outside, overscan cut off.
+
+    Raises:
+        MissingFileError: There is no such file, or it cannot be read.
+        AssetFormatError: It is damaged, larger than `MAX_SIDE`, `MAX_PIXELS` or `MAX_CHANNELS`, or of a kind
+            (deep, multi-part, subsampled, CMYK, ...) that is not read. NaN and infinity in an EXR are kept.
+    """
+    path = Path(path)
+    if color_space is not None:
+        require_choice("color_space", color_space, COLOR_SPACES)
+    suffix = path.suffix.lower()
+    _require_file(path)
+    if suffix == ".exr":
+        return Image(path, _read_exr(path), color_space or LINEAR_REC709, premultiplied=True)
+    if suffix == ".hdr":
+        rgb = read_radiance_hdr(path, max_side=MAX_SIDE, max_pixels=MAX_PIXELS)
+        channels = {name: rgb[..., index] for index, name in enumerate("RGB")}
+        return Image(path, channels, color_space or LINEAR_REC709, premultiplied=True)
+    return Image(path, _read_pillow(path), color_space or DISPLAY_SRGB, premultiplied=False)
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return the width and height of an image file; pixels are decoded of an .hdr only.
+
+    Raises:
+        MissingFileError: There is no such file, or it cannot be read.
+        AssetFormatError: It is not an image that `read_image` reads, as far as its header tells.
+    """
+    path = Path(path)
+    _require_file(path)
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        image = read_image(path)
+        return image.width, image.height
+    if suffix == ".exr":
+        import OpenEXR
+
+        try:
+            first, end = _window(path, OpenEXR.File(str(path), header_only=True).header(), "displayWindow")
+        except AssetFormatError:
+            raise
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise _damaged(path, error) from error
+        width, height = (end - first).tolist()
+        return width, height
+    from PIL import Image as PillowImage
+
+    try:
+        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
+            _require_size(path, *picture.size)
+            return picture.size
+    except AssetFormatError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, PillowImage.DecompressionBombError) as error:
+        raise _damaged(path, error) from error
+
+
+def _require_file(path: Path) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        raise AssetFormatError(
+            f"image must be an .exr, .hdr, .png, .jpg or .jpeg file, got {path}. Convert it to one of them."
+        )
+    if not path.is_file():
+        raise MissingFileError(f"image must be a readable file, got {path} (no such file). Check the path.")
+
+
+def _require_size(path: Path, width: int, height: int) -> None:
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise AssetFormatError(
+            f"image must have sides in [1, {MAX_SIDE}] px and at most {MAX_PIXELS} px, got {width} x {height} "
+            f"in {path}. Resize it."
+        )
+
+
+def _damaged(path: Path, error: object) -> AssetFormatError:
+    reason = " ".join(str(error).split())
+    return AssetFormatError(
+        f"image must be an intact {path.suffix[1:].upper()} file, got a damaged one at {path} ({reason}). "
+        "Copy or export it again."
+    )
+
+
+def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return (first, last + 1) of an EXR window as (x, y), after checking its size."""
+    first, last = (np.asarray(corner, np.int64) for corner in header[name])
+    _require_size(path, *(last - first + 1).tolist())
+    return first, last + 1
+
+
+def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
+    import OpenEXR
+
+    try:
+        lead = OpenEXR.File(str(path), header_only=True)
+        header = lead.header()
+        described = header["channels"]
+        if len(lead.parts) != 1 or header.get("type") not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+            raise AssetFormatError(
+                f"image must be a flat EXR of one part, got {len(lead.parts)} parts of type {header.get('type')} "
+                f"in {path}. Export each part as its own flat file."
+            )
+        if not (0 < len(described) <= MAX_CHANNELS) or any((c.xSampling, c.ySampling) != (1, 1) for c in described):
+            raise AssetFormatError(
+                f"image must have 1 to {MAX_CHANNELS} channels without subsampling, got {len(described)} channels "
+                f"in {path}. Export fewer, or not as luminance-chroma."
+            )
+        data_first, data_end = _window(path, header, "dataWindow")
+        first, end = _window(path, header, "displayWindow")
+        stored = OpenEXR.File(str(path), separate_channels=True).channels()
+        pixels = {name: channel.pixels for name, channel in stored.items()}
+        if any(array.shape != tuple(data_end - data_first)[::-1] for array in pixels.values()):
+            raise ValueError("a channel is incomplete")
+    except AssetFormatError:
+        raise
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError) as error:
+        raise _damaged(path, error) from error
+    low, high = np.maximum(data_first, first), np.minimum(data_end, end)
+    into = tuple(slice(*pair) for pair in zip((low - first)[::-1], (high - first)[::-1], strict=True))
+    part = tuple(slice(*pair) for pair in zip((low - data_first)[::-1], (high - data_first)[::-1], strict=True))
+    channels = {}
+    for name, array in pixels.items():
+        kind = np.uint32 if array.dtype.kind == "u" else np.float32
+        if (data_first == first).all() and (data_end == end).all():
+            channels[name] = array.astype(kind)
+            continue
+        channels[name] = np.zeros(tuple(end - first)[::-1], kind)
+        if (high > low).all():
+            channels[name][into] = array[part]
+    return channels
+
+
+_PILLOW_CHANNELS = {"L": ("Y",), "LA": ("Y", "A"), "RGB": ("R", "G", "B"), "RGBA": ("R", "G", "B", "A")}
+
+
+def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
+    from PIL import Image as PillowImage
+
+    try:
+        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
+            _require_size(path, *picture.size)
+            coding = str(picture.tile[0][3] if picture.tile else "")
+            if picture.mode == "P":
+                picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
+            if picture.mode in ("I;16", "I"):
+                return {"Y": np.asarray(picture).astype(np.float32) / np.float32(65535)}
+            names = _PILLOW_CHANNELS.get(picture.mode)
+            if names is None or coding == "LA;16B":
+                raise AssetFormatError(
+                    f"image must be grey, RGB or RGBA, of 8 or 16 bits (grey with alpha: 8), got mode {picture.mode} "
+                    f"in {path}. Convert it."
+                )
+            values = np.asarray(picture)
+        full = 255
+        if coding.endswith(";16B"):  # Pillow keeps the high bytes only: decode the low ones as a second picture
+            with PillowImage.open(path, formats=("PNG",)) as picture:
+                codec, extents, offset, _ = picture.tile[0]
+                picture.tile = [(codec, extents, offset, f"{picture.mode};16L")]
+                values, full = values * np.uint16(256) + np.asarray(picture), 65535
+    except AssetFormatError:
+        raise
+    except PillowImage.DecompressionBombError as error:
+        raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise _damaged(path, error) from error
+    values = values.reshape(*values.shape[:2], -1)
+    return {name: values[..., index].astype(np.float32) / np.float32(full) for index, name in enumerate(names)}
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary name beside ``path`` that takes its place on success and vanishes on failure."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except BeamError:  # says already what is wrong
+        raise
+    except (OSError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise OutputError(
+            f"output must be a writable file, got {path} ({reason}). Choose a folder that exists and has room."
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *, half: bool = False) -> None:
+    """Write an EXR of named channels, ZIP-compressed, in one step: readers see the old file or the whole new one.
+
+    Args:
+        path: The file, replaced if it exists.
+        channels: Name → ``(H, W)`` array of one common shape, linear; colour premultiplied by A by custom.
+        half: Store 16-bit floats, |x| ≤ 65504, instead of 32-bit ones.
+
+    Raises:
+        InvalidArrayError: No channels, shapes that differ, or a value too large for a half.
+        OutputError: The file cannot be written.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not channels:
+        raise InvalidArrayError("channels must hold at least one channel, got none. Pass name → (H, W) arrays.")
+    arrays = {name: require_array(name, value, (None, None)) for name, value in channels.items()}
+    shape = next(iter(arrays.values())).shape
+    for name, array in arrays.items():
+        if array.shape != shape or array.size == 0:
+            raise InvalidArrayError(
+                f"{name} must have the shape of the first channel {shape}, not empty, got {array.shape}. Resample it."
+            )
+        if half and (np.abs(array) > HALF_MAX).any():
+            raise InvalidArrayError(
+                f"{name} must be at most {HALF_MAX:g} in size as half floats, got {np.nanmax(np.abs(array)):g}. "
+                "Write 32-bit floats."
+            )
+    kind = np.float16 if half else np.float32
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    file = OpenEXR.File(header, {name: array.astype(kind) for name, array in arrays.items()})
+    with replacing(path) as temporary:
+        file.write(str(temporary))
+
+
+def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
+    """Write 8-bit display sRGB as PNG, in one step. For linear values see `display_image`.
+
+    Args:
+        path: The file, replaced if it exists.
+        pixels: ``(H, W)``, ``(H, W, 3)`` or ``(H, W, 4)`` uint8, alpha straight.
+
+    Raises:
+        InvalidArrayError: Another type or shape.
+        OutputError: The file cannot be written.
+    """
+    from PIL import Image as PillowImage
+
+    path = Path(path)
+    array = np.asarray(pixels)
+    if (
+        array.dtype != np.uint8
+        or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4)))
+        or not array.size
+    ):
+        raise InvalidArrayError(
+            f"pixels must be uint8 of shape (H, W), (H, W, 3) or (H, W, 4), got {array.dtype} {array.shape}. "
+            "Encode linear values with display_image."
+        )
+    with replacing(path) as temporary:
+        PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG")

@@ -1,0 +1,58 @@
+"""What a run says about itself: counts over frames, versions, warnings, and the file they are written to."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from beam_warp._version import __version__
+from beam_warp.errors import OutputError
+from beam_warp.kernels.common.launching import thread_count
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {
+        "beam-warp": __version__,
+        "warp": wp.__version__,
+        "numpy": np.__version__,
+        "usd-core": version("usd-core"),
+        "python": platform.python_version(),
+    }
+
+
+def device_facts(device: Any) -> dict[str, Any]:
+    """Return what a Warp device is, JSON-able."""
+    return {
+        "name": device.name,
+        "kind": "cuda" if device.is_cuda else "cpu",
+        "threads": None if device.is_cuda else thread_count(),
+    }
+
+
+def write_report(out: Path, report: Mapping[str, Any]) -> None:
+    """Write ``out/report.json`` whole or not at all."""
+    write_json(out / "report.json", report)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written; nothing is left behind.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error

@@ -1,0 +1,1 @@
+"""Environments and lights made ready on a device: sampling, prefiltering, regions and the GGX lobe."""

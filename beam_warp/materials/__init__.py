@@ -1,0 +1,1 @@
+"""Decomposition: base colour, roughness, ambient occlusion and normals from images under known light."""

@@ -1,0 +1,219 @@
+"""From evidence to base colour: solve the least-squares problem, say how sure it is, flag and fill what it leaves out.
+
+Nothing is divided by a small number: what was hardly lit or never seen is flagged and filled from neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from beam_warp.materials.direct import ColorEvidence
+from beam_warp.world.gaussians import GaussianCloud, Observability
+
+UNLIT_PART = 0.01
+"""A Gaussian is unlit below this part of the environment's mean unshadowed irradiance."""
+
+SATURATED_PART = 0.5
+"""Part of what was seen that was cut at a ceiling from which on a Gaussian counts as saturated."""
+
+FACING_PART = 0.02
+"""Part of what was seen that must not have been seen grazing."""
+
+UNCERTAIN_NORMAL = 0.2
+"""Confidence below which a normal counts as uncertain: fog has a median of 0.1, closed surfaces are above 0.5."""
+
+FILL_NEIGHBORS = 8
+
+PAIRED = 512
+PAIR_GROUPS = 64
+"""Gaussians whose pairs say how values differ with distance, and groups of as many pairs each by distance."""
+
+POOLED_VIEWS = 1.0
+"""Views of a typical Gaussian that count beside a Gaussian's own when it is asked how far views disagree: one view
+alone cannot tell, and two agree by chance."""
+
+SPECULAR_PART = 0.05
+"""What an open dielectric reflects specularly over what a white diffuser would send: an error of the light is one of
+the highlight that is subtracted too, so that black is not known better than this part of it."""
+
+UNKNOWN = (0.5, 12.0**-0.5)
+"""Base colour of which nothing is known, and its standard error: any in [0, 1] is as likely."""
+
+MISSING = Observability.UNLIT | Observability.UNSEEN
+"""What base colour cannot be measured of."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseColor:
+    """Solved base colour.
+
+    Attributes:
+        base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
+        standard_error: ``(N, 3)`` float32.
+        observability: `Observability` flags, ``(N,)`` uint8.
+        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
+    """
+
+    base_color: NDArray[np.float32]
+    standard_error: NDArray[np.float32]
+    observability: NDArray[np.uint8]
+    clipped_part: float
+
+
+def solve_base_color(
+    cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float, *, dispersion: float = 1.0
+) -> BaseColor:
+    """Solve the least-squares problem that the frames add up to.
+
+    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
+    badly one rho explains all views and frames, and the error of the light: its noise and that of the normal it
+    falls on, averaged over frames. Where nothing at all was measured, all are `UNKNOWN`.
+
+    Args:
+        cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
+        evidence: Of one frame, or the sum over frames of the same Gaussians.
+        mean_irradiance: The environment's mean unshadowed irradiance [W/m^2].
+        dispersion: By how much variances are larger than evidence states, as frames have shown; see
+            `beam_warp.materials.changes`.
+
+    Source: weighted linear least squares; BEAM Eq. 4 solved for the base colour.
+    """
+    flags = observability(cloud, evidence, mean_irradiance)
+    missing = ((flags & np.uint8(MISSING)) != 0) | ~_has_evidence(evidence)
+    raw, error = least_squares(evidence)
+    base_color, error = np.clip(raw, 0.0, 1.0), error * np.sqrt(dispersion)
+    weight = np.where(missing, 0.0, cloud.opacities)
+    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
+    base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)
+    if missing.all():
+        base_color, error = (np.full_like(base_color, value) for value in UNKNOWN)
+    flags[missing] |= np.uint8(Observability.FILLED)
+    return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
+
+
+def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the unbounded solution and its standard error, ``(N, 3)`` each; 0 where there is no evidence.
+
+    With v views of variance t^2 each, the variance of their mean is t^2 / v. What one Gaussian's views say of t^2 is
+    joined with what is typical (the median over Gaussians), which counts for `POOLED_VIEWS` more views: an empirical
+    Bayes estimate, as Smyth 2004 moderates variances of few samples.
+    """
+    numerator, denominator, observed = (
+        np.asarray(array, dtype=np.float64) for array in (evidence.numerator, evidence.denominator, evidence.observed)
+    )
+    known = denominator > 0.0
+    safe = np.where(known, denominator, 1.0)
+    raw = np.where(known, numerator / safe, 0.0)
+    bounded = np.clip(raw, 0.0, 1.0)
+    residual = np.maximum(observed - 2.0 * bounded * numerator + bounded**2 * denominator, 0.0)
+    views = np.asarray(evidence.views, np.float64)[:, None]
+    degrees = np.maximum(views - 1.0, 0.0)
+    scatter = residual / safe * views  # squared residuals of views, in base colour
+    told = known.all(axis=1) & (degrees[:, 0] >= 1.0)
+    # the median of a chi-squared variable over its mean, Wilson and Hilferty 1931
+    middle = degrees[told] * (1.0 - 2.0 / (9.0 * degrees[told])) ** 3
+    typical = np.median(scatter[told] / middle, axis=0) if told.any() else np.zeros(3)
+    variance = (scatter + POOLED_VIEWS * typical) / (degrees + POOLED_VIEWS) / np.maximum(views, 1.0)
+    noise = np.asarray(evidence.noise, np.float64) / measured_frames(evidence) ** 2
+    # rho = L_o / (E d) - s / d for light E times shares d and s: an error of E moves it by (rho + s / d) / E
+    light = (bounded + SPECULAR_PART) ** 2 * noise[:, None]
+    return raw, np.where(known, np.sqrt(variance + light), 0.0)
+
+
+def measured_frames(evidence: ColorEvidence) -> NDArray[np.float64]:
+    """Return in how many frames each Gaussian was measured, at least 1, ``(N,)``: the others add nothing to sums."""
+    return np.maximum(evidence.frames - np.asarray(evidence.unseen, np.float64), 1.0)
+
+
+def observability(cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float) -> NDArray[np.uint8]:
+    """Return why Gaussians are less than measured: `Observability` flags, ``(N,)``.
+
+    Unlit is what was measured and found dark; of what no view shows, or shows in no pixel that counts, that is not
+    known.
+    """
+    assert cloud.normal_confidence is not None
+    measured = measured_frames(evidence)
+    irradiance = np.asarray(evidence.irradiance).mean(axis=1) / measured
+    hidden = ~(np.asarray(evidence.unseen) < evidence.frames)
+    saturated = np.asarray(evidence.saturated) / evidence.frames > SATURATED_PART
+    unlit = ~hidden & ~(irradiance > UNLIT_PART * mean_irradiance)
+    # What was cut, or seen at grazing angles alone, is without evidence for that reason.
+    grazing = ~hidden & ~saturated & ~(np.asarray(evidence.facing) / measured > FACING_PART)
+    unseen = hidden | (~unlit & ~saturated & ~grazing & ~_has_evidence(evidence))
+    flags = np.zeros(len(irradiance), np.uint8)
+    for mask, flag in (
+        (unlit, Observability.UNLIT),
+        (unseen, Observability.UNSEEN),
+        (saturated, Observability.SATURATED),
+        (~(cloud.normal_confidence > UNCERTAIN_NORMAL), Observability.UNCERTAIN_NORMAL),
+        (grazing, Observability.GRAZING),
+    ):
+        flags[mask] |= np.uint8(flag)
+    return flags
+
+
+def _has_evidence(evidence: ColorEvidence) -> NDArray[np.bool_]:
+    """Return which Gaussians have any view that base colour follows from, in every channel."""
+    return np.all(np.asarray(evidence.denominator) > 0.0, axis=1)
+
+
+def fill_from_neighbors(
+    positions: NDArray[np.float32],
+    values: NDArray[Any],
+    errors: NDArray[Any],
+    missing: NDArray[np.bool_],
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Give what was not observed the mean of its nearest observed neighbours.
+
+    Its error is their spread, or how much values differ at its distance from them if that is more, and their own error
+    beside it.
+
+    Args:
+        positions: Centres [m], ``(N, 3)``.
+        values: ``(N, C)``.
+        errors: ``(N, C)``.
+        missing: Which rows are to be filled, ``(N,)``.
+    """
+    known = np.flatnonzero(~missing)
+    if not missing.any() or len(known) == 0:
+        return values, errors
+    k = min(FILL_NEIGHBORS, len(known))
+    distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
+    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+    weight = 1.0 / np.maximum(distance, 1e-9)
+    weight /= weight.sum(axis=1, keepdims=True)
+    near = values[known[index]]
+    mean = np.einsum("nk,nkc->nc", weight, near)
+    filled, spread = values.copy(), errors.copy()
+    filled[missing] = mean
+    around = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2))
+    away = _difference_at(distance[:, 0], positions[known], values[known])
+    spread[missing] = np.maximum(around, away) + errors[known].mean(axis=0)
+    return filled, spread
+
+
+def _difference_at(distance: NDArray[Any], positions: NDArray[np.float32], values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return by how much values that far from each other differ, root mean square, ``(M, C)``.
+
+    The larger of what pairs of that distance and of any smaller one show; nearer than the nearest pairs, nothing.
+
+    Source: the structure function (variogram) of geostatistics, Matheron 1963.
+    """
+    rows = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), PAIRED)).astype(np.int64))
+    one, two = np.triu_indices(len(rows), 1)
+    if not len(one):
+        return np.zeros((len(distance), values.shape[1]))
+    place, value = positions[rows].astype(np.float64), values[rows].astype(np.float64)
+    apart = np.linalg.norm(place[one] - place[two], axis=1)
+    order = np.argsort(apart, kind="stable")
+    groups = np.array_split(order, min(PAIR_GROUPS, len(order)))
+    at = np.array([apart[group].mean() for group in groups])
+    differ = np.array([np.sqrt(((value[one[group]] - value[two[group]]) ** 2).mean(axis=0)) for group in groups])
+    differ = np.maximum.accumulate(differ, axis=0)
+    at, differ = np.append(0.0, at), np.vstack([np.zeros(values.shape[1]), differ])
+    return np.stack([np.interp(distance, at, differ[:, channel]) for channel in range(values.shape[1])], axis=1)

@@ -1,0 +1,144 @@
+"""Whether base colour changes over time: one colour for all frames unless the data says otherwise.
+
+Frame f of a Gaussian has the colour rho_f with the standard error s_f. If it is the same in every frame,
+Q = sum over f of (rho_f - mean)^2 / s_f^2 follows a chi-squared distribution of one degree less than frames. Errors of
+normals and of occlusion make Q larger than that: the bulk of the Gaussians tells by how much, and only what stands
+out from it counts. Where colour does change, each frame's is drawn towards the mean as far as its error asks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from beam_warp.materials.base_color import BaseColor, least_squares
+from beam_warp.materials.direct import ColorEvidence
+
+FALSE_DISCOVERIES = 1e-3
+"""Part of the Gaussians said to change that may not."""
+
+LEAST_ERROR = 1e-3
+"""Standard errors below it are those of rounding and of the model, not of the data."""
+
+LEAST_CHANGE = 0.04
+"""Standard deviation over time below which a change, however certain, is not worth a colour for every frame."""
+
+REFERENCE_QUANTILE = 0.9
+"""Errors are taken to be as much larger than stated as this quantile over Gaussians is: model errors are heavy-tailed,
+and the middle does not show it. It holds as long as fewer than a tenth of the Gaussians change."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColorChange:
+    """Which Gaussians change colour, and what their frames are drawn towards.
+
+    Attributes:
+        changing: ``(N,)`` bool.
+        mean: Weighted mean over frames, ``(N, 3)``.
+        variance: Of the true colour over frames, ``(N, 3)``: the scatter less what errors explain.
+        dispersion: By how much variances are larger than stated, on the bulk of the Gaussians; at least 1.
+    """
+
+    changing: NDArray[np.bool_]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    dispersion: float
+
+    @property
+    def changing_part(self) -> float:
+        """Part of the Gaussians that change."""
+        return float(self.changing.mean()) if len(self.changing) else 0.0
+
+    def frame_color(self, evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the colour of one frame of every Gaussian and its standard error, ``(N, 3)`` each.
+
+        Where nothing was seen in the frame, it is the mean.
+        """
+        color, variance, known = _frame(evidence)
+        variance = variance * self.dispersion
+        gain = np.where(known, self.variance / np.maximum(self.variance + variance, 1e-30), 0.0)
+        return self.mean + gain * (color - self.mean), np.sqrt((1.0 - gain) * self.variance)
+
+
+class ChangeTest:
+    """Adds up frames of the same Gaussians, one after the other; memory does not grow with their number."""
+
+    def __init__(self) -> None:
+        """Start without frames."""
+        self._frames: NDArray[Any] | float = 0.0
+        self._weights: NDArray[Any] | float = 0.0
+        self._sums: NDArray[Any] | float = 0.0
+        self._squares: NDArray[Any] | float = 0.0
+
+    def add(self, evidence: ColorEvidence) -> None:
+        """Count the evidence of one frame."""
+        color, variance, known = _frame(evidence)
+        weight = np.where(known, 1.0 / variance, 0.0)
+        self._frames = self._frames + known
+        self._weights = self._weights + weight
+        self._sums = self._sums + weight * color
+        self._squares = self._squares + weight * color**2
+
+    def result(self) -> ColorChange:
+        """Test every Gaussian; false discoveries are bounded over all of them (Benjamini and Hochberg 1995)."""
+        frames, weights = np.asarray(self._frames), np.asarray(self._weights)
+        mean = np.divide(self._sums, weights, out=np.zeros_like(weights), where=weights > 0.0)
+        q = np.maximum(np.asarray(self._squares) - mean * np.asarray(self._sums), 0.0)
+        degrees = np.maximum(frames - 1.0, 0.0)
+        total, freedom = q.sum(axis=1), degrees.sum(axis=1)
+        tested = freedom > 0.0
+        dispersion = 1.0
+        if tested.any():
+            excess = total[tested] / stats.chi2.ppf(REFERENCE_QUANTILE, freedom[tested])
+            dispersion = max(float(np.quantile(excess, REFERENCE_QUANTILE)), 1.0)
+        variance = np.zeros_like(mean)
+        np.divide(
+            np.maximum(q - degrees * dispersion, 0.0),
+            weights * np.maximum(degrees, 1.0) / np.maximum(frames, 1.0),
+            out=variance,
+            where=(weights > 0.0) & (degrees > 0.0),
+        )
+        chance = np.ones(len(total))
+        chance[tested] = stats.chi2.sf(total[tested] / dispersion, freedom[tested])
+        large = np.sqrt(variance.mean(axis=1)) >= LEAST_CHANGE
+        changing = _discoveries(chance, tested) & large
+        return ColorChange(changing, mean, np.where(changing[:, None], variance, 0.0), dispersion)
+
+
+def with_changes(constant: BaseColor, change: ColorChange, evidence: ColorEvidence) -> BaseColor:
+    """Return the base colour of one frame: the constant one, but for Gaussians that change.
+
+    Args:
+        constant: Solved over all frames.
+        change: What the frames' evidence says of changes.
+        evidence: Of the frame.
+    """
+    if not change.changing.any():
+        return constant
+    rows = change.changing[:, None]
+    color, error = change.frame_color(evidence)
+    return replace(
+        constant,
+        base_color=np.where(rows, np.clip(color, 0.0, 1.0), constant.base_color).astype(np.float32),
+        standard_error=np.where(rows, error, constant.standard_error).astype(np.float32),
+    )
+
+
+def _frame(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return a frame's colour, its variance, and where there is any."""
+    raw, error = least_squares(evidence)
+    known = (np.asarray(evidence.denominator) > 0.0).all(axis=1) & (np.asarray(evidence.unseen) == 0.0)
+    return np.clip(raw, 0.0, 1.0), np.maximum(error, LEAST_ERROR) ** 2, np.broadcast_to(known[:, None], raw.shape)
+
+
+def _discoveries(chance: NDArray[np.float64], tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which hypotheses are rejected when `FALSE_DISCOVERIES` of the rejected may be true."""
+    rows = np.flatnonzero(tested)
+    ordered = np.sort(chance[rows])
+    passing = np.flatnonzero(ordered <= FALSE_DISCOVERIES * np.arange(1, len(rows) + 1) / max(len(rows), 1))
+    limit = ordered[passing[-1]] if len(passing) else -1.0
+    return tested & (chance <= limit)

@@ -1,0 +1,490 @@
+"""What the light of a capture says of each Gaussian in one frame: how open it is, and evidence on its base colour.
+
+The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
+What views show comes from their images (`beam_warp.materials.evidence`), or, of Gaussians without images, from their
+own captured radiance around the normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.checks import require_choice, require_count
+from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.kernels.light.product_sampling import launch_accumulate_block_weights
+from beam_warp.kernels.materials.residues import (
+    ALBEDO_SCALING,
+    FRESNEL_HV,
+    ColorFit,
+    LightRays,
+    Observations,
+    PointLight,
+    Surface,
+    launch_fit_color,
+    launch_gather_light,
+    launch_sample_radiance,
+    launch_trace_bounce,
+    launch_view_residues,
+)
+from beam_warp.kernels.trace.incident_light import PRODUCT, launch_draw_light, launch_sum_unshadowed
+from beam_warp.kernels.trace.surface_rays import RayBatch
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.trace.incident import DENSITIES, Density, techniques
+from beam_warp.trace.occlusion import Progress, ambient_occlusion
+from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
+from beam_warp.trace.sampling import SAMPLERS, Sampler
+from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import EXACT, trace_rays
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
+
+BOUNCE_PART = 4
+"""The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
+
+VIEW_COUNT = 8
+SMALLEST_VIEW_COSINE = 0.2
+"""Where there are no images: views below this n.v count for nothing, there the normal and the lobe's edge dominate."""
+
+BURIED_VISIBILITY = 0.02
+"""Below this visibility no view shows the Gaussian: its captured colour was never constrained."""
+
+SATURATION = 0.995
+"""Captured display colour above which the sensor's or the training's ceiling may have cut it."""
+
+DiffuseWeight = Literal["albedo_scaling", "fresnel_hv"]
+
+DIFFUSE_WEIGHTS: dict[str, int] = {"albedo_scaling": int(ALBEDO_SCALING), "fresnel_hv": int(FRESNEL_HV)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOptions:
+    """How materials are measured.
+
+    Attributes:
+        sample_count: Rays per Gaussian and frame for visibility, and as many for light; a power of two is best.
+        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.trace.rays`.
+        bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
+        diffuse_weight: What the specular lobe leaves for diffusion: ``"albedo_scaling"`` 1 - E_s(n.v), which keeps
+            energy, or ``"fresnel_hv"`` 1 - F(h.v), the paper's.
+        sampler: Sample sets; see `beam_warp.irradiance`.
+        density: What light rays are drawn by; see there.
+        ratio: Whether rays only say which share of the unshadowed light arrives; see there.
+        robust: Count views little that disagree with the others.
+        seed: Same seed, same device, same bits.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    sample_count: int = 64
+    offset: float | Literal["auto"] = "auto"
+    bounce: bool = True
+    diffuse_weight: DiffuseWeight = "albedo_scaling"
+    sampler: Sampler = "owen"
+    density: Density = "product"
+    ratio: bool = True
+    robust: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_count("sample_count", self.sample_count, 4, 4096)
+        require_choice("diffuse_weight", self.diffuse_weight, tuple(DIFFUSE_WEIGHTS))
+        require_choice("sampler", self.sampler, SAMPLERS)
+        require_choice("density", self.density, DENSITIES)
+        require_count("seed", self.seed, 0, 2**32 - 1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ColorEvidence:
+    """What frames say about base colour; evidence on the same Gaussians adds up.
+
+    Attributes:
+        numerator: Sum of w L_D (L_o - L_S), ``(N, 3)``.
+        denominator: Sum of w L_D^2, ``(N, 3)``.
+        observed: Sum of w (L_o - L_S)^2, ``(N, 3)``.
+        irradiance: Sum over frames of the irradiance that arrives from the environment, ``(N, 3)``.
+        openness: Sum over frames of the hemispherical visibility, ``(N,)``.
+        noise: Sum over frames of the squared relative standard error of the arriving light, ``(N,)``.
+        views: How many equally good views the weights are worth, ``(N,)``.
+        facing: Sum over frames of the part of what was seen that was not seen grazing, ``(N,)``.
+        saturated: Sum over frames of the part of what was seen that was cut at a ceiling, ``(N,)``.
+        unseen: Sum over frames of 1 where no view shows the Gaussian, ``(N,)``.
+        frames: Number of frames.
+    """
+
+    numerator: NDArray[Any]
+    denominator: NDArray[Any]
+    observed: NDArray[Any]
+    irradiance: NDArray[Any]
+    openness: NDArray[Any]
+    noise: NDArray[Any]
+    views: NDArray[Any]
+    facing: NDArray[Any]
+    saturated: NDArray[Any]
+    unseen: NDArray[Any]
+    frames: int = 1
+
+    ARRAYS: ClassVar[tuple[str, ...]] = (
+        "numerator",
+        "denominator",
+        "observed",
+        "irradiance",
+        "openness",
+        "noise",
+        "views",
+        "facing",
+        "saturated",
+        "unseen",
+    )
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], frames: int = 1) -> ColorEvidence:
+        """Collect arrays by name."""
+        return cls(**{name: arrays[name] for name in cls.ARRAYS}, frames=frames)  # type: ignore[arg-type]
+
+    def __add__(self, other: ColorEvidence) -> ColorEvidence:
+        """Join evidence, in float64."""
+        sums = {
+            name: np.add(getattr(self, name), getattr(other, name), dtype=np.float64) for name in ColorEvidence.ARRAYS
+        }
+        return ColorEvidence.from_arrays(sums, self.frames + other.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialMeasurement:
+    """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour."""
+
+    ambient_occlusion: NDArray[np.float32]
+    ambient_occlusion_error: NDArray[np.float32]
+    evidence: ColorEvidence
+
+
+@dataclass(frozen=True, eq=False)
+class LitBatch:
+    """Some points, the rays that were traced from them, and their rows among those that are measured."""
+
+    batch: RayBatch
+    rays: LightRays
+
+
+@dataclass(frozen=True, eq=False)
+class LitPoints:
+    """Points whose light is known; all arrays are on the device and by row.
+
+    Attributes:
+        light: The light at each point; filled batch by batch while `batches` are gone through.
+        surface: Their normals and roughness.
+        views: What views show of them.
+        rows: Which Gaussians they are, ``(M,)``.
+    """
+
+    light: PointLight
+    surface: Surface
+    views: Observations
+    rows: NDArray[np.int64]
+
+    def without_views(self) -> LitPoints:
+        """Return the same points, towards no view."""
+        none = Observations()
+        device = self.surface.normals.device
+        for name, variable in Observations.vars.items():
+            setattr(none, name, wp.empty((0, len(self.rows)), dtype=variable.type.dtype, device=device))
+        return LitPoints(self.light, self.surface, none, self.rows)
+
+
+def without_report(done: int, total: int) -> None:
+    """Report to nobody."""
+
+
+def view_set() -> NDArray[np.float32]:
+    """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
+    index = np.arange(VIEW_COUNT) + 0.5
+    z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1).astype(np.float32)
+
+
+def measure_materials(
+    cloud: GaussianCloud,
+    scene: Scene,
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: MaterialLight,
+    *,
+    options: MaterialOptions,
+    views: ViewEvidence | None = None,
+    frame: int = 0,
+    rows: NDArray[np.integer[Any]] | None = None,
+    progress: Progress | None = None,
+) -> MaterialMeasurement:
+    """Trace one frame and accumulate its evidence on base colour.
+
+    Args:
+        cloud: Gaussians with captured radiance, axes "rfu".
+        scene: The same Gaussians, uploaded.
+        points: Where their light is gathered.
+        roughness: Their perceptual roughness, ``(N,)``.
+        light: The light of the capture, prepared on the scene's device.
+        options: Rays, offset, bounce, seed.
+        views: What views with images show; None takes the captured radiance around each normal.
+        frame: Number of the frame. Light rays differ from frame to frame, so that fits over frames average their
+            noise; occlusion rays do not, so that ambient occlusion does not flicker.
+        rows: Gaussians to measure; all of them if None.
+        progress: Called now and then with (Gaussians done, Gaussians in all).
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+
+    Source: BEAM Eqs. 3 to 6; the ratio estimator, Heitz et al. 2018.
+    """
+    _require_radiance(cloud)
+    device = scene.device
+    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
+    count = len(chosen)
+    shown = chosen[points.seen[chosen]]
+    at = upload(shown.astype(np.int32), int, device)
+    occlusion = ambient_occlusion(
+        scene,
+        points.positions[at].contiguous(),
+        points.normals[at].contiguous(),
+        sample_count=options.sample_count,
+        offset=points.offsets[at].contiguous(),
+        sampler=options.sampler,
+        seed=options.seed,
+        # Occlusion and light are about as much work, so each is half of the way.
+        progress=None if progress is None else lambda done, _: progress(done // 2, count),
+    )
+    visibility = occlusion.visibility.numpy()
+    # What is buried is filled from neighbours anyway: its light is not traced.
+    lit = shown[visibility > BURIED_VISIBILITY]
+
+    def report(done: int, total: int) -> None:
+        if progress is not None:
+            progress(count - (total - done) // 2, count)
+
+    measured = lit_points(cloud, points, roughness, light, lit, views)
+    bounced = mean_radiance(cloud, views) if options.bounce else None
+    for _ in light_batches(scene, points, light, measured, options, bounced, frame, report):
+        pass
+    fit = _empty(ColorFit, len(lit), device)
+    launch_fit_color(measured.views, measured.light, measured.surface, options.robust, fit, device)
+
+    def by_row(values: NDArray[Any], at_rows: NDArray[np.integer[Any]], otherwise: float = 0.0) -> NDArray[np.float32]:
+        """Spread what was measured over all rows that were asked for."""
+        whole = np.full((len(cloud), *values.shape[1:]), otherwise, np.float32)
+        whole[at_rows] = values
+        return whole[chosen]
+
+    tilt = measured.light.tilt.numpy() * points.normal_error[lit]
+    evidence = ColorEvidence(
+        numerator=by_row(fit.numerator.numpy(), lit),
+        denominator=by_row(fit.denominator.numpy(), lit),
+        observed=by_row(fit.observed.numpy(), lit),
+        irradiance=by_row(np.pi * measured.light.arriving.numpy(), lit),
+        openness=by_row(visibility, shown),
+        noise=by_row(measured.light.noise.numpy() ** 2 + tilt**2, lit),
+        views=by_row(fit.views.numpy(), lit),
+        facing=by_row(fit.facing.numpy(), lit),
+        saturated=(_cut_radiance(cloud) if views is None else views.saturated)[chosen],
+        unseen=by_row(np.zeros(len(lit)), lit, 1.0),
+    )
+    return MaterialMeasurement(
+        by_row(visibility, shown, 1.0), by_row(occlusion.standard_error.numpy(), shown, 1.0), evidence
+    )
+
+
+def lit_points(
+    cloud: GaussianCloud,
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: MaterialLight,
+    rows: NDArray[np.integer[Any]],
+    views: ViewEvidence | None,
+) -> LitPoints:
+    """Make room for the light of some Gaussians, and collect what views show of them.
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+    """
+    radiance = _require_radiance(cloud)
+    device, count = light.device, len(rows)
+    at = upload(np.asarray(rows, np.int32), int, device)
+    observed = Observations()
+    if views is None:
+        observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
+        observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
+        launch_sample_radiance(
+            upload(radiance, wp.vec3, device),
+            at,
+            int(cloud.radiance_color_space == DISPLAY_SRGB),
+            points.normals[at].contiguous(),
+            upload(view_set(), wp.vec3, device),
+            observed.colors,
+            observed.directions,
+            device,
+        )
+    else:
+        observed.colors = views.colors[:, at].contiguous()
+        observed.directions = views.directions[:, at].contiguous()
+    return make_points(points, roughness, light, rows, observed)
+
+
+def make_points(
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: MaterialLight,
+    rows: NDArray[np.integer[Any]],
+    views: Observations,
+) -> LitPoints:
+    """Make room for the light of some Gaussians and its residues towards views.
+
+    Args:
+        points: Of all Gaussians.
+        roughness: Of all Gaussians, ``(N,)``.
+        light: The light.
+        rows: Which Gaussians, ``(M,)``.
+        views: Colours and directions of views, ``(V, M)``; the residues are allocated here.
+    """
+    device = light.device
+    at = upload(np.asarray(rows, np.int32), int, device)
+    surface = Surface()
+    surface.normals = points.normals[at].contiguous()
+    surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
+    views.specular = wp.zeros(views.directions.shape, dtype=wp.vec3, device=device)
+    views.diffuse_share = wp.zeros(views.directions.shape, dtype=float, device=device)
+    arriving = _empty(PointLight, len(rows), device)
+    launch_sum_unshadowed(light.sampled.moments, surface.normals, arriving.unshadowed, device)
+    return LitPoints(arriving, surface, views, np.asarray(rows, np.int64))
+
+
+def light_batches(
+    scene: Scene,
+    points: SurfacePoints,
+    light: MaterialLight,
+    measured: LitPoints,
+    options: MaterialOptions,
+    hit_radiance: NDArray[np.float32] | None,
+    frame: int,
+    progress: Progress,
+) -> Iterator[LitBatch]:
+    """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
+
+    A batch's rays are gone when the next one is asked for.
+
+    Args:
+        scene: Occluders.
+        points: Of all Gaussians.
+        light: The light.
+        measured: Which points; its arrays are filled.
+        options: Rays and what they are drawn by.
+        hit_radiance: What rays that hit a Gaussian see of it, scene-linear, ``(N, 3)``: one bounce; None keeps the
+            bounce that ``measured`` holds.
+        frame: Number of the frame.
+        progress: Called with (points done, points in all).
+    """
+    device = scene.device
+    if not len(measured.rows):
+        return
+    at = upload(measured.rows.astype(np.int32), int, device)
+    bounced = None if hit_radiance is None else upload(hit_radiance, wp.vec3, device)
+    parts = techniques(options.density, options.sampler, options.sample_count)
+    is_product = parts[0].density == int(PRODUCT)
+    stream = (options.seed, frame)
+    done = 0
+    for batch in ray_batches(
+        scene,
+        points.positions[at].contiguous(),
+        measured.surface.normals,
+        points.offsets[at].contiguous(),
+        options.sample_count,
+        points_at_once=points_for_weights(device) if is_product else None,
+    ):
+        cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
+        if is_product:
+            launch_accumulate_block_weights(light.sampled.blocks, batch.normals, cumulative, device)
+        rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
+        found = LightRays()
+        found.directions = rays.directions
+        found.weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
+        found.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
+        found.paired = int(all(part.samples.columns > 0 for part in parts))
+        for part in parts:
+            launch_draw_light(part, light.sampled, cumulative, batch, stream, rays, found.weights, device)
+        trace_rays(scene, EXACT, rays, found.visibility)
+        if bounced is not None:
+            launch_trace_bounce(
+                scene,
+                EXACT.settings(scene),
+                batch,
+                bounced,
+                stream,
+                max(options.sample_count // BOUNCE_PART, 2),
+                measured.light.bounce,
+            )
+        launch_gather_light(batch, found, options.ratio, measured.light, device)
+        launch_view_residues(
+            batch,
+            found,
+            measured.light,
+            light.blurred.light,
+            measured.surface,
+            DIFFUSE_WEIGHTS[options.diffuse_weight],
+            measured.views,
+            device,
+        )
+        yield LitBatch(batch, found)
+        done += len(batch.rows)
+        progress(done, len(measured.rows))
+
+
+def _require_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
+    if cloud.radiance is None:
+        raise InvalidArrayError(
+            "radiance must be given to decompose materials, got None. Import Gaussians with captured colour."
+        )
+    return cloud.radiance
+
+
+def mean_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
+    """Return what a ray that hits a Gaussian sees, ``(N, 3)``: hits are taken as diffuse, so its mean colour.
+
+    Over the views that show it; the band of degree 0 is the mean over all directions, seen or not.
+    """
+    assert cloud.radiance is not None
+    mean = 0.5 + SH_C0 * cloud.radiance[:, 0]
+    if cloud.radiance_color_space == DISPLAY_SRGB:
+        mean = srgb_to_linear(np.clip(mean, 0.0, 1.0))
+    if views is not None and views.colors.shape[0]:
+        colors = views.colors.numpy()
+        weight = colors[..., 3].sum(axis=0)
+        shown = np.einsum("vn,vnc->nc", colors[..., 3], colors[..., :3])
+        mean = np.where((weight > 0.0)[:, None], shown / np.maximum(weight, 1e-12)[:, None], mean)
+    return np.asarray(np.maximum(mean, 0.0), np.float32)
+
+
+def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return 1 where captured display colour is at the top of its range."""
+    assert cloud.radiance is not None
+    if cloud.radiance_color_space != DISPLAY_SRGB:
+        return np.zeros(len(cloud), np.float32)  # scene-linear colour has no top
+    return np.asarray((0.5 + SH_C0 * cloud.radiance[:, 0] >= SATURATION).any(axis=1), np.float32)
+
+
+def _empty(structure: Any, count: int, device: Any) -> Any:
+    """Return an instance of a structure of arrays, all zeros."""
+    result = structure()
+    for name, variable in structure.vars.items():
+        setattr(result, name, wp.zeros(count, dtype=variable.type.dtype, device=device))
+    return result

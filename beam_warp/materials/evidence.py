@@ -1,0 +1,290 @@
+"""What views show of every Gaussian: the surface it belongs to, and its colour towards each camera.
+
+The rasteriser's blending weights say which pixels a Gaussian is part of, and how much. Spread back by them, the points
+that pixels see give each Gaussian its place on the surface as it is *seen*, which its own centre is not (a third of
+a fitted cloud lies behind the surface); and images give it colours.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.kernels.materials.view_evidence import (
+    PIXEL_CHANNELS,
+    CapturedPixels,
+    SurfacePixels,
+    launch_add_rows,
+    launch_finish_surface,
+    launch_observe,
+    launch_write_pixels,
+)
+from beam_warp.kernels.raster.bin_tiles import TILE
+from beam_warp.kernels.raster.project import View
+from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.raster.layout import ViewLayout
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+SURFACE_CHANNELS = 8
+"""Of a pixel's channels, those that are added up over views."""
+
+LEAST_WEIGHT = 0.5
+"""Pixels that all views together must show of a Gaussian, by its blending weights, for it to be seen."""
+
+LEAST_SHARE = 0.01
+"""Part of the pixels that it would cover without others before it that they must show: layers let something through,
+and with enough pixels that adds up."""
+
+LEAST_AGREEMENT = 1e-3
+"""Length of the mean of the normals below which it has no direction: both sides of a sheet are seen alike."""
+
+PIXELS_AT_ONCE = 2**21
+"""Most pixels drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
+
+CUTTING_THREADS = 8
+"""Images cut at a time."""
+
+RADII = 3.4
+"""Standard deviations up to which a Gaussian is drawn: beyond, alpha is below 1/255."""
+
+MARGIN = 4
+"""Pixels around the subject that stay: the pixel filter widens splats."""
+
+HEADROOM = 0.995
+"""Of what a display-referred image can hold: from there on a pixel counts as cut."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEvidence:
+    """What views show of every Gaussian; arrays are on the device.
+
+    Attributes:
+        positions: The point of the surface that it belongs to [m], ``(N,)`` vec3; its own centre where it is not seen.
+        normals: Unit normal of that surface, ``(N,)`` vec3; 0 where it is not seen.
+        agreement: Length of the mean of the normals that pixels see there, ``(N,)`` float: 1 on planes, less at edges.
+        weight: Pixels of all views together, by blending weights, ``(N,)`` float32 on the host.
+        seen: Which Gaussians any view shows, ``(N,)`` bool, host.
+        saturated: Part of its weight in pixels with an image that were cut at their ceiling, ``(N,)`` float32, host.
+        colors: Scene-linear radiance towards each camera and its weight [pixel], ``(V, N)`` vec4; of no views if there
+            were no images.
+        directions: Unit, towards each camera, ``(V, N)`` vec3.
+    """
+
+    positions: wp.array
+    normals: wp.array
+    agreement: wp.array
+    weight: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    saturated: NDArray[np.float32]
+    colors: wp.array
+    directions: wp.array
+
+
+def view_evidence(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    images: Sequence[CapturedView] | None = None,
+    *,
+    options: RasterOptions | None = None,
+    ceiling: float = float("inf"),
+    device: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ViewEvidence:
+    """Draw a cloud for cameras and spread what their pixels see back over its Gaussians.
+
+    Observed colour is the fitted radiance towards the camera plus the difference between image and rendering, spread
+    back by blending weights: what the fit explains keeps its sharpness, what it does not is not lost. Silhouettes and
+    pixels at the ceiling count for nothing.
+
+    Args:
+        cloud: Gaussians with captured radiance, in the internal world.
+        cameras: Of any sizes, at least one.
+        images: What the cameras saw, one each; None takes the surface alone.
+        options: How splats are drawn: as they were fitted.
+        ceiling: Largest value that the images can hold, scene-linear; infinite for scene-referred ones.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+        progress: Called with (views done, views in all).
+
+    Raises:
+        InvalidArrayError: The cloud has no radiance, or images are not as many as cameras.
+
+    Source: the transpose of alpha blending, as in the gradients of Kerbl et al. 2023.
+    """
+    if cloud.radiance is None:
+        raise InvalidArrayError("radiance must be given, got None. Import Gaussians with captured colour.")
+    if images is not None and len(images) != len(cameras):
+        raise InvalidArrayError(
+            f"images must be one for each of {len(cameras)} cameras, got {len(images)}. Leave neither out."
+        )
+    target = resolve_device(device)
+    count = len(cloud)
+    observed = len(cameras) if images is not None else 0
+    origin = cloud.positions.astype(np.float64).mean(axis=0) if count else np.zeros(3)
+    gaussians = upload_gaussians(cloud, target, radiance=cloud.radiance)
+    sums = wp.zeros((count, SURFACE_CHANNELS), dtype=float, device=target)
+    colors = wp.zeros((observed, count), dtype=wp.vec4, device=target)
+    directions = wp.zeros((observed, count), dtype=wp.vec3, device=target)
+    cut = _cut_to_subject(cloud, cameras, images)
+    for rasterizer, part, shown in _groups(count, cut, options, target):
+        drawn = SurfacePixels()
+        image = rasterizer.draw(gaussians)
+        drawn.colors, drawn.alpha, drawn.depth = image.channels[0], image.alpha, image.median_depth
+        drawn.display_srgb = int(cloud.radiance_color_space == DISPLAY_SRGB)
+        pixels = wp.empty((rasterizer.first_pixels[-1], PIXEL_CHANNELS), dtype=float, device=target)
+        rows = wp.empty((len(part) * count, PIXEL_CHANNELS), dtype=float, device=target)
+        views = ViewLayout.of(rasterizer.cameras).views
+        for view, image_shown in zip(views, shown, strict=True):
+            captured = _captured(image_shown, ceiling, target)
+            launch_write_pixels(view, drawn, captured, wp.vec3(*origin), pixels, target)
+        rasterizer.back_project(pixels, rows)
+        launch_add_rows(rows, len(part), SURFACE_CHANNELS, sums, target)
+        if images is not None:
+            launch_observe(
+                rows,
+                gaussians.positions,
+                gaussians.radiance,
+                drawn.display_srgb,
+                wp.array(views, dtype=View, device=target),
+                part.start,
+                colors,
+                directions,
+                target,
+            )
+        if progress is not None:
+            progress(part.stop, len(cameras))
+    totals = sums.numpy()
+    weight, cut = totals[:, 6].copy(), totals[:, 7]
+    seen = weight >= np.maximum(LEAST_WEIGHT, LEAST_SHARE * _coverage(cloud, cameras, origin))
+    seen &= np.linalg.norm(totals[:, 3:6], axis=1) > LEAST_AGREEMENT * weight
+    positions, normals = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
+    agreement = wp.empty(count, dtype=float, device=target)
+    launch_finish_surface(
+        sums,
+        gaussians.positions,
+        wp.vec3(*origin),
+        upload(seen.astype(np.int32), int, target),
+        positions,
+        normals,
+        agreement,
+        target,
+    )
+    saturated = np.divide(cut, weight, out=np.zeros_like(cut), where=weight > 0.0)
+    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions)
+
+
+def _groups(
+    count: int,
+    views: Iterator[tuple[Camera, CapturedView | None]],
+    options: RasterOptions | None,
+    device: wp.Device,
+) -> Iterator[tuple[Rasterizer, range, list[CapturedView | None]]]:
+    """Rasterise some views at a time; views of the same sizes share their buffers."""
+    rasterizer: Rasterizer | None = None
+    start = 0
+    group: list[tuple[Camera, CapturedView | None]] = []
+    for view in itertools.chain(views, (None,)):
+        pixels = sum(camera.width * camera.height for camera, _ in group)
+        if group and (view is None or pixels + view[0].width * view[0].height > PIXELS_AT_ONCE):
+            cameras = [camera for camera, _ in group]
+            sizes = [(camera.width, camera.height) for camera in cameras]
+            if rasterizer is not None and [(c.width, c.height) for c in rasterizer.cameras] == sizes:
+                rasterizer.set_cameras(cameras)
+            else:
+                rasterizer = Rasterizer(count, cameras, radiance=True, normals=True, options=options, device=device)
+            yield rasterizer, range(start, start + len(group)), [image for _, image in group]
+            start += len(group)
+            group = []
+        if view is not None:
+            group.append(view)
+
+
+def _cut_to_subject(
+    cloud: GaussianCloud, cameras: Sequence[Camera], images: Sequence[CapturedView] | None
+) -> Iterator[tuple[Camera, CapturedView | None]]:
+    """Cut cameras and images to where Gaussians can be: most of a picture is background, which costs as much to move.
+
+    Images are cut ahead by threads while earlier ones are worked on.
+    """
+    low, high = _bounds(cloud)
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+
+    def cut(index: int) -> tuple[Camera, CapturedView | None]:
+        camera, image = cameras[index], None if images is None else images[index]
+        left, top, right, bottom = _box(camera, corners)
+        part = (left, top, right - left, bottom - top)
+        if image is not None:
+            image = image.cropped(*part)
+            return image.camera, image
+        return camera.cropped(*part), None
+
+    with ThreadPoolExecutor(CUTTING_THREADS) as pool:
+        waiting: deque[Future[tuple[Camera, CapturedView | None]]] = deque()
+        for index in range(len(cameras)):
+            waiting.append(pool.submit(cut, index))
+            if len(waiting) > CUTTING_THREADS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _bounds(cloud: GaussianCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the box of all Gaussians, their reach included [m]."""
+    reach = RADII * cloud.scales.max(axis=1, keepdims=True).astype(np.float64)
+    if not len(cloud):
+        return np.zeros(3), np.zeros(3)
+    return (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+
+
+def _box(camera: Camera, corners: NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """Return the part of an image that a box can be in: left, top, right, bottom; all of it where that is unclear."""
+    whole = (0, 0, camera.width, camera.height)
+    if not (((corners - camera.position) @ camera.forward) > 0.0).all():
+        return whole
+    places = camera.project(corners)[:, :2]
+    low = np.floor(places.min(axis=0)).astype(int) - MARGIN
+    high = np.ceil(places.max(axis=0)).astype(int) + MARGIN
+    left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+    right, bottom = min(int(high[0]), camera.width), min(int(high[1]), camera.height)
+    # tiles are 16 pixels wide: parts of the same size share buffers more often if sizes are whole tiles
+    left, top = left // TILE * TILE, top // TILE * TILE
+    right, bottom = min(-(-right // TILE) * TILE, camera.width), min(-(-bottom // TILE) * TILE, camera.height)
+    return (left, top, right, bottom) if left < right and top < bottom else (0, 0, 1, 1)
+
+
+def _coverage(cloud: GaussianCloud, cameras: Sequence[Camera], center: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return about how many pixels each Gaussian would cover in all views with nothing before it, ``(N,)``.
+
+    2 pi opacity times the product of its larger deviations, at the distance of the whole cloud's middle, half of the
+    views from behind.
+    """
+    density = sum(
+        camera.focal_x * camera.focal_y / max(float(np.sum((camera.position - center) ** 2)), 1e-12)
+        for camera in cameras
+    )
+    larger = np.sort(cloud.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
+    return np.pi * density * cloud.opacities * larger
+
+
+def _captured(image: CapturedView | None, ceiling: float, device: wp.Device) -> CapturedPixels:
+    """Bring an image to the device."""
+    captured = CapturedPixels()
+    color = np.zeros((0, 3), np.float32) if image is None else image.color.reshape(-1, 3)
+    coverage = np.zeros(0, np.float32) if image is None or image.alpha is None else image.alpha.reshape(-1)
+    captured.color = upload(color, wp.vec3, device)
+    captured.coverage = upload(coverage, float, device)
+    captured.ceiling = HEADROOM * ceiling
+    return captured

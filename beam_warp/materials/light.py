@@ -1,0 +1,454 @@
+"""Whether a stated environment fits what was captured under it: its turn, its handedness, its scale, its range.
+
+Two things tell, and neither knows the base colours. Divided by the right light, shading is gone from what was seen and
+the base colours that are left spread least over the surface. And what changes of a point's colour from view to view is
+gloss: whatever the base colour, it must follow the light that the views see mirrored. Both are linear in the light, so
+that all turns of an environment cost two matrix products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.findings import Finding, count_of
+from beam_warp.checks import require_count
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.light.sampled import LUMINANCE
+from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import visibility
+from beam_warp.world.environment import EnvironmentMap, texel_directions
+
+LIGHT_ROWS, LIGHT_COLUMNS = 16, 32
+"""Cells that the light is averaged over; a turn by one column is 11.25 degrees, turns between are interpolated."""
+
+LEAST_POINTS = 64
+"""Fewest Gaussians that say anything about light."""
+
+LEAST_VIEWS = 4
+"""Fewest views: one side of a subject alone is explained by many lights."""
+
+MOST_VIEWS = 12
+"""Views that gloss is looked at in: what more of them say costs more than it tells."""
+
+WELL_SEEN = 2.0
+AGREEMENT = 0.9
+UNCUT = 0.1
+"""Pixels by blending weights, agreement of normals and largest saturated part of Gaussians that are asked."""
+
+GLOSS_ROUGHNESS = 0.5
+"""Roughness of the lobe that light is mirrored in. True ones of 0.3 to 0.9 correlate with it, only less."""
+
+LEAST_LIGHT = 0.01
+"""Part of the median irradiance that reaches every point at least, from other surfaces."""
+
+LARGEST_CHANGE = 0.5
+"""Changes from view to view are cut at this part of a point's own luminance: beyond are errors of matching."""
+
+CLEARLY_BETTER = 0.1
+"""Difference of misfit from which on another turn explains the capture better than the stated one.
+
+Measured on two captured figures, each under its own light and two others (6 in all): the true turn is behind the best
+by 0.023 at most. Turned away from it by 10 degrees it is behind by 0.06 to 0.28, by 15 by 0.10 to 0.74, by 30 by 0.21
+or more, by 90 or more by 0.67 or more. Mirrored, whatever the turn, by 0.35 or more but for turns that put a lone sun
+where it was, of which no capture could tell."""
+
+HANDEDNESS = 0.05
+"""Difference of misfit from which on a mirror image is preferred to a turn: twice the largest that chance made."""
+
+CONTRADICTED = 0.05
+"""Loss of correlation of gloss from which on it contradicts a turn that the spread of base colours prefers."""
+
+LEAST_GLOSS = 0.4
+"""Correlation of gloss below which no turn of the environment explains what views show.
+
+Measured as above: 0.49 to 0.76 with the true environment; with others, each at its best turn, below 0.34 in 20 cases of
+24, and 0.45 to 0.61 in the rest, whose lights resemble the true ones."""
+
+GLOSSY_PART = 0.01
+"""Change of luminance from view to view, of what is seen, above which gloss can be told from noise: 0.07 to 0.09 in
+captures."""
+
+UNREMOVED = 1.1
+"""Spread of base colours at the best turn, over that of what was seen, above which shading was put in, not removed:
+0.31 to 0.77 with the true environment."""
+
+WELL_LIT = 0.5
+BRIGHT, BRIGHTEST = 0.75, 0.95
+"""Of Gaussians that get this part of the mean irradiance, quantiles of the largest channel of base colour."""
+
+TOO_BRIGHT = 1.1
+TOO_DARK = 0.05
+PLAUSIBLE = 0.7
+"""Quantile `BRIGHT` above which light is stated too dim, `BRIGHTEST` below which too bright, and what the proposed
+exposure makes of the former. The former is 0.66 to 0.99 with the true light, on a figure in white clothes too; nothing
+but charcoal is below 0.05."""
+
+
+FEW_VALUES = 16
+EIGHT_BIT = 256
+CUT_PART = 1e-3
+STEP_SLACK = 0.07
+"""Distinct values up to which a map is a drawing, and up to which it may come from 8 bits; part of a map at its largest
+value from which on it was cut: a high-dynamic-range map has a texel or two there, of thousands; how far values may be
+from whole steps of 8 bits: a half float, rounded by 2^-12 of its value, is off by up to 255 / 2^12 = 0.06 steps where
+files are linear and 0.03 in sRGB."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LightEvidence:
+    """What some points show of the light; cells are those of a lat-long grid, row-major.
+
+    Attributes:
+        normals: Unit, ``(M, 3)``.
+        openness: Visibility towards each of `LIGHT_ROWS` x `LIGHT_COLUMNS` cells, in [0, 1], ``(M, L)``.
+        colors: Scene-linear radiance towards each view, ``(V, M, 3)``.
+        weights: Of the same, 0 where a view does not see the point, ``(V, M)``.
+        directions: Unit, towards each view, ``(V, M, 3)``.
+    """
+
+    normals: NDArray[np.float32]
+    openness: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    directions: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightCheck:
+    """How well an environment fits a capture.
+
+    Attributes:
+        best_rotation_degrees: Turn by which it fits best, as `EnvironmentMap.rotated` takes it, in (-180, 180]; of
+            the mirrored map if ``is_mirrored``.
+        is_mirrored: Whether it fits best with its columns in reverse order.
+        spread_as_given: Mean absolute deviation of the logarithm of base colour from its median.
+        spread_best: The same at the best turn.
+        spread_undivided: The same of what was seen, shading and all.
+        gloss_as_given: Correlation of what changes from view to view with the gloss expected; 0 where nothing does.
+        gloss_best: The same at the best turn.
+        misfit_as_given: Logarithm of how much is left unexplained by either, above the best turn's.
+        exposure_stops: Exposure that base colours as a whole ask for; 0 where they are plausible as they are.
+        point_count: How many Gaussians were asked.
+        findings: What is wrong.
+    """
+
+    best_rotation_degrees: float
+    is_mirrored: bool
+    spread_as_given: float
+    spread_best: float
+    spread_undivided: float
+    gloss_as_given: float
+    gloss_best: float
+    misfit_as_given: float
+    exposure_stops: float
+    point_count: int
+    findings: tuple[Finding, ...]
+
+
+def check_light(
+    scene: Scene,
+    points: SurfacePoints,
+    views: ViewEvidence,
+    environment: EnvironmentMap,
+    *,
+    subset: int = 1024,
+) -> LightCheck:
+    """Ask well-seen Gaussians whether an environment is the light that they were captured under.
+
+    Args:
+        scene: The Gaussians, uploaded.
+        points: Their points on the surface.
+        views: What views show of them, with images.
+        environment: The light as stated.
+        subset: Most Gaussians to ask, spread evenly over the cloud.
+
+    Raises:
+        InvalidArrayError: There are no images.
+        InvalidOptionError: ``subset`` is out of range.
+
+    Source: shading removed by division, as in intrinsic images; the two terms are those of BEAM Eqs. 4 and 5.
+    """
+    require_count("subset", subset, LEAST_POINTS, 65_536)
+    if not views.colors.shape[0]:
+        raise InvalidArrayError("views must have images to check the light, got none. Give the captured images.")
+    return judge_light(light_evidence(scene, points, views, subset), environment)
+
+
+def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, subset: int) -> LightEvidence:
+    """Collect what well-seen Gaussians show, and towards which cells of the sphere they are open."""
+    good = views.seen & (views.weight > WELL_SEEN) & (points.confidence > AGREEMENT) & (views.saturated < UNCUT)
+    rows = np.flatnonzero(good)
+    if len(rows) > subset:
+        rows = rows[np.linspace(0, len(rows) - 1, subset).astype(np.int64)]
+    count = views.colors.shape[0]
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_VIEWS)).astype(np.int64))
+    seen = views.colors.numpy()[chosen][:, rows]
+    normals = points.normals.numpy()[rows]
+    origins = points.positions.numpy()[rows] + normals * points.offsets.numpy()[rows][:, None]
+    cells = _cell_directions()
+    point, cell = np.nonzero(normals @ cells.T > 0.0)
+    openness = np.zeros((len(rows), len(cells)), np.float32)
+    openness[point, cell] = visibility(scene, origins[point].astype(np.float32), cells[cell])
+    return LightEvidence(
+        normals=normals,
+        openness=openness,
+        colors=seen[..., :3],
+        weights=seen[..., 3],
+        directions=views.directions.numpy()[chosen][:, rows],
+    )
+
+
+def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCheck:
+    """Compare an environment with its turns and mirror images.
+
+    The misfit is log(spread) + log(1 - gloss²) / 2: logarithms of what is left unexplained of either.
+    """
+    facing = np.einsum("vmk,mk->vm", evidence.directions, evidence.normals)
+    weights = evidence.weights * np.clip((facing - 0.2) / 0.3, 0.0, 1.0)
+    luminance = evidence.colors @ LUMINANCE.astype(np.float32)
+    total = weights.sum(axis=0)
+    observed = (weights * luminance).sum(axis=0) / np.maximum(total, 1e-12)
+    asked = (total > 0.0) & (observed > 0.0)
+    count = int(asked.sum())
+    if not environment.radiance.any():
+        remedy = "Check its exposure and the file; nothing can be measured without light."
+        return _unjudged(count, Finding("error", "environment-black", "environment is black", remedy=remedy))
+    if count < LEAST_POINTS or len(weights) < LEAST_VIEWS:
+        what = (
+            f"environment is not checked: {count} Gaussians are seen well in {count_of(len(weights), 'view')}, "
+            f"{LEAST_POINTS} and {LEAST_VIEWS} are needed"
+        )
+        remedy = "More views, or views from nearer, would allow it."
+        return _unjudged(count, Finding("note", "light-unchecked", what, remedy=remedy))
+    weights, total, observed, luminance = weights[:, asked], total[asked], observed[asked], luminance[:, asked]
+    normals, openness = evidence.normals[asked], evidence.openness[asked]
+    lights = _turns(environment)
+    diffuse = _diffuse_transfer(normals, openness)
+
+    irradiance = diffuse @ (lights @ LUMINANCE).T.astype(np.float32) / np.float32(np.pi)
+    spreads = _spreads(observed, irradiance)
+    # Relative to what a point shows on the whole: bright points must not decide alone.
+    relative = 1.0 / np.maximum(observed, 0.02 * np.median(observed))
+    changes = _cut(_centered(luminance, weights, total) * relative)
+    power = float((weights * changes**2).sum())
+    gloss = np.zeros(len(lights))
+    if power > GLOSSY_PART**2 * float(weights.sum()):
+        mirrored = _mirrored(normals, openness, evidence.directions[:, asked], lights)
+        for index in range(len(lights)):
+            expected = _cut(_centered(mirrored[..., index], weights, total) * relative)
+            norm = float((weights * expected**2).sum())
+            gloss[index] = float((weights * expected * changes).sum()) / np.sqrt(max(norm * power, 1e-30))
+    misfits = np.log(np.maximum(spreads, 1e-6)) + 0.5 * np.log1p(-(np.clip(gloss, 0.0, 0.999) ** 2))
+
+    unmirrored, mirror = misfits[:LIGHT_COLUMNS], misfits[LIGHT_COLUMNS:]
+    best = int(np.argmin(unmirrored))
+    if mirror.min() < unmirrored[best] - HANDEDNESS:
+        best = LIGHT_COLUMNS + int(np.argmin(mirror))
+    is_mirrored = best >= LIGHT_COLUMNS
+    stops = _exposure_stops(
+        (weights[..., None] * evidence.colors[:, asked]).sum(axis=0) / total[:, None],
+        diffuse @ lights[best].astype(np.float32) / np.float32(np.pi),
+    )
+    check = LightCheck(
+        best_rotation_degrees=_refined(misfits.reshape(2, -1)[int(is_mirrored)], best % LIGHT_COLUMNS),
+        is_mirrored=is_mirrored,
+        spread_as_given=float(spreads[0]),
+        spread_best=float(spreads[best]),
+        spread_undivided=float(_spreads(observed, np.ones((len(observed), 1), np.float32))[0]),
+        gloss_as_given=float(gloss[0]),
+        gloss_best=float(gloss[best]),
+        misfit_as_given=float(misfits[0] - misfits[best]),
+        exposure_stops=stops,
+        point_count=count,
+        findings=(),
+    )
+    return replace(check, findings=tuple(_findings(check, has_gloss=bool(gloss.any()))))
+
+
+def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
+    """Tell a display-referred picture that was given as light: cut at white, or from 8 bits whatever its scale.
+
+    Uniform maps and those of a few colours are taken for what they are.
+    """
+    radiance = environment.radiance
+    brightest = float(radiance.max())
+    values = np.unique(radiance)
+    at_top = float((radiance.max(axis=-1) >= brightest).mean())
+    if len(values) <= FEW_VALUES:
+        return None
+    if brightest <= 1.0 and at_top >= CUT_PART:
+        why = f"never exceeds {brightest:.3g}, and {at_top:.1%} of it is exactly at that: it was cut at white"
+    elif len(values) <= EIGHT_BIT and any(
+        np.abs(steps - np.round(steps)).max() < STEP_SLACK
+        for steps in (255.0 * values / brightest, 255.0 * linear_to_srgb(values / brightest))
+    ):
+        why = f"has no more than {len(values)} values, in the steps of an 8-bit picture"
+    else:
+        return None
+    return Finding(
+        "warning",
+        "ldr-environment",
+        f"environment {why}",
+        remedy="Its light sources are missing. Use the high-dynamic-range file that it was made from; without one "
+        "shadows are too soft and base colours too bright, whatever its --exposure.",
+    )
+
+
+def _cell_directions() -> NDArray[np.float32]:
+    return texel_directions(LIGHT_ROWS, LIGHT_COLUMNS).reshape(-1, 3).astype(np.float32)
+
+
+def _cell_angles() -> NDArray[np.float32]:
+    """Return solid angles of the cells [sr]."""
+    rows = (2.0 * np.pi / LIGHT_COLUMNS) * -np.diff(np.cos(np.linspace(0.0, np.pi, LIGHT_ROWS + 1)))
+    return np.repeat(rows, LIGHT_COLUMNS).astype(np.float32)
+
+
+def _turns(environment: EnvironmentMap) -> NDArray[np.float64]:
+    """Return an environment under every turn by whole cells, then its mirror image, ``(2 LIGHT_COLUMNS, L, 3)``."""
+    cells = environment.resized(LIGHT_ROWS, LIGHT_COLUMNS).radiance.astype(np.float64)
+    return np.stack(
+        [
+            np.roll(hand, -turn, axis=1).reshape(-1, 3)
+            for hand in (cells, cells[:, ::-1])
+            for turn in range(LIGHT_COLUMNS)
+        ]
+    )
+
+
+def _diffuse_transfer(normals: NDArray[np.float32], openness: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what each cell's radiance adds to the irradiance of each point, ``(M, L)``."""
+    return np.maximum(normals @ _cell_directions().T, 0.0) * openness * _cell_angles()
+
+
+def _mirrored(
+    normals: NDArray[np.float32],
+    openness: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    lights: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return the luminance that points mirror towards views, under each light, ``(V, M, lights)``; GGX, F0 = 0.04."""
+    cells = _cell_directions()
+    by_light = (lights @ LUMINANCE).T.astype(np.float32)
+    reach = np.maximum(normals @ cells.T, 0.0)
+    power = np.float32(GLOSS_ROUGHNESS**4)
+    result = np.empty((len(directions), len(normals), len(lights)), np.float32)
+    for view, toward in enumerate(directions):
+        # |v + l|² = 2 + 2 v.l, so that no half vector is formed
+        double = np.sqrt(np.maximum(2.0 + 2.0 * (toward @ cells.T), 1e-6))
+        cosine = np.maximum(np.einsum("mk,mk->m", normals, toward), 0.05)[:, None]
+        n_h = (cosine + reach) / double
+        fresnel = 0.04 + 0.96 * (1.0 - np.clip(0.5 * double, 0.0, 1.0)) ** 5
+        lobe = power / (np.pi * (n_h * n_h * (power - 1.0) + 1.0) ** 2)
+        masking = 0.5 / (
+            reach * np.sqrt(cosine**2 * (1.0 - power) + power) + cosine * np.sqrt(reach**2 * (1.0 - power) + power)
+        )
+        transfer = lobe * masking * fresnel * reach * openness * _cell_angles()
+        result[view] = transfer.astype(np.float32) @ by_light
+    return result
+
+
+def _centered(
+    values: NDArray[np.float32], weights: NDArray[np.float32], total: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return what changes of ``(V, M)`` values from view to view."""
+    return values - (weights * values).sum(axis=0) / total
+
+
+def _cut(changes: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.clip(changes, -LARGEST_CHANGE, LARGEST_CHANGE)
+
+
+def _spreads(observed: NDArray[np.float32], irradiance: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the spread of the logarithm of base colour under each light, ``(lights,)``."""
+    least = np.maximum(LEAST_LIGHT * np.median(irradiance, axis=0), 1e-12)
+    base = np.log(observed.astype(np.float64))[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
+    return np.abs(base - np.median(base, axis=0)).mean(axis=0)
+
+
+def _refined(misfits: NDArray[np.float64], best: int) -> float:
+    """Return the turn of the least misfit [degree], by a parabola through the best and its neighbours."""
+    before, here, after = (misfits[(best + step) % len(misfits)] for step in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    turn = best + (0.5 * (before - after) / bend if bend > 0.0 else 0.0)
+    degrees = float(turn * 360.0 / LIGHT_COLUMNS)
+    return degrees - 360.0 if degrees > 180.0 else degrees
+
+
+def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]) -> float:
+    """Return the exposure of the light that makes base colours plausible [stops]."""
+    mean = irradiance.mean(axis=1)
+    lit = mean > WELL_LIT * mean.mean()
+    if not lit.any():
+        return 0.0
+    base = (colors[lit] / np.maximum(irradiance[lit], 1e-12)).max(axis=1)
+    bright, brightest = (max(float(value), 1e-9) for value in np.quantile(base, (BRIGHT, BRIGHTEST)))
+    if bright > TOO_BRIGHT:
+        return float(np.log2(bright / PLAUSIBLE))
+    return float(np.log2(brightest / PLAUSIBLE)) if brightest < TOO_DARK else 0.0
+
+
+def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
+    """Put what is wrong into words; of a light that does not fit at all neither turn nor exposure mean anything."""
+    put_in = check.spread_best > UNREMOVED * check.spread_undivided
+    if (has_gloss and check.gloss_best < LEAST_GLOSS) or put_in:
+        return [
+            Finding(
+                # Small images blur gloss away under the right light too: then it is worth knowing, no more.
+                "warning" if put_in else "note",
+                "environment-unexplained",
+                "environment does not explain the capture under any turn: correlation of gloss "
+                f"{check.gloss_best:.2f}, {LEAST_GLOSS:g} or more with the right one; spread of base colours "
+                f"{check.spread_best:.2f}, of what was seen {check.spread_undivided:.2f}",
+                remedy="Check that it is the light of this capture. Surfaces without any gloss, and blurred images, "
+                "can look so too.",
+            )
+        ]
+    findings = []
+    if check.misfit_as_given > CLEARLY_BETTER and check.gloss_best > check.gloss_as_given - CONTRADICTED:
+        findings.append(
+            Finding(
+                "warning",
+                "environment-turned",
+                f"environment explains the capture {np.exp(check.misfit_as_given):.2f} times better "
+                f"{'mirrored and ' if check.is_mirrored else ''}turned by {check.best_rotation_degrees:+.0f} degrees "
+                "about the up axis",
+                remedy="Check its convention: the centre of the image is +x, its left quarter +y. "
+                + ("Reverse its columns, then turn it." if check.is_mirrored else "Turn it by that."),
+            )
+        )
+    if check.exposure_stops:
+        dim = check.exposure_stops > 0.0
+        findings.append(
+            Finding(
+                "warning",
+                "environment-exposure",
+                f"environment seems {abs(check.exposure_stops):.1f} stops too {'dim' if dim else 'bright'}: base "
+                f"colours would be {'above 1' if dim else 'below 0.05'}",
+                remedy="Scale it by --exposure, or use the high-dynamic-range file in the units of the images.",
+            )
+        )
+    return findings
+
+
+def _unjudged(count: int, finding: Finding) -> LightCheck:
+    """Say why nothing can be said."""
+    return LightCheck(
+        best_rotation_degrees=0.0,
+        is_mirrored=False,
+        spread_as_given=0.0,
+        spread_best=0.0,
+        spread_undivided=0.0,
+        gloss_as_given=0.0,
+        gloss_best=0.0,
+        misfit_as_given=0.0,
+        exposure_stops=0.0,
+        point_count=count,
+        findings=(finding,),
+    )

@@ -1,0 +1,449 @@
+"""Perceptual roughness from photographs: which one explains best how a point's colour changes with the view.
+
+The residues of every view are known for any roughness (`beam_warp.kernels.materials.roughness_profile`), and what views
+show beyond them must be diffuse, of one base colour: candidates are judged by how badly that fits. Dielectrics reflect
+four parts in a hundred, so a single Gaussian says next to nothing; what its surroundings say with it is weighed by how
+well one half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and
+standard deviation are stated: where the data cannot tell, these are the prior's.
+
+The weights: a misfit A counts as evidence exp(-T A). With halves 1 and 2 of the views, each with a base colour of its
+own, T maximises the sum over places of
+
+    log sum_r p(r) exp(-T (A_1 + A_2)) - log sum_r p(r) exp(-T A_1) - log sum_r p(r) exp(-T A_2),
+
+what knowing one half tells of the other. Whatever normalises exp(-T A) over data cancels; where halves contradict each
+other, or fit everything, the maximum is at T = 0 and nothing is claimed. Errors that are the same in both halves (of
+normals, above all) are not seen this way: evidence counts `SHARED` of what they agree on.
+
+Sources: Varin et al. 2011 (composite likelihoods claim too much when errors are shared, and are to be scaled);
+Bissiri, Holmes and Walker 2016 (evidence from a misfit, exp(-T A), and the choice of T).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from beam_warp.checks import require_number
+from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.materials.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.direct import MaterialOptions, light_batches, lit_points, mean_radiance
+from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.trace.occlusion import Progress
+from beam_warp.trace.scene import Scene
+from beam_warp.world.gaussians import GaussianCloud
+
+CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.85, 1.0)
+"""Perceptual roughness that is tried: a lobe's peak goes with its inverse fourth power, so smooth ones lie closer."""
+
+GRID = np.linspace(CANDIDATES[0], CANDIDATES[-1], 37)
+"""Roughness at which distributions are held: steps of 0.025, below any error that is stated."""
+
+CLUSTER = 4
+"""Gaussians are asked together by so many."""
+
+NEAR, WIDE = 4, 64
+"""Clusters that make up a place and its surroundings: 16 and 256 Gaussians, 1 and 4 cm about on 100,000 of a person."""
+
+PARENTS = 3
+"""Clusters nearest to a Gaussian that it takes its distribution from."""
+
+MOST_ASKED = 6_000
+"""Places that weights are estimated from, evenly spread: their errors are far below those of what they stand for."""
+
+PRECISIONS = np.geomspace(1e-3, 10.0, 25)
+"""T that are tried. The largest takes residuals of 0.013 of a white surface for chance: no captured light is better."""
+
+STEPS = np.array((0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3))
+"""By how much a place may differ from its surroundings (standard deviation), as tried."""
+
+SPREADS = np.geomspace(0.05, 0.4, 13)
+"""Spreads of the prior that are tried: no subject is of one roughness to better than the split sum knows it."""
+
+SHARED = 0.25
+"""Part of the agreement of two halves of the views that counts: the rest is taken for errors that they share.
+
+Measured against the truth of two captures, where 0.2 to 0.3 makes the distributions most probable, of 16 as of 256
+Gaussians together (docs/materials.md)."""
+
+LEAST_AGREEMENT = 2.0
+"""Natural logarithm of the odds by which halves must agree rather than not, for any claim: e^2 is 7 to 1."""
+
+INFORMED_PART = 0.9
+"""Of the prior's spread; a Gaussian whose distribution is wider is told by the prior."""
+
+MODEL_ERROR = 0.04
+"""What the split sum makes of roughness: against the full integral over the lobe, under a sky of five soft lights and
+without noise, 0.2, 0.3, ... 0.8 come back 0.02 to 0.06 off, 0.035 in root mean square."""
+
+TINY = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class RoughnessProfile:
+    """How badly candidates explain the views of Gaussians; profiles of several frames of them add up.
+
+    Attributes:
+        misfit: For all views, the even and the odd ones, and each of `CANDIDATES`: the sum over views of
+            w log(1 + e^2 / s^2) at the base colour in [0, 1] that suits those views best, ``(3, N, 12)``. e is the
+            residual, s 0.06 of what a white surface would show with nothing in the way.
+        views: Sum of w over all views: how many that see a whole pixel from the front, ``(N,)``; 0 where there is none.
+        frames: Number of frames.
+    """
+
+    misfit: NDArray[np.floating[Any]]
+    views: NDArray[np.floating[Any]]
+    frames: int = 1
+
+    def __post_init__(self) -> None:
+        """Check shapes once."""
+        expected = (int(PARTS), len(self.views), len(CANDIDATES))
+        if self.misfit.shape != expected:
+            raise InvalidArrayError(
+                f"misfit must have shape {expected}, got {self.misfit.shape}. Take it from measure_roughness_profile."
+            )
+
+    def __add__(self, other: RoughnessProfile) -> RoughnessProfile:
+        """Join evidence on the same Gaussians, in float64."""
+        if len(self.views) != len(other.views):
+            raise InvalidArrayError(
+                f"profiles must be of the same Gaussians, got {len(self.views)} and {len(other.views)}. "
+                "Add up the frames of one segment."
+            )
+        return RoughnessProfile(
+            np.add(self.misfit, other.misfit, dtype=np.float64),
+            np.add(self.views, other.views, dtype=np.float64),
+            self.frames + other.frames,
+        )
+
+
+@dataclass(frozen=True)
+class RoughnessPrior:
+    """What is held of roughness before a place is looked at: normal, cut to the range of `CANDIDATES`.
+
+    Attributes:
+        mean: Mean, perceptual.
+        spread: Standard deviation.
+
+    Raises:
+        InvalidOptionError: A value is out of range.
+    """
+
+    mean: float = 0.5
+    spread: float = 0.25
+
+    def __post_init__(self) -> None:
+        """Check values once."""
+        require_number("mean", self.mean, 0.0, 1.0)
+        require_number("spread", self.spread, 0.01, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RoughnessEstimate:
+    """Estimated roughness.
+
+    Attributes:
+        roughness: Mean of each Gaussian's distribution, perceptual, ``(N,)`` float32.
+        standard_error: Its standard deviation, joined with `MODEL_ERROR`, ``(N,)`` float32.
+        informed: False where the data adds little to the prior, ``(N,)`` bool.
+        prior: What all Gaussians together say, or what was given.
+        report: How it came about, JSON-ready: ``informed_part``, ``median_error``, ``frames``; the ``prior_mean`` and
+            ``prior_spread`` that a Gaussian without evidence gets; ``step``, by how much places differ from their
+            surroundings; ``near`` and ``wide``, each with the ``precision`` T and the ``agreement`` of halves of the
+            views, a natural logarithm of odds.
+    """
+
+    roughness: NDArray[np.float32]
+    standard_error: NDArray[np.float32]
+    informed: NDArray[np.bool_]
+    prior: RoughnessPrior
+    report: dict[str, Any]
+
+
+def measure_roughness_profile(
+    cloud: GaussianCloud,
+    scene: Scene,
+    points: SurfacePoints,
+    light: MaterialLight,
+    views: ViewEvidence | None,
+    *,
+    options: MaterialOptions,
+    frame: int = 0,
+    rows: NDArray[np.integer[Any]] | None = None,
+    progress: Progress | None = None,
+) -> RoughnessProfile:
+    """Trace the light of one frame and try every candidate on what its views show.
+
+    Args:
+        cloud: Gaussians with captured radiance, axes "rfu".
+        scene: The same Gaussians, uploaded.
+        points: Where their light is gathered.
+        light: The light of the capture, prepared on the scene's device.
+        views: What views with images show; None takes the captured radiance around each normal.
+        options: Rays, offset, bounce, seed; as for `beam_warp.materials.direct.measure_materials`.
+        frame: Number of the frame, for the rays' random streams.
+        rows: Gaussians to measure; all of them if None.
+        progress: Called now and then with (Gaussians done, Gaussians in all).
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+    """
+    device = scene.device
+    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
+    shown = chosen[points.seen[chosen]]
+    # Any roughness will do here: the candidates take its place.
+    measured = lit_points(cloud, points, np.ones(len(cloud), np.float32), light, shown, views)
+    candidates = upload(np.array(CANDIDATES, np.float32), float, device)
+    fit = ProfileFit()
+    fit.misfit = wp.zeros((int(PARTS), len(shown), len(CANDIDATES)), dtype=float, device=device)
+    fit.views = wp.zeros(len(shown), dtype=float, device=device)
+
+    def report(done: int, total: int) -> None:
+        if progress is not None:
+            progress(len(chosen) - (total - done), len(chosen))
+
+    normals, observed, lobes = measured.surface.normals, measured.views, light.blurred.light
+    bounced = mean_radiance(cloud, views) if options.bounce else None
+    for lit in light_batches(scene, points, light, measured, options, bounced, frame, report):
+        shares = wp.empty((len(lit.batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
+        launch_lobe_shares(lit.batch, lit.rays, measured.light, normals, observed, shares, device)
+        launch_profile(lit.batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
+    misfit = np.zeros((int(PARTS), len(cloud), len(CANDIDATES)), np.float32)
+    counted = np.zeros(len(cloud), np.float32)
+    misfit[:, shown], counted[shown] = fit.misfit.numpy(), fit.views.numpy()
+    return RoughnessProfile(misfit[:, chosen], counted[chosen])
+
+
+def solve_roughness(
+    positions: NDArray[np.floating[Any]], profile: RoughnessProfile, *, prior: RoughnessPrior | None = None
+) -> RoughnessEstimate:
+    """Turn profiles into a roughness for every Gaussian, with its standard error.
+
+    A place, `NEAR` clusters of Gaussians, is told by its own misfit, by that of its surroundings and by the prior. The
+    weights of both come from how far halves of the views agree on them; how far a place may differ from its
+    surroundings is what makes the misfits of all places most probable. So places that speak clearly are told by
+    themselves, others by what is around them, and what nothing tells keeps the prior with its spread.
+
+    Args:
+        positions: Of the Gaussians [m], in any one of the frames, ``(N, 3)``.
+        profile: Of one frame, or the sum over frames of the same Gaussians.
+        prior: Taken as it is; None takes what makes the misfits of all surroundings most probable.
+
+    Raises:
+        InvalidArrayError: Positions and profile are not of as many Gaussians.
+    """
+    places = np.asarray(positions, np.float64)
+    if places.shape != (len(profile.views), 3):
+        raise InvalidArrayError(
+            f"positions must have shape ({len(profile.views)}, 3), got {places.shape}. Take those of one of the frames."
+        )
+    known = np.flatnonzero(profile.views > 0.0)
+    if not len(known):
+        return _told_by(prior or RoughnessPrior(), len(places), profile.frames)
+    seen = places[known]
+    tree = cKDTree(seen[_morton_order(seen)][::CLUSTER])
+    clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], tree.query(seen, workers=-1)[1], tree.n)
+    resample = CubicSpline(CANDIDATES, np.eye(len(CANDIDATES)))(GRID).T
+    near, wide = (_sums_around(tree, clusters, count) @ resample for count in (NEAR, WIDE))
+    asked = slice(None, None, -(-tree.n // MOST_ASKED))
+    counted = tree.n / len(range(tree.n)[asked])  # how many places each one that is asked stands for
+    chosen, near_evidence, wide_evidence = _weigh(near[:, asked], wide[:, asked], counted, prior)
+    outside = _normalized(_log_prior(chosen) - wide_evidence.precision * (wide[0] - near[0]))
+    inside = -near_evidence.precision * near[0]
+    step = _most_probable_step(outside[asked], inside[asked])
+    distribution = _normalized(_widened(outside, step) + inside)
+    mean, spread = _moments(distribution)
+    prior_mean, prior_spread = _moments(_widened(_log_prior(chosen), step))
+    weight, index = _nearest(tree, places)
+    roughness = (weight * mean[index]).sum(axis=1)
+    error = np.sqrt((weight * np.square(spread[index])).sum(axis=1) + MODEL_ERROR**2)
+    informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * prior_spread
+    return RoughnessEstimate(
+        roughness.astype(np.float32),
+        error.astype(np.float32),
+        informed,
+        chosen,
+        {
+            "informed_part": float(informed.mean()),
+            "median_error": float(np.median(error)),
+            "frames": profile.frames,
+            "prior_mean": float(prior_mean),
+            "prior_spread": float(prior_spread),
+            "step": step,
+            "near": near_evidence.record(),
+            "wide": wide_evidence.record(),
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What misfits are worth: exp(-precision misfit), and the logarithm of the odds that halves of the views agree."""
+
+    precision: float
+    agreement: float
+
+    def record(self) -> dict[str, float]:
+        """Return it JSON-ready."""
+        return {"precision": self.precision, "agreement": self.agreement}
+
+
+def _told_by(prior: RoughnessPrior, count: int, frames: int) -> RoughnessEstimate:
+    """Return what is held of Gaussians that no view shows."""
+    mean, spread = _moments(_log_prior(prior))
+    nothing = _Evidence(0.0, 0.0).record()
+    return RoughnessEstimate(
+        np.full(count, mean, np.float32),
+        np.full(count, np.hypot(spread, MODEL_ERROR), np.float32),
+        np.zeros(count, bool),
+        prior,
+        {
+            "informed_part": 0.0,
+            "median_error": float(np.hypot(spread, MODEL_ERROR)),
+            "frames": frames,
+            "prior_mean": float(mean),
+            "prior_spread": float(spread),
+            "step": 0.0,
+            "near": nothing,
+            "wide": nothing,
+        },
+    )
+
+
+def _weigh(
+    near: NDArray[np.float64], wide: NDArray[np.float64], counted: float, prior: RoughnessPrior | None
+) -> tuple[RoughnessPrior, _Evidence, _Evidence]:
+    """Return the prior, and what misfits of places and of surroundings are worth.
+
+    Halves are asked how far they agree before anything is known: where all places are alike, the prior that these make
+    leaves nothing to agree on.
+
+    The prior's mean is taken from evidence as far as it counts. Its spread is taken from evidence at its word: cut to
+    a quarter, evidence hardly tells places apart, and the spread of two captures came out a third too small.
+    """
+    start = prior or RoughnessPrior()
+    near_evidence = _worth(_log_prior(start), near, counted / NEAR)
+    wide_evidence = _worth(_log_prior(start), wide, counted / WIDE)
+    if prior is not None or wide_evidence.precision == 0.0:
+        return start, near_evidence, wide_evidence
+    mean = _most_probable_prior(wide[0], wide_evidence.precision, counted / WIDE, start).mean
+    spread = _most_probable_prior(wide[0], wide_evidence.precision / SHARED, counted / WIDE, start).spread
+    return RoughnessPrior(mean, spread), near_evidence, wide_evidence
+
+
+def _worth(log_prior: NDArray[np.float64], parts: NDArray[np.float64], counted: float) -> _Evidence:
+    """Return the precision at which halves of the views tell most of each other; 0 if they do not."""
+    _, even, odd = parts
+    agreement = [
+        counted
+        * float(
+            (
+                _log_evidence(log_prior, even + odd, precision)
+                - _log_evidence(log_prior, even, precision)
+                - _log_evidence(log_prior, odd, precision)
+            ).sum()
+        )
+        for precision in PRECISIONS
+    ]
+    best = int(np.argmax(agreement))
+    if not agreement[best] > LEAST_AGREEMENT:
+        return _Evidence(0.0, agreement[best])
+    return _Evidence(SHARED * float(PRECISIONS[best]), agreement[best])
+
+
+def _most_probable_prior(
+    misfit: NDArray[np.float64], precision: float, counted: float, start: RoughnessPrior
+) -> RoughnessPrior:
+    """Return the prior that makes misfits most probable; ``start`` counts as much as one place."""
+    means, spreads = np.meshgrid(GRID, SPREADS, indexing="ij")
+    means, spreads = means.ravel(), spreads.ravel()
+    priors = np.exp(_normalized(-0.5 * np.square((GRID - means[:, None]) / spreads[:, None])))
+    likelihood = np.exp(-precision * (misfit - misfit.min(axis=1, keepdims=True)))
+    gain = counted * np.log(likelihood @ priors.T + TINY).sum(axis=0)
+    gain -= 0.5 * np.square((means - start.mean) / start.spread)
+    gain -= 0.5 * np.square(np.log2(spreads / start.spread))
+    best = int(np.argmax(gain))
+    return RoughnessPrior(float(means[best]), float(spreads[best]))
+
+
+def _most_probable_step(outside: NDArray[np.float64], inside: NDArray[np.float64]) -> float:
+    """Return by how much places differ from their surroundings: what makes their own misfit most probable."""
+    likelihood = np.exp(inside - inside.max(axis=1, keepdims=True))
+    gains = [np.log((np.exp(_widened(outside, step)) * likelihood).sum(axis=1) + TINY).sum() for step in STEPS]
+    return float(STEPS[int(np.argmax(gains))])
+
+
+def _log_prior(prior: RoughnessPrior) -> NDArray[np.float64]:
+    """Return the prior's logarithm on the grid."""
+    return _normalized(-0.5 * np.square((GRID - prior.mean) / prior.spread))
+
+
+def _normalized(logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return logarithms whose exponentials add up to one over the grid."""
+    top = logarithms.max(axis=-1, keepdims=True)
+    return logarithms - top - np.log(np.exp(logarithms - top).sum(axis=-1, keepdims=True))
+
+
+def _log_evidence(log_prior: NDArray[np.float64], misfit: NDArray[np.float64], precision: float) -> NDArray[np.float64]:
+    """Return log sum_r p(r) exp(-T A(r)) of every place."""
+    least = misfit.min(axis=-1)
+    return np.log(np.exp(log_prior - precision * (misfit - least[:, None])).sum(axis=-1) + TINY) - precision * least
+
+
+def _widened(log_distribution: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Blur distributions on the grid, whose ends nothing leaves by."""
+    if step == 0.0:
+        return log_distribution
+    kernel = np.exp(-0.5 * np.square((GRID[:, None] - GRID) / step))
+    return np.log(np.exp(log_distribution) @ (kernel / kernel.sum(axis=1, keepdims=True)) + TINY)
+
+
+def _moments(log_distribution: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and standard deviation."""
+    p = np.exp(log_distribution)
+    mean = p @ GRID
+    return mean, np.sqrt((p * np.square(GRID - mean[..., None])).sum(axis=-1))
+
+
+def _cluster_sums(misfit: NDArray[np.float64], cluster: NDArray[np.integer[Any]], count: int) -> NDArray[np.float64]:
+    """Add up the misfits of each cluster's Gaussians, in their order: ``(3, N, G)`` to ``(3, count, G)``."""
+    sums = [np.stack([np.bincount(cluster, column, count) for column in part.T], axis=1) for part in misfit]
+    return np.stack(sums).astype(np.float64)
+
+
+def _sums_around(tree: cKDTree, clusters: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Add up the misfits of every cluster and its nearest ones, ``count`` in all."""
+    count = min(count, tree.n)
+    near = tree.query(tree.data, k=count, workers=-1)[1].reshape(tree.n, count)
+    total = np.zeros_like(clusters)
+    for column in near.T:
+        total += clusters[:, column]
+    return total
+
+
+def _nearest(tree: cKDTree, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.integer[Any]]]:
+    """Return the weights and indices of the clusters nearest to places, ``(N, PARENTS)`` each."""
+    count = min(PARENTS, tree.n)
+    distance, index = (found.reshape(len(places), count) for found in tree.query(places, k=count, workers=-1))
+    weight = 1.0 / np.maximum(distance, 1e-3 * distance[:, -1:] + 1e-12)
+    return weight / weight.sum(axis=1, keepdims=True), index
+
+
+def _morton_order(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the order of points along a space-filling curve of 1024 cells a side."""
+    low = points.min(axis=0)
+    cells = ((points - low) * (1023.0 / max(float(np.ptp(points, axis=0).max()), 1e-30))).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")

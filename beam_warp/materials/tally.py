@@ -1,0 +1,93 @@
+"""Counts over the frames of a relightable sequence, and what a user should know about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.materials.changes import ColorChange
+from beam_warp.world.gaussians import GaussianCloud, Observability
+
+CLIPPED_WARNING = 0.05
+"""Part of the opacity with base colour cut at 1 above which the stated light is called too dim."""
+
+UNCERTAIN_WARNING = 0.5
+"""Part of the Gaussians with uncertain normals above which they are said not to form a surface."""
+
+
+def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
+    """Return what a user should know about a tally's `Tally.summary`."""
+    warnings = []
+    if statistics["clipped_part"] > CLIPPED_WARNING:
+        warnings.append(
+            f"{statistics['clipped_part']:.0%} of what is opaque has base colour cut at 1: the environment is too dim, "
+            "or comes from other sides than the light of the capture; see --exposure and --rotate"
+        )
+    if statistics["gaussians"] and statistics["flags"]["FILLED"] == statistics["gaussians"]:
+        warnings.append(
+            "no base colour could be measured: no Gaussian is both lit and seen; check that the environment is not "
+            "black and that the capture is the one that the Gaussians were reconstructed from"
+        )
+    if statistics["flags"]["UNCERTAIN_NORMAL"] > UNCERTAIN_WARNING * statistics["gaussians"]:
+        warnings.append("most normals are uncertain: the Gaussians do not form a surface; relighting is a guess")
+    return warnings
+
+
+class Tally:
+    """Counts over frames, so that a report needs no frame twice."""
+
+    def __init__(self) -> None:
+        """Start with nothing counted."""
+        self._rows = 0
+        self._sums: dict[str, float] = {}
+        self._changes: dict[str, float] = {}
+        self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
+
+    def add(self, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]], clipped_part: float = 0.0) -> None:
+        """Count one frame: its relightable cloud, ``from_shape`` and ``report`` of the store, and what was cut at 1."""
+        count = len(cloud)
+        assert cloud.observability is not None
+        assert cloud.ambient_occlusion is not None
+        assert cloud.normal_confidence is not None
+        measured = (cloud.observability & np.uint8(Observability.FILLED)) == 0
+        error = 0.0
+        if cloud.base_color_error is not None:
+            error = cloud.base_color_error[measured].mean(axis=1).sum(dtype=np.float64)
+        self._rows += count
+        for name, value in (
+            ("clipped", clipped_part * count),
+            ("from_shape", stored["from_shape"].sum()),
+            ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
+            ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
+            ("error", error),
+            ("measured", measured.sum()),
+            ("dropped", stored["report"][1]),
+            ("raised", stored["report"][2]),
+        ):
+            self._sums[name] = self._sums.get(name, 0.0) + float(value)
+        for flag in Observability:
+            if flag and flag.name:
+                self._flags[flag.name] += int(((cloud.observability & np.uint8(flag)) != 0).sum())
+
+    def count_changes(self, change: ColorChange) -> None:
+        """Keep what a test of frames against each other found."""
+        self._changes = {"changing_part": change.changing_part, "error_dispersion": change.dispersion}
+
+    def summary(self) -> dict[str, Any]:
+        """Return parts, means and counts over all frames, JSON-able."""
+        rows = max(self._rows, 1)
+        return {
+            "gaussians": self._rows,
+            "clipped_part": self._sums["clipped"] / rows,
+            "normals_from_shape": self._sums["from_shape"] / rows,
+            "mean_ambient_occlusion": self._sums["openness"] / rows,
+            "mean_normal_confidence": self._sums["confidence"] / rows,
+            "mean_base_color_error_where_measured": self._sums["error"] / max(self._sums["measured"], 1.0),
+            "dropped_transparent": int(self._sums["dropped"]),
+            "raised_scales": int(self._sums["raised"]),
+            "flags": self._flags,
+            **self._changes,
+        }

@@ -1,0 +1,1 @@
+"""Triangle meshes: fusion of depth images, files, topology, texture coordinates and distances."""

@@ -1,0 +1,1 @@
+"""Gaussians drawn as images: any channel, depth and normals, with gradients."""

@@ -1,0 +1,228 @@
+"""How far a picture is from what it should be, and how every pixel should change: terms of a training loss.
+
+A term belongs to one size of image and holds the buffers for it. Called, it adds its gradient to an array that other
+terms add to as well, and returns its value in an array of one element that it owns: valid until its next call. Values
+and gradients are of ``weight`` times a mean over *all* pixels; masked ones add 0 to it. So terms of one image add up,
+and halving the mask halves the term.
+
+Nothing is allocated in a call and nothing waits for the device: calls may be captured in a CUDA graph, where weights
+stay as they were captured. Sums go in a fixed order: same device, same input, same bits. Arrays may be strided views,
+such as some channels of wider rows; inputs may also be NumPy arrays, which are uploaded at every call. Images are
+finite.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import warp as wp
+
+from beam_warp.checks import require_count, require_number
+from beam_warp.device.array_checks import device_array, require_device_array
+from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import InvalidOptionError
+from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
+from beam_warp.kernels.raster.image_losses import launch_add_l1, launch_add_normal
+from beam_warp.kernels.raster.ssim import launch_add_window_gradients, launch_compare_windows, strip_count
+from beam_warp.world.camera import MAX_PIXELS, MAX_SIDE
+
+
+class _Term:
+    """What every term has: a size, a device, what its threads add, and its value."""
+
+    def __init__(self, height: int, width: int, channels: int, device: Any) -> None:
+        self.shape = (
+            require_count("height", height, 1, MAX_SIDE),
+            require_count("width", width, 1, MAX_SIDE),
+            require_count("channels", channels, 1, 64),
+        )
+        if height * width * channels > MAX_PIXELS:
+            raise InvalidOptionError(
+                f"height x width x channels must be at most {MAX_PIXELS}, got {height} x {width} x {channels}. "
+                "Choose a smaller image."
+            )
+        self.device = resolve_device(device)
+        self._value = wp.zeros(1, dtype=float, device=self.device)
+        self._sums = SumBuffers(self.device)
+
+    def _input(self, name: str, value: Any) -> wp.array:
+        return device_array(name, value, self.shape, self.device)
+
+    def _mask(self, mask: Any) -> wp.array | None:
+        return None if mask is None else device_array("mask", mask, self.shape[:2], self.device)
+
+    def _output(self, name: str, value: wp.array | None) -> wp.array | None:
+        return None if value is None else require_device_array(name, value, self.shape, self.device)
+
+    def _finish(self, terms: wp.array, scale: float) -> wp.array:
+        launch_sum_floats(terms, scale, self._sums, self._value, self.device)
+        return self._value
+
+
+class L1Loss(_Term):
+    """Mean absolute difference."""
+
+    def __init__(self, height: int, width: int, channels: int = 3, *, device: Any = None) -> None:
+        """Make buffers for images of one size, 4 bytes a pixel.
+
+        Args:
+            height: Rows.
+            width: Columns.
+            channels: Channels, C.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidOptionError: A size is out of range.
+            DeviceError: The device is not there.
+        """
+        super().__init__(height, width, channels, device)
+        self._terms = wp.empty(height * width, dtype=float, device=self.device)
+
+    def __call__(
+        self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
+    ) -> wp.array:
+        """Return weight * sum over pixels of mask * |image - target| / (H W C), and add its gradient.
+
+        Args:
+            image: ``(H, W, C)`` float32.
+            target: What it should be, like ``image``.
+            weight: The factor of the term, at least 0.
+            mask: What each pixel counts, ``(H, W)`` float32, usually in [0, 1]; 1 without. It has no gradient.
+            gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32; 0 where the
+                images are equal.
+
+        Raises:
+            InvalidArrayError: An array has another type, shape or device.
+            InvalidOptionError: ``weight`` is negative.
+        """
+        scale = _scale(weight, self.shape)
+        launch_add_l1(
+            self._input("image", image),
+            self._input("target", target),
+            self._mask(mask),
+            scale,
+            self._terms,
+            self._output("gradient", gradient),
+            self.device,
+        )
+        return self._finish(self._terms, scale)
+
+
+class SsimLoss(_Term):
+    """One minus the mean structural similarity, of values in [0, 1].
+
+    Windows are Gaussian, 11 x 11 pixels with a standard deviation of 1.5, and everything beyond the image is 0, as in
+    3DGS (Kerbl et al. 2023): only 5 pixels and more from the border does it equal `beam_warp.image.metrics.ssim`'s map.
+
+    Source: Wang et al. 2004, Eq. 13.
+    """
+
+    def __init__(self, height: int, width: int, channels: int = 3, *, device: Any = None) -> None:
+        """Make buffers for images of one size, about 12 bytes a pixel and channel.
+
+        Args:
+            height: Rows.
+            width: Columns.
+            channels: Channels, C; each is compared alone.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidOptionError: A size is out of range.
+            DeviceError: The device is not there.
+        """
+        super().__init__(height, width, channels, device)
+        self._terms = wp.empty(strip_count(height, width, channels), dtype=float, device=self.device)
+        self._slopes = wp.empty((3, height, width, channels), dtype=float, device=self.device)
+
+    def __call__(
+        self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
+    ) -> wp.array:
+        """Return weight * sum over pixels of mask * (1 - similarity) / (H W C), and add its gradient.
+
+        Args:
+            image: ``(H, W, C)`` float32.
+            target: What it should be, like ``image``.
+            weight: The factor of the term, at least 0.
+            mask: What the window around each pixel counts, ``(H, W)`` float32; 1 without. It has no gradient. A window
+                that counts sees all its pixels, masked or not.
+            gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32.
+
+        Raises:
+            InvalidArrayError: An array has another type, shape or device.
+            InvalidOptionError: ``weight`` is negative.
+        """
+        picture, truth = self._input("image", image), self._input("target", target)
+        out = self._output("gradient", gradient)
+        scale = _scale(weight, self.shape)
+        slopes = None if out is None else self._slopes
+        launch_compare_windows(picture, truth, self._mask(mask), scale, self._terms, slopes, self.device)
+        if out is not None:
+            launch_add_window_gradients(picture, truth, slopes, out, self.device)
+        return self._finish(self._terms, scale)
+
+
+class NormalLoss(_Term):
+    """Disagreement of rendered normals with those of the rendered depth: the mean of 1 - cos of the angle.
+
+    Source: Zhang et al. 2024, RaDe-GS (normal consistency); there every pixel counts the same.
+    """
+
+    def __init__(self, height: int, width: int, *, device: Any = None) -> None:
+        """Make buffers for images of one size, 4 bytes a pixel.
+
+        Args:
+            height: Rows.
+            width: Columns.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidOptionError: A size is out of range.
+            DeviceError: The device is not there.
+        """
+        super().__init__(height, width, 3, device)
+        self._terms = wp.empty(height * width, dtype=float, device=self.device)
+
+    def __call__(
+        self,
+        rendered: Any,
+        expected: Any,
+        *,
+        weight: float = 1.0,
+        mask: Any = None,
+        rendered_gradient: wp.array | None = None,
+        expected_gradient: wp.array | None = None,
+    ) -> wp.array:
+        """Return weight * sum over pixels of mask * (1 - rendered . expected / |rendered|) / (H W), and add gradients.
+
+        Pixels where ``expected`` is 0, or ``rendered`` shorter than 0.001, add 0 to the sum and have no gradient.
+
+        Args:
+            rendered: Normals as composited, of any length, ``(H, W, 3)`` float32.
+            expected: Unit normals or 0, such as `DepthNormals` writes, in the same axes.
+            weight: The factor of the term, at least 0.
+            mask: What each pixel counts, ``(H, W)`` float32, such as alpha; 1 without. It has no gradient.
+            rendered_gradient: The derivative with respect to ``rendered``, through its normalisation, is added to it.
+            expected_gradient: The derivative with respect to ``expected``, taken as it is, is added to it.
+
+        Raises:
+            InvalidArrayError: An array has another type, shape or device.
+            InvalidOptionError: ``weight`` is negative.
+        """
+        scale = _scale(weight, self.shape[:2])
+        launch_add_normal(
+            self._input("rendered", rendered),
+            self._input("expected", expected),
+            self._mask(mask),
+            scale,
+            self._terms,
+            self._output("rendered_gradient", rendered_gradient),
+            self._output("expected_gradient", expected_gradient),
+            self.device,
+        )
+        return self._finish(self._terms, scale)
+
+
+def _scale(weight: float, shape: tuple[int, ...]) -> float:
+    """Return the factor of a sum that makes it a weighted mean."""
+    return require_number("weight", weight, 0.0) / math.prod(shape)

@@ -1,0 +1,123 @@
+"""What the rasteriser is given and what it gives: options, Gaussians, images, gradients; arrays are on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import warp as wp
+
+from beam_warp.checks import require_choice, require_number
+from beam_warp.world.metadata import LOW_PASS_RANGE, UNSTATED_RASTER, raster_metadata, stated_raster
+
+COEFFICIENT_COUNTS = (1, 4, 9, 16, 25)
+"""Numbers of spherical harmonics of a colour: those of degree 0 to 4."""
+
+DEPTH_MODES = ("plane", "exact")
+
+DepthMode = Literal["plane", "exact"]
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """How splats are drawn.
+
+    Attributes:
+        antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
+            views from further away than the training views (Yu et al. 2024, Eq. 9).
+        low_pass: Variance of the pixel filter that every splat is widened by [pixel^2], above 0.
+        near: Depth before which a Gaussian's centre is not drawn [m], above 0: perspective explodes there.
+        depth: ``"plane"``: a splat's depth is its tangent plane's, exact for flat Gaussians. ``"exact"``: that of the
+            largest response on every ray, for thick ones and grazing views; costs a few operations a pixel.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    antialiased: bool = UNSTATED_RASTER[0]
+    low_pass: float = UNSTATED_RASTER[1]
+    near: float = 0.01
+    depth: DepthMode = "plane"
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_number("low_pass", self.low_pass, *LOW_PASS_RANGE)
+        require_number("near", self.near, 1e-9, 1e9)
+        require_choice("depth", self.depth, DEPTH_MODES)
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> RasterOptions:
+        """Return how a sequence says that its Gaussians are to be drawn; the defaults where it says nothing.
+
+        Args:
+            metadata: Of a `beam_warp.world.gaussians.GaussianSequence`.
+
+        Raises:
+            InvalidOptionError: It says something else than a filter.
+        """
+        antialiased, low_pass = stated_raster(metadata) or UNSTATED_RASTER
+        return cls(antialiased=antialiased, low_pass=low_pass)
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return what states that Gaussians were fitted so; near and depth are whoever draws them's to choose."""
+        return raster_metadata(self.antialiased, self.low_pass)
+
+
+class GaussianArrays(NamedTuple):
+    """Gaussians on a device.
+
+    Attributes:
+        positions: ``(N,)`` vec3 [m].
+        orientations: ``(N,)`` quat xyzw; normalised where they are used.
+        scales: ``(N,)`` vec3 [m].
+        opacities: ``(N,)`` float in [0, 1].
+        values: ``(N, K)`` float: whatever is to be composited; None for nothing.
+        radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B of `COEFFICIENT_COUNTS`, another one in
+            every draw if need be; None for none.
+    """
+
+    positions: wp.array
+    orientations: wp.array
+    scales: wp.array
+    opacities: wp.array
+    values: wp.array | None = None
+    radiance: wp.array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RasterImages:
+    """Images of all views, one view after the other and row by row, on the device; or a loss's derivatives to them.
+
+    Attributes:
+        channels: Sums of channels weighted by visibility, ``(P, K)`` float each: passes of 16 channels, the last of 4,
+            8, 12 or 16, padded with zeros.
+        alpha: Sum of the weights, ``(P,)`` float, at most 1 but for rounding.
+        depth: Mean depth along the optical axis [m], ``(P,)``; 0 where nothing is seen.
+        median_depth: Depth of the last splat that more than half of the light passes before [m], ``(P,)``.
+    """
+
+    channels: tuple[wp.array, ...]
+    alpha: wp.array
+    depth: wp.array
+    median_depth: wp.array
+
+    def zero_(self) -> None:
+        """Set everything to 0."""
+        for array in (*self.channels, self.alpha, self.depth, self.median_depth):
+            array.zero_()
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianGradients:
+    """Derivatives of a loss with respect to Gaussians, on the device; attributes as in `GaussianArrays`.
+
+    ``orientations`` are to the quaternions as given, and orthogonal to them.
+    """
+
+    positions: wp.array
+    orientations: wp.array
+    scales: wp.array
+    opacities: wp.array
+    values: wp.array | None
+    radiance: wp.array | None

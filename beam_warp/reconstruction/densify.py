@@ -1,0 +1,70 @@
+"""Which Gaussians are dropped and which are split, under a budget: rows of the dead are given to the strained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.reconstruction.parameters import DEAD_LOGIT
+
+SPLIT_OFFSET = 0.6
+"""Halves of a split Gaussian lie that many of its longest deviations to either side of its centre."""
+
+SPLIT_SHRINK = 0.65
+"""And their longest deviation is this part of it: variance offset^2 + shrink^2 is 0.8 of what it was, for halves are
+composited over one another and so look wider than their sum."""
+
+
+def prune(rows: dict[str, NDArray[Any]], unused: NDArray[np.bool_]) -> None:
+    """Make rows wait for a Gaussian, in place."""
+    rows["logits"][unused] = DEAD_LOGIT
+    rows["orientations"][unused] = 0.0
+    rows["radiance"][unused] = 0.0
+
+
+def split(rows: dict[str, NDArray[Any]], sources: NDArray[np.int64], targets: NDArray[np.int64]) -> None:
+    """Replace Gaussians by two halves along their longest axis: one in their own row, one in another; in place.
+
+    Args:
+        rows: As `beam_warp.reconstruction.parameters.GaussianParameters.rows` returns them.
+        sources: Rows of Gaussians, each once, ``(K,)``.
+        targets: Rows for their second halves, ``(K,)``.
+    """
+    for array in rows.values():
+        array[targets] = array[sources]
+    scales = rows["log_scales"][sources]
+    axis = scales.argmax(axis=1)
+    picked = np.arange(len(sources))
+    offset = np.zeros_like(rows["positions"][sources])
+    offset[picked, axis] = SPLIT_OFFSET * np.exp(scales[picked, axis])
+    moved = _rotate(rows["orientations"][sources], offset)
+    for places, sign in ((sources, 1.0), (targets, -1.0)):
+        rows["positions"][places] += np.float32(sign) * moved
+        rows["log_scales"][places, axis] += np.float32(np.log(SPLIT_SHRINK))
+
+
+def hidden(shares: NDArray[np.floating], part: float) -> NDArray[np.bool_]:
+    """Return the rows that show least, as many as together show at most a part of what all show, ``(N,)``."""
+    order = np.argsort(shares, kind="stable")
+    total = np.cumsum(shares[order])
+    result = np.zeros(len(shares), bool)
+    result[order[total <= part * total[-1]]] = True
+    return result
+
+
+def choose_strained(stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Return the rows of largest stress among those that may be split, at most ``count``; ties by row."""
+    candidates = np.flatnonzero(eligible & (stress > 0.0))
+    order = np.argsort(-stress[candidates], kind="stable")
+    return candidates[order[:count]]
+
+
+def _rotate(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Rotate vectors by quaternions xyzw of any length."""
+    unit = quaternions.astype(np.float64)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+    axis, w = unit[:, :3], unit[:, 3:]
+    twice = 2.0 * np.cross(axis, vectors)
+    return (vectors + w * twice + np.cross(axis, twice)).astype(np.float32)

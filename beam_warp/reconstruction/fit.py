@@ -1,0 +1,524 @@
+"""The first frame: Gaussians that look like the photographs of a moment, with the geometry that these imply.
+
+Steps look at one view each. The discs of a visual hull are moved until renders agree with the photographs in colour,
+structure and coverage, and the Gaussians' normals with those of the depth that they draw. Every so many steps those
+that nobody sees are dropped, and those that the images pull at most are split into their places: their number stays
+within a budget.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.checks import require_choice, require_count, require_number
+from beam_warp.device.array_checks import float_rows
+from beam_warp.device.arrays import resolve_device
+from beam_warp.device.graphs import StepGraphs
+from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.reconstruction.pull import launch_add_stress
+from beam_warp.raster.adam import Adam
+from beam_warp.raster.records import GaussianGradients, RasterOptions
+from beam_warp.reconstruction.densify import choose_strained, hidden, prune, split
+from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.reconstruction.motion_losses import TemporalLoss
+from beam_warp.reconstruction.parameters import GaussianParameters
+from beam_warp.reconstruction.regularizers import AnisotropyLoss, OpacityLoss
+from beam_warp.reconstruction.sampling_limits import SamplingLimits
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
+from beam_warp.world.gaussians import GaussianCloud
+
+PRESETS = ("fast", "draft", "paper", "rade")
+
+FIT_RASTER = RasterOptions(antialiased=True, low_pass=0.1)
+"""How splats are drawn while they are fitted, and should be afterwards: the pixel filter's variance is about that of
+a pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
+
+NO_PSNR = 120.0
+"""What is said where there is nothing to meet [dB]."""
+
+PROGRESS_EVERY = 50
+"""Steps from one report of progress, and change of the learning rates, to the next."""
+
+RENEW_EVERY = 250
+"""Most steps between looks whether the Gaussians still find room, and the sampling filter fits them."""
+
+LEAST_GAIN = 0.15
+"""Gain of twice as many Gaussians below which more of them do not pay [dB]."""
+
+FEWEST_GAUSSIANS = 2_000
+"""Where a search for a number of Gaussians begins, at least."""
+
+
+class FitProgress(Protocol):
+    """Hears how far a fit is."""
+
+    def __call__(self, done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+        """Take ``done`` of ``total`` steps; facts: ``psnr`` [dB], ``gaussians``."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Sizes of steps, each in the units of what is moved.
+
+    Attributes:
+        positions: In distances of the cameras from the subject.
+        orientations: Of quaternions.
+        scales: Of logarithms.
+        opacities: Of logits.
+        color: Of the spherical harmonics' band 0.
+        bands: Of all other bands.
+        final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
+        final_others: The same of all other rates.
+
+    Raises:
+        InvalidOptionError: A rate is negative or no number.
+    """
+
+    positions: float = 5e-4
+    orientations: float = 2e-3
+    scales: float = 1e-2
+    opacities: float = 3e-2
+    color: float = 1e-2
+    bands: float = 5e-4
+    final_positions: float = 0.01
+    final_others: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Check every rate once: the last of the positions is not reached before many steps are taken."""
+        for rate in fields(self):
+            require_number(rate.name, getattr(self, rate.name), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How Gaussians are fitted to the photographs of one moment.
+
+    Attributes:
+        gaussian_count: Most Gaussians there may be.
+        target_psnr: Begin with few Gaussians and double them until the views are met so well [dB], or doubling gains
+            less than `LEAST_GAIN`, or there are as many as allowed; None for all of them at once.
+        color_iterations: Steps without the term of normals.
+        normal_iterations: Steps with it.
+        weights: What the terms count.
+        rates: Sizes of steps.
+        sh_degree: Of the captured radiance.
+        samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
+        raster: How splats are drawn.
+        sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
+        anisotropy: Weight of needles (`AnisotropyLoss`).
+        opacity: Weight of opacity (`OpacityLoss`).
+        temporal: Weight of changes against the start, for the frames after the first (E_temp).
+        refine_every: Steps from one refinement to the next; 0 for none.
+        refine_until: Part of all steps after which there is none.
+        split_fraction: Most of the Gaussians that one refinement splits.
+        hidden_share: Gaussians that show least are dropped at a refinement, as many as together show this part of
+            what all show: those that sank behind others, about a third of them, and nobody pulls back.
+        dead_opacity: Gaussians below it are dropped.
+        seed: Same seed, same device, same result.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    gaussian_count: int = 100_000
+    target_psnr: float | None = None
+    color_iterations: int = 1_000
+    normal_iterations: int = 2_000
+    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=0.5))
+    rates: LearningRates = field(default_factory=LearningRates)
+    sh_degree: int = 2
+    samples: int | Literal["auto"] = "auto"
+    raster: RasterOptions = FIT_RASTER
+    sampling_filter: bool = True
+    anisotropy: float = 0.0
+    opacity: float = 0.0
+    temporal: float = 0.0
+    refine_every: int = 250
+    refine_until: float = 0.6
+    split_fraction: float = 0.2
+    hidden_share: float = 0.01
+    dead_opacity: float = 0.02
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_count("gaussian_count", self.gaussian_count, 1, 2**24)
+        if self.target_psnr is not None:
+            require_number("target_psnr", self.target_psnr, 1.0, 120.0)
+        for name in ("color_iterations", "normal_iterations", "refine_every", "seed"):
+            require_count(name, getattr(self, name), 0)
+        require_count("sh_degree", self.sh_degree, 0, 4)
+        if self.samples != "auto":
+            require_count("samples", self.samples, 1, 8)
+        for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
+            require_number(name, getattr(self, name), 0.0, 1.0)
+        for name in ("anisotropy", "opacity", "temporal"):
+            require_number(name, getattr(self, name), 0.0)
+
+    @classmethod
+    def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
+        """Return the options of a preset, some of them changed.
+
+        ``fast`` is ours, ``draft`` a seventh of its steps: for a first look, and for a CPU. ``paper`` is BEAM's
+        schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term of
+        coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
+        normals at 0.05 for the second half. The latter two draw one sample a pixel.
+
+        Raises:
+            InvalidOptionError: There is no such preset, or an option is out of range.
+        """
+        require_choice("preset", preset, PRESETS)
+        rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
+        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
+        options: dict[str, dict[str, Any]] = {
+            "fast": {},
+            "draft": {
+                "color_iterations": 150,
+                "normal_iterations": 300,
+                "refine_every": 100,
+                "rates": LearningRates(final_others=1.0),
+            },
+            "paper": {
+                **common,
+                "color_iterations": 7_000,
+                "normal_iterations": 5_000,
+                "weights": LossWeights(alpha=0.0, normal=0.03),
+                "hidden_share": 0.0,
+                "raster": RasterOptions(),
+                "sampling_filter": False,
+            },
+            "rade": {
+                **common,
+                "color_iterations": 6_000,
+                "normal_iterations": 6_000,
+                "weights": LossWeights(alpha=0.0, normal=0.05),
+                "hidden_share": 0.0,
+                "raster": RasterOptions(low_pass=1e-4),
+            },
+        }
+        return cls(**{**options[preset], **changes})
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What came out of a fit.
+
+    Attributes:
+        cloud: Gaussians with scene-linear radiance and ids.
+        report: What was done and how well it went, JSON-able: ``psnr`` of the training views' crops [dB], lowest
+            ``view_psnr``, ``gaussians``, ``iterations``, ``samples``, ``seconds``; ``growth`` with a target.
+    """
+
+    cloud: GaussianCloud
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+def mean_psnr(psnr: NDArray[np.float64]) -> float:
+    """Return the mean over views that show the subject; `NO_PSNR` if none does."""
+    known = psnr[np.isfinite(psnr)]
+    return float(known.mean()) if len(known) else NO_PSNR
+
+
+def no_fit_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
+    """Report to nobody."""
+
+
+def fit_gaussians(
+    views: Sequence[CapturedView],
+    start: GaussianCloud,
+    options: FitOptions | None = None,
+    *,
+    device: str | None = None,
+    progress: FitProgress = no_fit_progress,
+) -> Fit:
+    """Fit Gaussians to the photographs of one moment.
+
+    Args:
+        views: The photographs, at least one.
+        start: Where steps begin, with scene-linear radiance, such as `initial_gaussians` gives; some of them, evenly
+            chosen, where there are more than may be.
+        options: See `FitOptions`.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+        progress: Called with (done, total, facts).
+
+    Raises:
+        InvalidArrayError: There is no view or no Gaussian, or the start has no radiance in scene-linear Rec.709.
+        DeviceError: There is no such device.
+
+    Source: Kerbl et al. 2023, 3DGS; BEAM §3.1 for the normals; what differs is in `docs/reconstruction.md`.
+    """
+    chosen = options or FitOptions()
+    if not len(views) or not len(start):
+        raise InvalidArrayError(
+            f"views and start must hold something, got {len(views)} views and {len(start)} Gaussians. Pass some."
+        )
+    if len(start) > chosen.gaussian_count:
+        start = start.select(np.linspace(0, len(start) - 1, chosen.gaussian_count).astype(int))
+    target = resolve_device(device)
+    began = time.perf_counter()
+    if chosen.target_psnr is None:
+        fitter = Fitter(views, start, chosen, target)
+        fitter.run(progress)
+        report = fitter.report()
+    else:
+        fitter, report = _grow(views, start, chosen, target, progress)
+    report["seconds"] = time.perf_counter() - began
+    return Fit(fitter.parameters.cloud(), report)
+
+
+def _grow(
+    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: FitProgress
+) -> tuple[Fitter, dict[str, Any]]:
+    """Fit few Gaussians, and twice as many from there, until more do not pay."""
+    wanted = options.target_psnr
+    assert wanted is not None
+    count = min(max(FEWEST_GAUSSIANS, options.gaussian_count // 16), len(start))
+    cloud = start.select(np.linspace(0, len(start) - 1, count).astype(int))
+    cloud = cloud.with_arrays(scales=cloud.scales * np.sqrt(len(start) / count))
+    growth: list[dict[str, float]] = []
+    iterations = 0
+    while True:
+        fitter = Fitter(views, cloud, replace(options, gaussian_count=count), device)
+        fitter.run(progress)
+        report = fitter.report()
+        iterations += report["iterations"]
+        growth.append({"gaussians": report["gaussians"], "psnr": report["psnr"]})
+        gain = growth[-1]["psnr"] - growth[-2]["psnr"] if len(growth) > 1 else np.inf
+        if growth[-1]["psnr"] >= wanted or gain < LEAST_GAIN or count >= options.gaussian_count:
+            return fitter, {**report, "iterations": iterations, "growth": growth}
+        count = min(2 * count, options.gaussian_count)
+        cloud = fitter.doubled(count)
+        # What is there is good already: half the steps do for its halves.
+        options = replace(
+            options,
+            color_iterations=0,
+            normal_iterations=max(1, (options.color_iterations + options.normal_iterations) // 2)
+            if len(growth) == 1
+            else options.normal_iterations,
+        )
+
+
+class Fitter:
+    """The steps of one fit, on a device.
+
+    Attributes:
+        parameters: The Gaussians.
+        samples: Side of the square of samples of a pixel.
+    """
+
+    def __init__(self, views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any) -> None:
+        """Bring everything to the device; see `fit_gaussians`."""
+        self.options = options
+        self.device = device
+        count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
+        self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
+        center = np.median(start.positions, axis=0)
+        spacing = float(np.median(np.sort(start.scales, axis=1)[:, 1])) / DISC_WIDTH
+        self.samples = sample_side(views, center, spacing) if options.samples == "auto" else int(options.samples)
+        self._targets = TargetSet(views, count, options.raster, self.samples, device)
+        self._extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
+        self._limits = SamplingLimits([view.camera for view in views], device=device)
+        rates = options.rates
+        self._rates = {
+            "positions": rates.positions * self._extent,
+            "orientations": rates.orientations,
+            "log_scales": rates.scales,
+            "logits": rates.opacities,
+            "color": rates.color,
+            "bands": rates.bands,
+        }
+        self._adam: Adam = self.parameters.optimizer(self._rates)
+        self._stress = wp.zeros(count, dtype=float, device=device)
+        self._seen = wp.zeros(count, dtype=float, device=device)
+        self._anisotropy = AnisotropyLoss(count, device=device)
+        self._opacity = OpacityLoss(count, device=device)
+        self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._graphs = StepGraphs(device)
+        self._weights = options.weights
+        self._taken = 0
+
+    def run(self, progress: FitProgress = no_fit_progress) -> None:
+        """Take all steps."""
+        chosen = self.options
+        total = chosen.color_iterations + chosen.normal_iterations
+        order = self._order(total)
+        facts: dict[str, float] = {"gaussians": float(self.parameters.alive().sum())}
+        self._weights = replace(chosen.weights, normal=0.0)
+        self._graphs.clear()
+        self._renew()
+        for iteration in range(total):
+            if iteration == chosen.color_iterations:
+                self._weights = chosen.weights
+                self._graphs.clear()
+            if iteration % PROGRESS_EVERY == 0:
+                self._set_rates(iteration / max(total - 1, 1))
+                progress(iteration, total, facts)
+            view = int(order[iteration])
+            self._graphs.run(view, lambda view=view: self._step(view))
+            self._taken += 1
+            is_due = bool(chosen.refine_every) and self._taken % chosen.refine_every == 0
+            if is_due and self._taken <= chosen.refine_until * total:
+                self._refine()
+            if is_due or self._taken % RENEW_EVERY == 0:
+                facts = {"gaussians": float(self.parameters.alive().sum()), "psnr": self._renew()}
+        facts["psnr"] = self._renew()
+        progress(total, total, facts)
+
+    def report(self) -> dict[str, Any]:
+        """Return what was done and how well it went, JSON-able."""
+        psnr = self.psnr()
+        return {
+            "psnr": mean_psnr(psnr),
+            "view_psnr": float(np.nanmin(psnr, initial=NO_PSNR)),
+            "gaussians": int(self.parameters.alive().sum()),
+            "iterations": self._taken,
+            "samples": self.samples,
+        }
+
+    def psnr(self) -> NDArray[np.float64]:
+        """Return the PSNR of every view's crop [dB]."""
+        self.parameters.activate()
+        return self._targets.make_room(self.parameters.drawn)[0]
+
+    def gaps(self) -> NDArray[np.float64]:
+        """Return the largest uncovered part of the subject in every view; see `TargetSet.gaps`."""
+        self.parameters.activate()
+        return self._targets.gaps(self.parameters.drawn)
+
+    def doubled(self, count: int) -> GaussianCloud:
+        """Return what was fitted with the most strained Gaussians split, ``count`` in all."""
+        rows = self.parameters.rows()
+        alive = self.parameters.alive()
+        rows = {name: array[alive] for name, array in rows.items()}
+        present = int(alive.sum())
+        stress = (self._stress.numpy() / np.maximum(self._seen.numpy(), 1.0))[alive]
+        strained = choose_strained(stress + 1e-30, np.ones(present, bool), max(count - present, 0))
+        grown = {name: np.concatenate([array, array[strained]]) for name, array in rows.items()}
+        split(grown, strained, present + np.arange(len(strained)))
+        orientations = grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True)
+        return GaussianCloud(
+            positions=grown["positions"],
+            orientations=orientations,
+            scales=np.exp(grown["log_scales"]),
+            opacities=(1.0 / (1.0 + np.exp(-grown["logits"]))).astype(np.float32),
+            radiance=grown["radiance"],
+            radiance_color_space=self.parameters.cloud().radiance_color_space,
+            ids=np.arange(len(grown["positions"])),
+        )
+
+    def _order(self, total: int) -> NDArray[np.int64]:
+        """Return which view each step looks at: all of them, shuffled, again and again."""
+        rng = np.random.default_rng(self.options.seed)
+        rounds = -(-total // len(self._targets))
+        return np.concatenate([rng.permutation(len(self._targets)) for _ in range(max(rounds, 1))])
+
+    def _set_rates(self, part: float) -> None:
+        """Let steps shrink: ``part`` of them have been taken."""
+        rates = self.options.rates
+        for name in self._adam.parameters:
+            final = rates.final_positions if name == "positions" else rates.final_others
+            self._adam.set_learning_rate(name, self._rates[name] * final**part)
+
+    def _renew(self) -> float:
+        """Bring the sampling filter and the room for pairs up to date; return the mean PSNR of the views [dB]."""
+        if self.options.sampling_filter:
+            self._limits.write(self.parameters.positions, self.parameters.filters)
+        self.parameters.activate()
+        psnr, is_new = self._targets.make_room(self.parameters.drawn)
+        if is_new:
+            self._graphs.clear()
+        return mean_psnr(psnr)
+
+    def _step(self, view: int) -> None:
+        """Draw a view, compare, and move the Gaussians."""
+        group, index = self._targets[view]
+        parameters, chosen = self.parameters, self.options
+        parameters.activate()
+        group.select(index)
+        group.rasterizer.redraw()
+        group.add_losses(index, self._weights)
+        drawn = group.rasterizer.backward()
+        launch_add_stress(drawn.positions, self._stress, self._seen, self.device)
+        self._add_regularizers(drawn)
+        parameters.zero_gradients()
+        parameters.add_gradients(drawn)
+        if self._temporal is not None:
+            self._temporal.add_gradients(chosen.temporal)
+        self._adam.step()
+
+    def _add_regularizers(self, drawn: GaussianGradients) -> None:
+        """Add the gradients of terms on what is drawn."""
+        chosen, gaussians = self.options, self.parameters.drawn
+        if chosen.anisotropy > 0.0:
+            self._anisotropy(gaussians.scales, weight=chosen.anisotropy, gradient=drawn.scales)
+        if chosen.opacity > 0.0:
+            self._opacity(gaussians.opacities, weight=chosen.opacity, gradient=drawn.opacities)
+
+    def _refine(self) -> None:
+        """Drop Gaussians that are not seen, and split strained ones into their rows."""
+        chosen = self.options
+        rows = self.parameters.rows()
+        stress, seen = self._stress.numpy(), self._seen.numpy()
+        alive = self.parameters.alive()
+        opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
+        dead = alive & ~(opacity >= chosen.dead_opacity)
+        if chosen.hidden_share > 0.0:
+            dead |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
+        if dead.sum() == alive.sum():  # all of them: nothing to go on from
+            dead[:] = False
+        prune(rows, dead)
+        alive &= ~dead
+        free = np.flatnonzero(~alive)
+        most = min(len(free), int(np.ceil(chosen.split_fraction * alive.sum())))
+        strained = choose_strained(stress / np.maximum(seen, 1.0), alive, most)
+        taken = free[: len(strained)]
+        split(rows, strained, taken)
+        self.parameters.set_rows(rows)
+        changed = dead.copy()
+        changed[strained] = changed[taken] = True
+        self._adam.restart(changed)
+        if self._temporal is not None:
+            self._temporal.hold(changed)
+        self._stress.zero_()
+        self._seen.zero_()
+
+
+class _Anchored:
+    """Terms that hold Gaussians to what they were in the frame before (E_temp)."""
+
+    UNITS: Mapping[str, float] = MappingProxyType({"radiance": 0.1, "log_scales": 0.1, "logits": 0.5})
+
+    def __init__(self, parameters: GaussianParameters, spacing: float) -> None:
+        self._parameters = parameters
+        self._units = {**self.UNITS, "positions": 0.1 * spacing}
+        self._terms = {}
+        for name in self._units:
+            rows = float_rows(getattr(parameters, name))
+            self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
+
+    def hold(self, changed: NDArray[np.bool_]) -> None:
+        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
+        for name, (_, reference) in self._terms.items():
+            held = reference.numpy().copy()
+            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
+            reference.assign(held)
+
+    def add_gradients(self, weight: float) -> None:
+        for name, (term, reference) in self._terms.items():
+            values, gradients = getattr(self._parameters, name), self._parameters.gradient(name)
+            term(
+                float_rows(values),
+                reference,
+                weight=weight,
+                unit=self._units[name],
+                gradient=float_rows(gradients),
+            )

@@ -1,0 +1,209 @@
+"""Coarse motion: where joints must be for the Gaussians that they carry to look like the next photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.checks import require_choice, require_count, require_number
+from beam_warp.device.arrays import upload
+from beam_warp.device.graphs import StepGraphs
+from beam_warp.errors import InvalidOptionError
+from beam_warp.raster.adam import Adam, Parameters
+from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.reconstruction.joints import JointGraph
+from beam_warp.reconstruction.motion_losses import RigidityLoss
+from beam_warp.reconstruction.skinning import BLENDS, Anchors, Skin
+from beam_warp.reconstruction.targets import LossWeights, TargetSet
+from beam_warp.world.gaussians import GaussianCloud
+
+
+@dataclass(frozen=True)
+class JointPose:
+    """Poses of all joints.
+
+    Attributes:
+        rotations: Against the frame before, quaternions xyzw, ``(M, 4)`` float32.
+        positions: ``(M, 3)`` float32 [m].
+    """
+
+    rotations: NDArray[np.float32]
+    positions: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions:
+    """How joints are moved.
+
+    Attributes:
+        levels: Reductions of the images, coarse to fine: the coarser, the further a motion is found.
+        iterations: Steps at each of them.
+        weights: What the images' terms count.
+        rigidity: What motion that is not rigid around each joint counts at full resolution (E_smooth); on reduced
+            images as many times less as these have fewer pixels: stiff joints turn too slowly for what is far away.
+        rotation_rate: Size of steps of quaternions at full resolution; at others as many times as they are reduced.
+        position_rate: Likewise, in distances between joints.
+        final_rate: Part of both that is left at the end of each level.
+        blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
+
+    Raises:
+        InvalidOptionError: An option is out of range, or levels and iterations are not as many.
+    """
+
+    levels: tuple[int, ...] = (8, 4, 2, 1)
+    iterations: tuple[int, ...] = (200, 200, 150, 200)
+    weights: LossWeights = field(default_factory=lambda: LossWeights(alpha=1.0))
+    rigidity: float = 1.0
+    rotation_rate: float = 5e-3
+    position_rate: float = 3e-2
+    final_rate: float = 0.1
+    blend: str = "linear"
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        if not len(self.levels) or len(self.levels) != len(self.iterations):
+            raise InvalidOptionError(
+                f"levels and iterations must be as many, at least one, got {len(self.levels)} and "
+                f"{len(self.iterations)}. Give each level its steps."
+            )
+        for level, iterations in zip(self.levels, self.iterations, strict=True):
+            require_count("levels", level)
+            require_count("iterations", iterations, 0)
+        for name in ("rigidity", "rotation_rate", "position_rate"):
+            require_number(name, getattr(self, name), 0.0)
+        require_number("final_rate", self.final_rate, 0.0, 1.0)
+        require_choice("blend", self.blend, BLENDS)
+
+
+class JointTracker:
+    """Joints, the Gaussians that they carry from the frame before, and the photographs of this one."""
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        anchors: Anchors,
+        graph: JointGraph,
+        joints: NDArray[np.float32],
+        options: JointOptions,
+        raster: RasterOptions,
+        device: Any,
+    ) -> None:
+        """Bring the frame before to a device.
+
+        Args:
+            cloud: Its Gaussians.
+            anchors: Of the Gaussians to the joints.
+            graph: Of the joints.
+            joints: Where they were, ``(M, 3)``.
+            options: See `JointOptions`.
+            raster: How splats are drawn.
+            device: Warp device.
+        """
+        self.device = device
+        self._options = options
+        self._raster = raster
+        count = len(joints)
+        self._count = len(cloud)
+        self._spacing = graph.spacing
+        self._skin = Skin(cloud.positions, cloud.orientations, anchors, joints, blend=options.blend, device=device)
+        self._rigidity = RigidityLoss(graph, device=device)
+        at_rest = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
+        self._rest_rotations = upload(at_rest, wp.quat, device)
+        self._rest_positions = upload(joints.astype(np.float32), wp.vec3, device)
+        self._rotations = wp.clone(self._rest_rotations)
+        self._positions = wp.clone(self._rest_positions)
+        self._rotation_gradients = wp.zeros(count, dtype=wp.quat, device=device)
+        self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
+        self._drawn = GaussianArrays(
+            wp.clone(self._skin.rest_positions),
+            wp.clone(self._skin.rest_orientations),
+            upload(cloud.scales, wp.vec3, device),
+            upload(cloud.opacities, float, device),
+            None,
+            upload(cloud.radiance, wp.vec3, device),  # type: ignore[arg-type]
+        )
+
+    def find(self, views: Sequence[CapturedView], start: JointPose, samples: int, seed: int) -> JointPose:
+        """Move the joints until what they carry looks like the views.
+
+        Args:
+            views: The photographs.
+            start: Poses to begin with.
+            samples: Side of the square of samples of a pixel at full resolution.
+            seed: Of the order of views.
+        """
+        chosen = self._options
+        wp.copy(self._rotations, upload(start.rotations, wp.quat, self.device))
+        wp.copy(self._positions, upload(start.positions, wp.vec3, self.device))
+        rng = np.random.default_rng(seed)
+        rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
+        for level, iterations in zip(chosen.levels, chosen.iterations, strict=True):
+            reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
+            targets = TargetSet(reduced, self._count, self._raster, samples if level == 1 else 1, self.device)
+            adam = Adam(
+                {
+                    "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),
+                    "positions": Parameters(self._positions, self._position_gradients, rates["positions"]),
+                }
+            )
+            graphs = StepGraphs(self.device)
+            self._carry()
+            targets.make_room(self._drawn)
+            rounds = -(-iterations // len(targets))
+            order = np.concatenate([rng.permutation(len(targets)) for _ in range(max(rounds, 1))])
+            for iteration in range(iterations):
+                for name, rate in rates.items():
+                    left = chosen.final_rate ** (iteration / iterations)
+                    adam.set_learning_rate(name, level * rate * left)
+                view = int(order[iteration])
+                graphs.run(view, partial(self._step, targets, view, adam, chosen.rigidity / level**2))
+        rotations = self._rotations.numpy().astype(np.float64)
+        rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
+        return JointPose(rotations.astype(np.float32), self._positions.numpy().copy())  # on the CPU it is the array
+
+    def carried(self, cloud: GaussianCloud) -> GaussianCloud:
+        """Return a cloud where the joints carry it now."""
+        self._carry()
+        orientations = self._drawn.orientations.numpy().astype(np.float64)
+        orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
+        positions = self._drawn.positions.numpy().copy()  # on the CPU it is the array
+        return cloud.with_arrays(positions=positions, orientations=orientations.astype(np.float32))
+
+    def _carry(self) -> None:
+        self._skin.warp(self._rotations, self._positions, self._drawn.positions, self._drawn.orientations)
+
+    def _step(self, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
+        """Draw a view, compare, and move the joints."""
+        group, index = targets[view]
+        self._carry()
+        group.select(index)
+        group.rasterizer.redraw()
+        group.add_losses(index, self._options.weights)
+        drawn = group.rasterizer.backward()
+        self._rotation_gradients.zero_()
+        self._position_gradients.zero_()
+        self._skin.add_gradients(
+            self._rotations,
+            self._positions,
+            drawn.positions,
+            drawn.orientations,
+            self._rotation_gradients,
+            self._position_gradients,
+        )
+        self._rigidity(
+            self._rotations,
+            self._positions,
+            self._rest_rotations,
+            self._rest_positions,
+            weight=rigidity,
+            rotation_gradients=self._rotation_gradients,
+            position_gradients=self._position_gradients,
+        )
+        adam.step()

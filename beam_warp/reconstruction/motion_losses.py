@@ -1,0 +1,191 @@
+"""How implausible a motion is, and how every joint and Gaussian should change: terms of a loss of tracking.
+
+As in `beam_warp.raster.losses`, a term called adds its gradients to arrays that other terms add to as well, and returns
+its value in an array of one element that it owns: valid until its next call. Nothing is allocated in a call and nothing
+waits for the device: calls may be captured in a CUDA graph, where weights stay as they were captured. Sums go in a
+fixed order: same device, same input, same bits.
+
+All are means, in units that the caller states or that follow from the joints: a weight means the same for any number of
+Gaussians and any unit of length.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import warp as wp
+
+from beam_warp.checks import require_count, require_number
+from beam_warp.device.array_checks import float_rows, require_vectors
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
+from beam_warp.kernels.reconstruction.rigidity import EdgeArrays, JointPoses, launch_add_rigidity
+from beam_warp.kernels.reconstruction.squared_difference import launch_add_squared_difference
+from beam_warp.reconstruction.joints import JointGraph
+
+MOST_FLOATS = 2**31 - 1
+"""Most floats of one term: their indices are 32-bit."""
+
+SMALLEST_UNIT = 1e-12
+"""Smallest unit of a difference; its inverse square is a float32."""
+
+
+class RigidityLoss:
+    """Unlikeness of the joints' motion to one that is rigid around each of them (E_smooth, as rigid as possible).
+
+    Source: Jiang et al. 2024, DualGS, E_smooth; there a sum over all edges in squared units of the world, here a mean
+    over the joints in squared joint spacings. `docs/tracking.md` says which weight is which.
+    """
+
+    def __init__(self, graph: JointGraph, *, device: Any = None) -> None:
+        """Upload a graph.
+
+        Args:
+            graph: Of the joints; its spacing is the unit of length.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            DeviceError: The device is not there.
+        """
+        self.device = resolve_device(device)
+        self._count = len(graph.neighbors)
+        self._spacing = graph.spacing
+        self._edges = EdgeArrays()
+        self._edges.neighbors = upload(graph.neighbors, int, self.device)
+        self._edges.weights = upload(graph.weights, float, self.device)
+        self._edges.incoming = upload(graph.incoming, int, self.device)
+        self._edges.incoming_starts = upload(graph.incoming_starts, int, self.device)
+        self._terms = wp.empty(self._count, dtype=float, device=self.device)
+        self._value = wp.zeros(1, dtype=float, device=self.device)
+        self._sums = SumBuffers(self.device)
+
+    def __call__(
+        self,
+        rotations: wp.array,
+        positions: wp.array,
+        previous_rotations: wp.array,
+        previous_positions: wp.array,
+        *,
+        weight: float = 1.0,
+        rotation_gradients: wp.array | None = None,
+        position_gradients: wp.array | None = None,
+    ) -> wp.array:
+        """Return weight / (M s^2) sum_i sum_j w_ij |R_i R_i,p^T (x_i - x_j)_p - (x_i - x_j)|^2, and add its gradients.
+
+        The sums are over the M joints and their edges, p is what came before, s is the graph's spacing. With the pose
+        at rest as the previous one (rotations of 0, 0, 0, 1) it is how far the shape is from the one at rest.
+
+        Args:
+            rotations: Of the joints now, against rest, xyzw, ``(M,)`` quat or vec4; of any length but 0.
+            positions: Now, ``(M,)`` vec3.
+            previous_rotations: Before, like ``rotations``. It has no gradient.
+            previous_positions: Before, like ``positions``. It has no gradient.
+            weight: The factor of the term, at least 0.
+            rotation_gradients: The derivative with respect to ``rotations`` is added to it, ``(M,)`` quat or vec4;
+                orthogonal to them, as their length changes nothing.
+            position_gradients: The derivative with respect to ``positions`` is added to it, ``(M,)`` vec3.
+
+        Raises:
+            InvalidArrayError: An array has another type, length or device.
+            InvalidOptionError: ``weight`` is negative.
+        """
+        scale = require_number("weight", weight, 0.0) / (self._count * self._spacing**2)
+        now, previous = JointPoses(), JointPoses()
+        now.rotations = self._vectors("rotations", rotations, 4)
+        now.positions = self._vectors("positions", positions, 3)
+        previous.rotations = self._vectors("previous_rotations", previous_rotations, 4)
+        previous.positions = self._vectors("previous_positions", previous_positions, 3)
+        launch_add_rigidity(
+            self._edges,
+            now,
+            previous,
+            scale,
+            self._terms,
+            None if rotation_gradients is None else self._vectors("rotation_gradients", rotation_gradients, 4),
+            None if position_gradients is None else self._vectors("position_gradients", position_gradients, 3),
+            self.device,
+        )
+        launch_sum_floats(self._terms, scale, self._sums, self._value, self.device)
+        return self._value
+
+    def _vectors(self, name: str, value: wp.array, width: int) -> wp.array:
+        return require_vectors(name, value, self._count, width, self.device)
+
+
+class TemporalLoss:
+    """Mean squared change of an attribute since another time (E_temp), in units of a change that matters.
+
+    Source: Jiang et al. 2024, DualGS, E_temp; there the norm of all changes of an attribute together, before its
+    activation, here the mean of their squares, and the caller says before or after.
+    """
+
+    def __init__(self, shape: int | tuple[int, ...], *, device: Any = None) -> None:
+        """Make buffers, 4 bytes for each float.
+
+        Args:
+            shape: N rows of one float, or ``(N, K)``: vec3 have K = 3, quaternions 4.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidOptionError: A size is out of range.
+            DeviceError: The device is not there.
+        """
+        sizes = (shape,) if isinstance(shape, int) else tuple(shape)
+        if len(sizes) not in (1, 2):
+            raise InvalidOptionError(f"shape must be (N,) or (N, K), got {shape!r}. Flatten what is within a row.")
+        rows, width = (*sizes, 1)[:2]
+        self._shape = (require_count("shape[0]", rows), require_count("shape[1]", width))
+        if math.prod(self._shape) > MOST_FLOATS:
+            raise InvalidOptionError(f"shape must have at most {MOST_FLOATS} floats, got {self._shape}. Use two terms.")
+        self.device = resolve_device(device)
+        self._terms = wp.empty(math.prod(self._shape), dtype=float, device=self.device)
+        self._value = wp.zeros(1, dtype=float, device=self.device)
+        self._sums = SumBuffers(self.device)
+
+    def __call__(
+        self,
+        values: wp.array,
+        reference: wp.array,
+        *,
+        weight: float = 1.0,
+        unit: float = 1.0,
+        gradient: wp.array | None = None,
+    ) -> wp.array:
+        """Return weight * mean over all floats of ((values - reference) / unit)^2, and add its gradient.
+
+        Quaternions are compared as they are: q and -q are 2 apart.
+
+        Args:
+            values: N floats, vectors or quaternions, contiguous, or ``(N, K)`` floats of any strides.
+            reference: What they were, like ``values`` or its rows as ``(N, K)`` floats. It has no gradient.
+            weight: The factor of the term, at least 0.
+            unit: The change that counts as 1, in the units of the values; at least 1e-12.
+            gradient: The derivative with respect to ``values`` is added to it, like ``reference``.
+
+        Raises:
+            InvalidArrayError: An array has another type, shape or device.
+            InvalidOptionError: ``weight`` is negative, or ``unit`` too small.
+        """
+        scale = require_number("weight", weight, 0.0) / require_number("unit", unit, SMALLEST_UNIT) ** 2
+        scale /= self._terms.size
+        launch_add_squared_difference(
+            self._rows("values", values),
+            self._rows("reference", reference),
+            scale,
+            self._terms,
+            None if gradient is None else self._rows("gradient", gradient),
+            self.device,
+        )
+        launch_sum_floats(self._terms, scale, self._sums, self._value, self.device)
+        return self._value
+
+    def _rows(self, name: str, value: Any) -> wp.array:
+        if not isinstance(value, wp.array) or value.device != self.device:
+            found = f"one on {value.device}" if isinstance(value, wp.array) else type(value).__name__
+            raise InvalidArrayError(f"{name} must be a warp array on {self.device}, got {found}. Move it there.")
+        rows = float_rows(value)
+        if rows.shape != self._shape:
+            raise InvalidArrayError(f"{name} must have {self._shape} floats, got {rows.shape}. Pass one row each.")
+        return rows

@@ -1,0 +1,190 @@
+"""Gaussians as an optimiser moves them: raw arrays on a device, what is drawn of them, and gradients back to them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.checks import require_choice, require_count
+from beam_warp.device.array_checks import float_rows
+from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.kernels.reconstruction.activation import (
+    Shapes,
+    launch_activate,
+    launch_add_rows,
+    launch_add_shape_gradients,
+)
+from beam_warp.raster.adam import Adam, Parameters
+from beam_warp.raster.records import GaussianArrays, GaussianGradients
+from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
+
+SMALLEST_SCALE = 1e-7
+"""What a thickness of 0 is moved from [m]."""
+
+LOGIT_LIMIT = 9.0
+"""Opacities of 0 and 1 are moved from sigmoid(-9) and sigmoid(9)."""
+
+DEAD_LOGIT = -30.0
+"""Logit of a row that is no Gaussian: it is not drawn, and has no gradient."""
+
+
+class GaussianParameters:
+    """Rows of Gaussians that steps of an optimiser move; rows without a Gaussian wait for one.
+
+    Attributes:
+        device: Where they are.
+        positions: ``(N,)`` vec3 [m].
+        orientations: ``(N,)`` quat xyzw, of any length.
+        radiance: ``(N, B)`` vec3 spherical harmonics, scene-linear.
+        drawn: What the rasteriser is given; `activate` brings scales and opacities up to date.
+    """
+
+    def __init__(self, cloud: GaussianCloud, device: Any, *, row_count: int | None = None, sh_degree: int = 2) -> None:
+        """Bring a cloud to a device.
+
+        Args:
+            cloud: Where steps begin, with scene-linear radiance.
+            device: Warp device.
+            row_count: Room for Gaussians, at least the cloud's; its number without.
+            sh_degree: Of the radiance; the cloud's is cut or filled up with zeros.
+
+        Raises:
+            InvalidArrayError: The cloud has no radiance, or not in scene-linear Rec.709.
+            InvalidOptionError: ``row_count`` or ``sh_degree`` is out of range.
+        """
+        captured = require_scene_linear("start", cloud)
+        count = len(cloud)
+        rows = count if row_count is None else require_count("row_count", row_count, count)
+        require_count("sh_degree", sh_degree, 0, MAX_SH_DEGREE)
+        self.device = device
+
+        def padded(array: Any, fill: float = 0.0) -> Any:
+            result = np.full((rows, *array.shape[1:]), fill, np.float32)
+            result[:count] = array
+            return result
+
+        bands = (sh_degree + 1) ** 2
+        radiance = np.zeros((count, bands, 3), np.float32)
+        kept = min(bands, captured.shape[1])
+        radiance[:, :kept] = captured[:, :kept]
+        opacities = np.clip(cloud.opacities.astype(np.float64), 1e-12, 1.0 - 1e-12)
+        logits = np.clip(np.log(opacities / (1.0 - opacities)), -LOGIT_LIMIT, LOGIT_LIMIT)
+        self.positions = upload(padded(cloud.positions), wp.vec3, device)
+        self.orientations = upload(padded(cloud.orientations), wp.quat, device)
+        self.radiance = upload(padded(radiance), wp.vec3, device)
+        self.log_scales = upload(padded(np.log(np.maximum(cloud.scales, SMALLEST_SCALE)), -10.0), wp.vec3, device)
+        self.logits = upload(padded(logits, DEAD_LOGIT), float, device)
+        self.filters = wp.zeros(rows, dtype=float, device=device)
+        self._gradients = {
+            name: wp.zeros_like(getattr(self, name))
+            for name in ("positions", "orientations", "radiance", "log_scales", "logits")
+        }
+        self.drawn = GaussianArrays(
+            self.positions,
+            self.orientations,
+            wp.zeros(rows, dtype=wp.vec3, device=device),
+            wp.zeros(rows, dtype=float, device=device),
+            None,
+            self.radiance,
+        )
+        self._shapes = Shapes()
+        self._shapes.log_scales, self._shapes.logits, self._shapes.filters = self.log_scales, self.logits, self.filters
+        self.activate()
+
+    def __len__(self) -> int:
+        """Return the number of rows, with a Gaussian or without."""
+        return self.positions.shape[0]
+
+    def activate(self) -> None:
+        """Bring the drawn scales and opacities up to date."""
+        launch_activate(self._shapes, self.drawn.scales, self.drawn.opacities, self.device)
+
+    def zero_gradients(self) -> None:
+        """Begin a new sum of gradients."""
+        for array in self._gradients.values():
+            array.zero_()
+
+    def add_gradients(self, drawn: GaussianGradients) -> None:
+        """Add the gradients of what was drawn, brought back to what is moved."""
+        for name in ("positions", "orientations", "radiance"):
+            launch_add_rows(float_rows(getattr(drawn, name)), float_rows(self._gradients[name]), self.device)
+        launch_add_shape_gradients(
+            self._shapes,
+            drawn.scales,
+            drawn.opacities,
+            self._gradients["log_scales"],
+            self._gradients["logits"],
+            self.device,
+        )
+
+    def gradient(self, name: str) -> wp.array:
+        """Return where the gradient of ``positions``, ``orientations``, ``radiance``, ``log_scales``, ``logits`` is."""
+        return self._gradients[name]
+
+    def optimizer(self, rates: dict[str, float]) -> Adam:
+        """Return what moves the rows.
+
+        Args:
+            rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0)
+                and ``bands`` (all others, if there are any); those left out stay.
+
+        Raises:
+            InvalidOptionError: There is no such group.
+        """
+        color, slope = float_rows(self.radiance), float_rows(self._gradients["radiance"])
+        groups = {name: (getattr(self, name), self._gradients[name]) for name in self._gradients if name != "radiance"}
+        groups["color"] = (color[:, :3], slope[:, :3])
+        if color.shape[1] > 3:
+            groups["bands"] = (color[:, 3:], slope[:, 3:])
+        for name in rates:
+            require_choice("rates", name, (*groups, "bands"))
+        return Adam({name: Parameters(*groups[name], rate) for name, rate in rates.items() if name in groups})
+
+    def rows(self) -> dict[str, Any]:
+        """Return what is moved as NumPy arrays, by name, row by row."""
+        return {name: getattr(self, name).numpy() for name in self._gradients}
+
+    def set_rows(self, rows: dict[str, Any]) -> None:
+        """Overwrite what is moved; arrays stay where they are, so that captured steps go on."""
+        for name, array in rows.items():
+            target = getattr(self, name)
+            wp.copy(target, upload(array, target.dtype, self.device))
+
+    def alive(self) -> Any:
+        """Return which rows hold a Gaussian, ``(N,)`` bool NumPy."""
+        return self.logits.numpy() > 0.5 * (DEAD_LOGIT - LOGIT_LIMIT)
+
+    def cloud(self) -> GaussianCloud:
+        """Return the Gaussians as they are drawn, rows without one left out."""
+        self.activate()
+        alive = self.alive()
+        orientations = self.orientations.numpy()[alive].astype(np.float64)
+        orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
+        return GaussianCloud(
+            positions=self.positions.numpy()[alive],
+            orientations=orientations.astype(np.float32),
+            scales=self.drawn.scales.numpy()[alive],
+            opacities=np.clip(self.drawn.opacities.numpy()[alive], 0.0, 1.0),
+            radiance=self.radiance.numpy()[alive],
+            radiance_color_space=LINEAR_REC709,
+            ids=np.flatnonzero(alive),
+        )
+
+
+def require_scene_linear(name: str, cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return a cloud's radiance after checking that it is light: display colours would be taken for it.
+
+    Raises:
+        InvalidArrayError: There is none, or not in scene-linear Rec.709.
+    """
+    if cloud.radiance is None or cloud.radiance_color_space != LINEAR_REC709:
+        raise InvalidArrayError(
+            f"{name} must have radiance in {LINEAR_REC709}, got {cloud.radiance_color_space or 'none'}. "
+            "Begin from initial_gaussians, or with a cloud that was fitted in linear light."
+        )
+    return cloud.radiance

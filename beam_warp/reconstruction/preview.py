@@ -1,0 +1,138 @@
+"""One picture of a reconstructed frame: photograph, render, what differs, and normals, from two sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.files import display_image
+from beam_warp.image.metrics import block_means
+from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.mesh.extract import mesh_of_gaussians
+from beam_warp.mesh.preview import shaded_image
+from beam_warp.raster.gbuffer import RADIANCE, SURFACE_NORMALS, rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+AMPLIFICATION = 8
+"""By how much differences are brightened: 1/8 of the display's range comes to white."""
+
+MOST_ROWS = 540
+"""Panels are reduced to at most so many rows of pixels."""
+
+FEWEST_ROWS = 240
+"""Panels of fewer rows are enlarged, so that their titles fit."""
+
+
+def opposite_cameras(cameras: Sequence[Camera]) -> list[int]:
+    """Return which two cameras look from sides furthest apart, the first of all being one; fewer if there are fewer."""
+    if len(cameras) < 2:
+        return list(range(len(cameras)))
+    forward = np.stack([camera.forward for camera in cameras])
+    return [0, 1 + int(np.argmin(forward[1:] @ forward[0]))]
+
+
+def reconstruction_preview(
+    cloud: GaussianCloud,
+    views: Sequence[CapturedView],
+    *,
+    shadings: Sequence[NDArray[np.uint8]] = (),
+    options: RasterOptions | None = None,
+    samples: int = 1,
+    device: str | None = None,
+) -> NDArray[np.uint8]:
+    """Draw a frame beside its photographs, a row for each view.
+
+    Args:
+        cloud: Gaussians with scene-linear radiance, axes "rfu".
+        views: What to compare with; images of one size.
+        shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
+            column out.
+        options: How splats are drawn: as they were when the Gaussians were fitted.
+        samples: Side of the square of samples of a pixel: likewise.
+        device: Warp device.
+
+    Returns:
+        8-bit sRGB, ``(H, W, 3)``.
+    """
+    cameras = [view.camera.supersampled(samples) for view in views]
+    buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
+    panels: list[Panel] = []
+    for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
+        alpha = block_means(buffer.alpha, samples)[..., None]
+        radiance, normals = (
+            _straight(block_means(buffer.channels[name] * buffer.alpha[..., None], samples), alpha)
+            for name in (RADIANCE, SURFACE_NORMALS)
+        )
+        photograph = _shown(view)
+        render = over_background(display_image(radiance) / 255.0, alpha)
+        difference = np.abs(photograph.astype(np.int16) - render) * AMPLIFICATION
+        if view.alpha is None:  # nothing is known of what lies around the subject
+            difference = np.rint(difference * alpha)
+        row: list[Panel] = [
+            (f"{view.name}: photograph", photograph),
+            ("render", render),
+            (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
+            ("normals (x, y, z as r, g, b)", over_background(0.5 * normals + 0.5, alpha)),
+        ]
+        if shadings:
+            row.append(("mesh", shadings[index]))
+        panels += [(title, _fitted(pixels)) for title, pixels in row]
+    return lay_out(panels, len(panels) // len(views))
+
+
+def mesh_shadings(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    shown: Sequence[int],
+    *,
+    options: RasterOptions | None = None,
+    device: str | None = None,
+) -> list[NDArray[np.uint8]]:
+    """Return what some cameras see of the surface that all of them see of a cloud, ``(H, W, 3)`` 8-bit sRGB each.
+
+    Args:
+        cloud: Gaussians.
+        cameras: From where its depth is drawn, with as few pixels as a preview shows.
+        shown: Which of them are shown.
+        options: How splats are drawn.
+        device: Warp device.
+
+    Returns:
+        A picture for each; none where there is no surface.
+    """
+    smaller = [camera.reduced(min(-(-camera.height // MOST_ROWS), camera.width)) for camera in cameras]
+    try:
+        mesh = mesh_of_gaussians(cloud, smaller, options=options, device=device)
+    except InvalidArrayError:
+        return []
+    return [shaded_image(mesh, cameras[index], device=device) for index in shown]
+
+
+def _shown(view: CapturedView) -> NDArray[np.uint8]:
+    """Return a photograph for a display, over the background where its coverage is known."""
+    alpha = np.ones(view.color.shape[:2], np.float32) if view.alpha is None else view.alpha
+    covered = alpha[..., None]
+    return over_background(display_image(_straight(view.color, covered)) / 255.0, covered)
+
+
+def _straight(premultiplied: NDArray[np.floating], alpha: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return an image without its alpha; 0 where that is 0."""
+    return np.divide(premultiplied, alpha, out=np.zeros_like(premultiplied), where=alpha > 0.0)
+
+
+def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Reduce or enlarge a panel by a whole factor."""
+    rows, columns = pixels.shape[:2]
+    factor = -(-rows // MOST_ROWS)
+    if factor > 1:
+        kept = pixels[: rows // factor * factor, : columns // factor * factor]
+        blocks = kept.reshape(rows // factor, factor, columns // factor, factor, -1)
+        return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+    factor = max(-(-FEWEST_ROWS // rows), 1)
+    return np.repeat(np.repeat(pixels, factor, axis=0), factor, axis=1)

@@ -1,0 +1,288 @@
+"""How skin Gaussians follow joints: what they are anchored to, the warp by the joints' poses, and its gradients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from beam_warp.checks import require_array, require_choice, require_count, require_finite, require_range
+from beam_warp.device.array_checks import require_vectors
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.reconstruction.skinning import (
+    MESSAGE,
+    MOST_JOINTS,
+    RUN,
+    RestSkin,
+    Runs,
+    launch_add_joint_gradients,
+    launch_sum_runs,
+    launch_warp_skin,
+    launch_write_messages,
+)
+from beam_warp.reconstruction.joints import (
+    REACH,
+    SMALLEST_COSINE,
+    group_by,
+    joint_spacing,
+    nearest_joints,
+    proximity_weights,
+    require_points,
+)
+
+BLENDS = ("linear", "dual")
+"""How the motions of several joints become one: as matrices' effect on points, or as dual quaternions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """Which joints carry each skin.
+
+    Attributes:
+        joints: Nearest first, ``(N, k)`` int32.
+        weights: Not negative, the first the largest of its row, each row adds up to 1, ``(N, k)`` float32.
+    """
+
+    joints: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+    @classmethod
+    def fit(
+        cls,
+        positions: ArrayLike,
+        joint_positions: ArrayLike,
+        *,
+        neighbor_count: int = 8,
+        normals: ArrayLike | None = None,
+        joint_normals: ArrayLike | None = None,
+        smallest_cosine: float = SMALLEST_COSINE,
+    ) -> Anchors:
+        """Anchor skins to their nearest joints, with weights exp(-d^2 / l^2), l = 1.5 joint spacings, that add up to 1.
+
+        A skin that is far from every joint (several l) follows the nearest.
+
+        Args:
+            positions: Of the skins at rest, ``(N, 3)``.
+            joint_positions: At rest, ``(M, 3)``.
+            neighbor_count: Joints for a skin, k; M if there are fewer.
+            normals: Which way the surface faces at each skin, outward, ``(N, 3)`` of any length; 0 where unknown.
+            joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin do not
+                carry it, unless all near ones do; see `JointGraph.build`.
+            smallest_cosine: Of the normals of a skin and a joint that do not face apart.
+
+        Raises:
+            InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
+            InvalidOptionError: ``neighbor_count`` is out of range.
+        """
+        skins, joints = require_points("positions", positions), require_points("joint_positions", joint_positions)
+        count = min(require_count("neighbor_count", neighbor_count, 1, 64), len(joints))
+        nearest, squared = nearest_joints(skins, joints, count, normals, joint_normals, smallest_cosine)
+        reach = REACH * joint_spacing(joints, None if normals is None else joint_normals, smallest_cosine)
+        return cls(nearest.astype(np.int32), proximity_weights(squared, reach))
+
+
+class Skin:
+    """Gaussians at rest that joints carry along.
+
+    A joint's pose is where it is and how it is turned against its rest, a quaternion xyzw of any length but 0. With
+    y_a = R_a (x - x_a,rest) + x_a, where joint a alone would carry the skin x,
+
+    - the orientation becomes b / |b| times the one at rest, b = sum of w_a s_a q_a over the unit quaternions of the
+      anchors; s_a = -1 for those of which -q_a is nearer to the first anchor's;
+    - ``"linear"``: the position becomes sum w_a y_a (linear blend skinning; joints that are turned apart pull the skin
+      inwards, by a half for 120 degrees and into the middle for 180);
+    - ``"dual"``: that of dual quaternion blending, which keeps volume where joints twist, and bulges where they bend.
+
+    All arrays stay on the device. Nothing is allocated in a call and nothing waits for the device: calls may be
+    captured in a CUDA graph. Sums go in a fixed order: same device, same input, same bits.
+
+    Attributes:
+        rest_positions: ``(N,)`` vec3; may be written to between calls.
+        rest_orientations: ``(N,)`` quat; likewise. Their lengths are kept.
+        joint_rest_positions: ``(M,)`` vec3; likewise.
+        blend: ``"linear"`` or ``"dual"``.
+        device: Where they are.
+
+    Source: Jiang et al. 2024, DualGS (anchors, linear blend); Kavan et al. 2008, "Geometric Skinning with Approximate
+    Dual Quaternion Blending"; `docs/tracking.md` lists what differs.
+    """
+
+    def __init__(
+        self,
+        rest_positions: ArrayLike,
+        rest_orientations: ArrayLike,
+        anchors: Anchors,
+        joint_rest_positions: ArrayLike,
+        *,
+        blend: str = "linear",
+        device: Any = None,
+    ) -> None:
+        """Upload skins and joints at rest; about 16 k + 80 bytes a skin.
+
+        Args:
+            rest_positions: ``(N, 3)``.
+            rest_orientations: Quaternions xyzw, ``(N, 4)``.
+            anchors: Of the N skins to the M joints.
+            joint_rest_positions: ``(M, 3)``.
+            blend: ``"linear"`` or ``"dual"``.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidArrayError: Arrays do not fit together, or are not finite.
+            InvalidOptionError: There is no such blend.
+            DeviceError: The device is not there.
+        """
+        skins = require_points("rest_positions", rest_positions)
+        orientations = require_array("rest_orientations", rest_orientations, (len(skins), 4))
+        require_finite("rest_orientations", orientations)
+        joints = require_points("joint_rest_positions", joint_rest_positions)
+        slots, weights = _slots(anchors, len(skins), len(joints))
+        self.blend = require_choice("blend", blend, BLENDS)
+        self.device = resolve_device(device)
+        self._counts = (len(skins), len(joints))
+        self.rest_positions = upload(skins.astype(np.float32), wp.vec3, self.device)
+        self.rest_orientations = upload(orientations, wp.quat, self.device)
+        self.joint_rest_positions = upload(joints.astype(np.float32), wp.vec3, self.device)
+        self._rest = RestSkin()
+        self._rest.positions = self.rest_positions
+        self._rest.orientations = self.rest_orientations.view(wp.vec4)
+        self._rest.joints = upload(slots.T, int, self.device)
+        self._rest.weights = upload(weights.T, float, self.device)
+        self._rest.joint_positions = self.joint_rest_positions
+        self._rest.dual = int(self.blend == "dual")
+        order = np.argsort(slots[:, 0], kind="stable")
+        self._rest.places = upload(np.argsort(order).astype(np.int32), int, self.device)
+        self._runs, run_count = _runs(slots[order], weights[order], len(joints), self.device)
+        self._messages = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
+        self._run_rotations = wp.empty(run_count, dtype=wp.vec4, device=self.device)
+        self._run_positions = wp.empty(run_count, dtype=wp.vec3, device=self.device)
+
+    def warp(
+        self, joint_rotations: wp.array, joint_positions: wp.array, out_positions: wp.array, out_orientations: wp.array
+    ) -> None:
+        """Write where the joints carry the skins.
+
+        Args:
+            joint_rotations: Against rest, xyzw, ``(M,)`` quat or vec4; of any length but 0.
+            joint_positions: ``(M,)`` vec3.
+            out_positions: Written, ``(N,)`` vec3.
+            out_orientations: Written, ``(N,)`` quat or vec4.
+
+        Raises:
+            InvalidArrayError: An array has another type, length or device.
+        """
+        rotations, positions = self._poses(joint_rotations, joint_positions)
+        launch_warp_skin(
+            self._rest,
+            rotations,
+            positions,
+            require_vectors("out_positions", out_positions, self._counts[0], 3, self.device),
+            require_vectors("out_orientations", out_orientations, self._counts[0], 4, self.device),
+            self.device,
+        )
+
+    def add_gradients(
+        self,
+        joint_rotations: wp.array,
+        joint_positions: wp.array,
+        position_gradients: wp.array | None,
+        orientation_gradients: wp.array | None,
+        out_rotation_gradients: wp.array,
+        out_position_gradients: wp.array,
+    ) -> None:
+        """Add the gradient of a loss with respect to the joints' poses, given those with respect to the warped skins.
+
+        Which of q and -q a rotation is blended as is held still.
+
+        Args:
+            joint_rotations: As for `warp`.
+            joint_positions: As for `warp`.
+            position_gradients: With respect to the warped positions, ``(N,)`` vec3; None for 0.
+            orientation_gradients: With respect to the warped orientations, ``(N,)`` quat or vec4; None for 0.
+            out_rotation_gradients: dL/drotation is added to it, ``(M,)`` quat or vec4; orthogonal to the rotations, as
+                their length changes nothing.
+            out_position_gradients: dL/dposition is added to it, ``(M,)`` vec3.
+
+        Raises:
+            InvalidArrayError: An array has another type, length or device.
+        """
+        skin_count, joint_count = self._counts
+        rotations, positions = self._poses(joint_rotations, joint_positions)
+        to_positions = to_orientations = None
+        if position_gradients is not None:
+            to_positions = require_vectors("position_gradients", position_gradients, skin_count, 3, self.device)
+        if orientation_gradients is not None:
+            to_orientations = require_vectors(
+                "orientation_gradients", orientation_gradients, skin_count, 4, self.device
+            )
+        out_rotations = require_vectors("out_rotation_gradients", out_rotation_gradients, joint_count, 4, self.device)
+        out_positions = require_vectors("out_position_gradients", out_position_gradients, joint_count, 3, self.device)
+        launch_write_messages(
+            self._rest, rotations, positions, to_positions, to_orientations, self._messages, self.device
+        )
+        launch_sum_runs(
+            self._rest,
+            self._runs,
+            rotations,
+            positions,
+            self._messages,
+            self._run_rotations,
+            self._run_positions,
+            self.device,
+        )
+        launch_add_joint_gradients(
+            self._runs,
+            rotations,
+            self._run_rotations,
+            self._run_positions,
+            out_rotations,
+            out_positions,
+            self.device,
+        )
+
+    def _poses(self, rotations: wp.array, positions: wp.array) -> tuple[wp.array, wp.array]:
+        """Return the joints' poses as kernels read them."""
+        count = self._counts[1]
+        return (
+            require_vectors("joint_rotations", rotations, count, 4, self.device),
+            require_vectors("joint_positions", positions, count, 3, self.device),
+        )
+
+
+def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return what skins are anchored to, checked."""
+    require_count("the number of joints", joint_count, 1, MOST_JOINTS)
+    joints = require_array("anchors.joints", anchors.joints, (skin_count, None), np.int32)
+    weights = require_array("anchors.weights", anchors.weights, joints.shape)
+    if not joints.shape[1]:
+        raise InvalidArrayError("anchors.joints must have at least one column, got none. Take it from Anchors.fit.")
+    require_range("anchors.joints", joints, 0, joint_count - 1, "Fit the anchors to these joints.")
+    require_range("anchors.weights", weights, 0.0, 1.0, "Divide each row by its sum.")
+    # The first anchor is what quaternions are turned towards: with the largest weight it keeps their sum from 0.
+    first, total = weights[:, 0], weights.sum(axis=1)
+    if not ((first >= weights.max(axis=1)) & (np.abs(total - 1.0) <= 1e-4)).all():
+        raise InvalidArrayError(
+            "anchors.weights must add up to 1 in each row and begin with the largest, got other rows. "
+            "Take them from Anchors.fit."
+        )
+    return joints, weights
+
+
+def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> tuple[Runs, int]:
+    """Return what hangs on each joint in runs of at most `RUN` skins, and how many; skins as their messages lie."""
+    pairs, starts = group_by(slots.ravel(), np.flatnonzero(weights.ravel() > 0.0), joint_count)
+    runs_of = -(-np.diff(starts) // RUN)
+    first_runs = np.concatenate([[0], np.cumsum(runs_of)])
+    joints = np.repeat(np.arange(joint_count), runs_of)
+    first_pairs = starts[joints] + RUN * (np.arange(len(joints)) - first_runs[joints])
+    runs = Runs()
+    runs.places = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
+    runs.weights = upload(weights.ravel()[pairs], float, device)
+    runs.first_pairs = upload(np.append(first_pairs, len(pairs)).astype(np.int32), int, device)
+    runs.joints = upload(joints.astype(np.int32), int, device)
+    runs.first_runs = upload(first_runs.astype(np.int32), int, device)
+    return runs, len(joints)

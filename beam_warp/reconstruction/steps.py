@@ -1,0 +1,156 @@
+"""How the Gaussians of a frame are found: the first one from a visual hull, by fitting; the next ones by tracking."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from beam_warp.capture.capture import SparsePoints
+from beam_warp.capture.findings import Finding
+from beam_warp.capture.views import CapturedView
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
+from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
+from beam_warp.reconstruction.image_motion import motion_in_pixels
+from beam_warp.reconstruction.initial import initial_gaussians
+from beam_warp.reconstruction.job import StepProgress
+from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.world.gaussians import GaussianCloud
+
+MOST_UNPAIRED = 0.5
+"""Part of the Gaussians that fewer than two views see from which on that is said: most of the surface."""
+
+STRUCTURE_REACH = 5
+"""Half a window of structural similarity [pixel]: what lies farther from its place has no pull towards it. At the
+coarsest level of tracking a pixel is as many as its reduction."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitAndTrack:
+    """The steps that `beam_warp.reconstruction.job.reconstruct` takes; see `beam_warp.reconstruction.job.FrameSteps`.
+
+    Attributes:
+        fitting: How key frames are fitted.
+        tracking: How other frames follow from the one before; drawn and compared as `fitting` says.
+        points: What is known of the surfaces before, for images without masks; None if nothing is.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+    """
+
+    fitting: FitOptions = field(default_factory=FitOptions)
+    tracking: TrackOptions = field(default_factory=TrackOptions)
+    points: SparsePoints | None = None
+    device: str | None = None
+
+    @property
+    def raster(self) -> RasterOptions:
+        """How splats are drawn."""
+        return self.fitting.raster
+
+    @property
+    def _tracking(self) -> TrackOptions:
+        return self.tracking.following(self.fitting)
+
+    def options(self) -> Mapping[str, Any]:
+        """Return all that results depend on, but for the device; JSON-able."""
+        return {
+            "fitting": asdict(self.fitting),
+            "tracking": asdict(self._tracking),
+            "points": None if self.points is None else _digest(self.points),
+        }
+
+    def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
+        """Fit a key frame from its images alone, their exposures matched."""
+        start, findings, said = self._start(views), [], {}
+        if all(view.alpha is not None for view in views):  # else it is no surface, and does not say who sees what
+            up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
+            gains = view_gains(start, outward_normals(start, up), views, device=self.device)
+            findings = judge_gains(gains, views)
+            if findings:
+                views = matched(views, gains)
+                start = self._start(views)  # of colours that agree
+            unpaired = float((gains.views_of_points < 2).mean())
+            said = {**_exposures(gains), "unpaired": unpaired}
+            if unpaired > MOST_UNPAIRED:
+                findings.append(_few_cameras(unpaired))
+        fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
+        track = begin_track(fit.cloud, views, self._tracking, device=self.device)
+        return track, {**fit.report, **said, "findings": [vars(finding) for finding in findings]}
+
+    def advance(
+        self, track: Track, views: Sequence[CapturedView], progress: StepProgress
+    ) -> tuple[Track, dict[str, Any]]:
+        """Track the frame after, exposures of its images matched."""
+        gains = view_gains(track.cloud, track.normals(), views, device=self.device)
+        findings = judge_gains(gains, views)
+        views = matched(views, gains)
+        following, report = advance_track(track, views, self._tracking, device=self.device, progress=progress)
+        cameras = [view.camera for view in views]
+        motion = motion_in_pixels(track.joints, following.joints, cameras)
+        surprise = motion_in_pixels(2.0 * track.joints - track.previous_joints, following.joints, cameras)
+        reach = STRUCTURE_REACH * max(self._tracking.joints.levels)
+        if not surprise.max() <= reach:
+            findings.append(
+                Finding(
+                    "warning",
+                    "fast-motion",
+                    f"a joint moved {surprise.max():.0f} pixels from where it was expected, where {reach} are found "
+                    "for certain",
+                    remedy="Record more frames a second, or plan shorter segments.",
+                )
+            )
+        if report["lost"]:
+            covered = report["gap"] <= track.baseline[1] + self._tracking.largest_gap
+            code = "tracking-lost" if covered else "new-surface"
+            findings.append(Finding("warning", code, f"tracking is lost: {report['lost']}"))
+        said = {
+            **_exposures(gains),
+            "motion": {"median": float(np.median(motion)), "largest": float(motion.max())},
+            "surprise": float(surprise.max()),
+            "findings": [vars(finding) for finding in findings],
+        }
+        return following, {**report, **said}
+
+    def _start(self, views: Sequence[CapturedView]) -> GaussianCloud:
+        """Return what a fit begins with."""
+        known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
+        return initial_gaussians(
+            views,
+            self.fitting.gaussian_count,
+            points=None if known is None else known.positions,
+            point_colors=None if known is None else known.colors,
+            device=self.device,
+            seed=self.fitting.seed,
+        )
+
+    def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
+        """Return the track whose arrays these are."""
+        return Track.from_arrays(arrays)
+
+
+def _few_cameras(unpaired: float) -> Finding:
+    """Say that cameras are too few, or too far apart, to see depth."""
+    return Finding(
+        "warning",
+        "few-cameras",
+        f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of outlines",
+        remedy="Add cameras.",
+    )
+
+
+def _exposures(gains: ViewGains) -> dict[str, float]:
+    """Return what a report says of exposures [stop]."""
+    off = np.abs(gains.stops)
+    return {"exposure_spread": float(np.nanmax(off))} if np.isfinite(off).any() else {}
+
+
+def _digest(points: SparsePoints) -> str:
+    digest = hashlib.blake2b(np.ascontiguousarray(points.positions).tobytes(), digest_size=16)
+    if points.colors is not None:
+        digest.update(np.ascontiguousarray(points.colors).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,354 @@
+"""What the renders of Gaussians should look like: photographs on a device, cropped, encoded, and the losses to them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.checks import require_number
+from beam_warp.device.array_checks import pixel_channels
+from beam_warp.device.arrays import upload
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
+from beam_warp.kernels.reconstruction.display_encoding import (
+    launch_add_sample_gradients,
+    launch_average,
+    launch_encode,
+    launch_spread,
+    launch_square_error,
+)
+from beam_warp.raster.depth_normals import DepthNormals
+from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
+from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
+from beam_warp.raster.records import GaussianArrays, RasterOptions
+
+CROP_MARGIN = 8
+"""Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
+
+CROP_STEP = 16
+"""Crops are multiples of it: a tile of the rasteriser."""
+
+
+MOST_SAMPLES = 4
+"""Side of the square of samples of a pixel."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """What the terms of a step count.
+
+    Attributes:
+        l1: Mean absolute difference of encoded colours.
+        ssim: One minus the structural similarity of encoded colours.
+        alpha: Mean absolute difference of coverage, where it is known.
+        normal: Disagreement of the Gaussians' normals with those of the drawn depth (BEAM Eq. 2).
+
+    Raises:
+        InvalidOptionError: A weight is negative or no number.
+    """
+
+    l1: float = 0.8
+    ssim: float = 0.2
+    alpha: float = 0.5
+    normal: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check every weight once; a term that counts 0 is left out, and NaN must not pass for it."""
+        for name in ("l1", "ssim", "alpha", "normal"):
+            require_number(name, getattr(self, name), 0.0)
+
+
+def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
+    """Return the parts of the views where the subject is, of one size for all that have the same resolution.
+
+    Views whose coverage is not known stay whole. Renders and losses cost as much as there are pixels.
+    """
+    boxes = [_box(view) for view in views]
+    sizes: dict[tuple[int, int], list[int]] = {}
+    for view, box in zip(views, boxes, strict=True):
+        largest = sizes.setdefault((view.camera.width, view.camera.height), [CROP_STEP, CROP_STEP])
+        for axis in range(2):
+            side = box[1][axis] - box[0][axis] + 2 * CROP_MARGIN
+            largest[axis] = max(largest[axis], -(-side // CROP_STEP) * CROP_STEP)
+    result = []
+    for view, (low, high) in zip(views, boxes, strict=True):
+        whole = (view.camera.width, view.camera.height)
+        size = [min(side, full) for side, full in zip(sizes[whole], whole, strict=True)]
+        starts = [
+            int(np.clip((low[axis] + high[axis] - size[axis]) // 2, 0, whole[axis] - size[axis])) for axis in range(2)
+        ]
+        result.append(view.cropped(*starts, *size))
+    return result
+
+
+def _box(view: CapturedView) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first column and row of the subject, and the ones after its last."""
+    if view.alpha is None:
+        return (0, 0), (view.camera.width, view.camera.height)
+    rows, columns = (np.flatnonzero((view.alpha > 0.0).any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return (0, 0), (0, 0)
+    return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
+
+
+class ViewTargets:
+    """The photographs of views of one size, and how renders of Gaussians differ from them.
+
+    Attributes:
+        rasterizer: Draws one view at a time: `select` says which.
+        cameras: What it draws for, with as many pixels as there are samples.
+        height: Of every view [pixel].
+        width: Of every view [pixel].
+    """
+
+    def __init__(
+        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+    ) -> None:
+        """Bring views to a device.
+
+        Args:
+            views: Of one size.
+            gaussian_count: Rows that are drawn.
+            options: How splats are drawn.
+            samples: Side of the square of samples that a pixel is the mean of.
+            device: Warp device.
+        """
+        cameras = tuple(view.camera.supersampled(samples) for view in views)
+        self.cameras = cameras
+        self._weigher: Rasterizer | None = None
+        self.rasterizer = Rasterizer(
+            gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
+        )
+        self.device = self.rasterizer.device
+        self.height, self.width = views[0].camera.height, views[0].camera.width
+        self._samples = samples
+        self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
+        self._colors = [upload(linear_to_srgb(view.color), float, self.device) for view in views]
+        self._alphas = [
+            None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
+        ]
+        self._subjects = [
+            self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
+        ]
+        self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
+        size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
+        images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
+        colors, normals = self.rasterizer.color_channels.start, self.rasterizer.normal_channels.start
+        self._color, self._to_color = (
+            pixel_channels(part.channels[0], *fine, colors, 3) for part in (images, adjoints)
+        )
+        self._normal, self._to_normal = (
+            pixel_channels(part.channels[0], *fine, normals, 3) for part in (images, adjoints)
+        )
+        self._alpha, self._to_alpha = (part.alpha.reshape((*fine, 1)) for part in (images, adjoints))
+        self._depth, self._to_depth = (part.depth.reshape(fine) for part in (images, adjoints))
+        self._coverage = images.alpha.reshape(fine)
+        self._encoded, self._to_encoded = (wp.zeros((*size, 3), dtype=float, device=self.device) for _ in range(2))
+        self._covered, self._to_covered = (wp.zeros((*size, 1), dtype=float, device=self.device) for _ in range(2))
+        self._surface, self._to_surface = (wp.zeros((*fine, 3), dtype=float, device=self.device) for _ in range(2))
+        self._l1, self._ssim = L1Loss(*size, device=self.device), SsimLoss(*size, device=self.device)
+        self._l1_alpha, self._agreement = L1Loss(*size, 1, device=self.device), NormalLoss(*fine, device=self.device)
+        self._adjoints = adjoints
+        self._errors = wp.empty(self.height * self.width, dtype=float, device=self.device)
+        self._error = wp.zeros(1, dtype=float, device=self.device)
+        self._sums = SumBuffers(self.device)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self._colors)
+
+    def select(self, index: int) -> None:
+        """Look from a view; may be captured in a CUDA graph."""
+        self.rasterizer.set_cameras(self._cameras[index])
+
+    def add_losses(self, index: int, weights: LossWeights) -> list[wp.array]:
+        """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
+
+        Returns:
+            The terms that count, one element each: colour, structure, coverage, normals.
+        """
+        self._adjoints.zero_()
+        self._to_encoded.zero_()
+        launch_encode(self._color, self._samples, self._encoded, self.device)
+        target = self._colors[index]
+        terms = [
+            self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded),
+        ]
+        if weights.ssim > 0.0:
+            terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
+        launch_add_sample_gradients(self._color, self._samples, self._to_encoded, self._to_color, self.device)
+        alpha = self._alphas[index]
+        if alpha is not None and weights.alpha > 0.0:
+            self._to_covered.zero_()
+            launch_average(self._alpha, self._samples, self._covered, self.device)
+            terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
+            launch_spread(self._to_covered, self._samples, self._to_alpha, self.device)
+        if weights.normal > 0.0:
+            self._to_surface.zero_()
+            geometry = self._depth_normals[index]
+            geometry.write(self._depth, self._coverage, self._surface)
+            terms.append(
+                self._agreement(
+                    self._normal,
+                    self._surface,
+                    weight=weights.normal,
+                    mask=self._coverage,
+                    rendered_gradient=self._to_normal,
+                    expected_gradient=self._to_surface,
+                )
+            )
+            geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
+        return terms
+
+    def shares(self, index: int, gaussians: GaussianArrays) -> NDArray[np.float32]:
+        """Return what each Gaussian shows of itself in a view: its weights summed over the pixels, ``(N,)`` [pixel]."""
+        count = gaussians.positions.shape[0]
+        if self._weigher is None:
+            self._weigher = Rasterizer(
+                count, [self.cameras[index]], value_count=1, options=self.rasterizer.options, device=self.device
+            )
+        weigher = self._weigher
+        weigher.set_cameras([self.cameras[index]])
+        ones = wp.full((count, 1), 1.0, dtype=float, device=self.device)
+        weigher.draw(gaussians._replace(values=ones, radiance=None))
+        adjoints = weigher.adjoints()
+        adjoints.channels[0].fill_(1.0)  # derivatives of the image's sum to what is composited are the weights
+        values = weigher.backward().values
+        assert values is not None
+        return values.numpy()[:, 0] / np.float32(self._samples**2)
+
+    def psnr(self, index: int) -> float:
+        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB].
+
+        NaN for a view that shows nothing of the subject: black is easily met, and says nothing.
+        """
+        if self._alphas[index] is not None and not self._subjects[index]:
+            return math.nan
+        launch_encode(self._color, self._samples, self._encoded, self.device)
+        launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
+        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
+        return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
+
+    def draw(self, index: int, gaussians: GaussianArrays) -> None:
+        """Draw Gaussians for a view, with as much room as they take."""
+        self.select(index)
+        self.rasterizer.draw(gaussians)
+
+    def subject_pixels(self, index: int) -> int:
+        """Return how many pixels of a view the subject covers; all without alpha."""
+        return self._subjects[index]
+
+    def missed(self, index: int) -> NDArray[np.bool_]:
+        """Return which pixels of the subject what was drawn last does not cover, ``(H, W)``; none without alpha."""
+        alpha = self._alphas[index]
+        if alpha is None:
+            return np.zeros((self.height, self.width), bool)
+        launch_average(self._alpha, self._samples, self._covered, self.device)
+        return ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+
+
+class TargetSet:
+    """Views of any sizes, each at hand by its number.
+
+    Attributes:
+        device: Where they are.
+    """
+
+    def __init__(
+        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+    ) -> None:
+        """Crop views to the subject and bring them to a device; see `ViewTargets`."""
+        by_size: dict[tuple[int, int], list[int]] = {}
+        cropped = crop_views(views)
+        for number, view in enumerate(cropped):
+            by_size.setdefault((view.camera.width, view.camera.height), []).append(number)
+        self.device = device
+        self._places: list[tuple[ViewTargets, int]] = [None] * len(cropped)  # type: ignore[list-item]
+        self._groups = []
+        for numbers in by_size.values():
+            group = ViewTargets([cropped[number] for number in numbers], gaussian_count, options, samples, device)
+            self._groups.append(group)
+            for index, number in enumerate(numbers):
+                self._places[number] = (group, index)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self._places)
+
+    def __getitem__(self, number: int) -> tuple[ViewTargets, int]:
+        """Return where a view is: among which, and at which place."""
+        return self._places[number]
+
+    def make_room(self, gaussians: GaussianArrays) -> tuple[NDArray[np.float64], bool]:
+        """Draw every view, with as much room as it takes.
+
+        Returns:
+            PSNR of each crop, encoded and clipped to [0, 1] [dB], NaN where nothing of the subject is, ``(V,)``; and
+            whether room had to be made: then what was recorded with the old arrays must be recorded again.
+        """
+        before = [group.rasterizer.pair_capacity for group in self._groups]
+        psnr = []
+        for group, index in self._places:
+            group.draw(index, gaussians)
+            psnr.append(group.psnr(index))
+        for group in self._groups:
+            group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
+        return np.array(psnr), before != [group.rasterizer.pair_capacity for group in self._groups]
+
+    def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
+        total = np.zeros(gaussians.positions.shape[0])
+        for group, index in self._places:
+            total += group.shares(index, gaussians)
+        return total
+
+    def seen_directions(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Return the mean direction from each Gaussian to the views, by how much they see of it, ``(N, 3)``.
+
+        It lies on the side of a surface from which it is seen; it is 0 for what no view sees.
+        """
+        positions = gaussians.positions.numpy().astype(np.float64)
+        total = np.zeros_like(positions)
+        for group, index in self._places:
+            towards = group.cameras[index].position - positions
+            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            total += group.shares(index, gaussians)[:, None] * towards
+        return total
+
+    def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
+        """Draw every view; return the largest connected part of its subject that is not drawn, a fraction, ``(V,)``."""
+        gaps = []
+        for group, index in self._places:
+            group.draw(index, gaussians)
+            labelled: Any = ndimage.label(group.missed(index))  # its types say that it may be a number
+            parts, count = labelled
+            largest = np.bincount(parts.ravel())[1:].max() if count else 0
+            gaps.append(largest / max(group.subject_pixels(index), 1))
+        return np.array(gaps)
+
+
+def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:
+    """Return how many samples a pixel's side needs, so that two fall on the distance of neighbouring Gaussians.
+
+    At silhouettes many layers lie behind each other, so that their blurred edges are opaque further out than half of
+    the blur, and what is fitted shrinks to make up for it, by half a pixel. Samples finer than the Gaussians keep that
+    below their own size.
+
+    Args:
+        views: What is fitted.
+        center: Of the subject [m], ``(3,)``.
+        spacing: Distance of neighbouring Gaussians [m].
+    """
+    footprints = [float((center - view.camera.position) @ view.camera.forward) / view.camera.focal_x for view in views]
+    footprint = float(np.median(footprints))
+    if not footprint > 0.0:
+        return 1
+    return int(np.ceil(2.0 * footprint / spacing)) if MOST_SAMPLES * spacing > 2.0 * footprint else MOST_SAMPLES

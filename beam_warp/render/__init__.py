@@ -1,0 +1,1 @@
+"""Renderers: deferred shading in real time, path tracing offline, and pictures of channels."""

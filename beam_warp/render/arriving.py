@@ -1,0 +1,257 @@
+"""What light arrives where, for deferred shading: shadow maps of lights and of an environment's regions, and bounces.
+
+The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. What
+arrives at a Gaussian is the irradiance in closed form times the share that its regions leave, and what surfaces around
+it send (``kernels/render/cluster_bounces.py``); it is blended into pixels like a material.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from beam_warp.device.arrays import upload
+from beam_warp.device.morton import morton_order
+from beam_warp.kernels.light.lights import Lights
+from beam_warp.kernels.render.cluster_bounces import (
+    Clusters,
+    launch_bounce_clusters,
+    launch_gather_bounces,
+    launch_sum_clusters,
+)
+from beam_warp.kernels.render.gaussian_light import RegionShadows, launch_light_gaussians
+from beam_warp.kernels.render.shadow_maps import ShadowMaps
+from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows
+from beam_warp.kernels.trace.incident_light import LightMoments
+from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.regions import EnvironmentRegions
+from beam_warp.light.uploaded import upload_lights
+from beam_warp.raster.records import GaussianArrays
+from beam_warp.render.options import DeferredOptions
+from beam_warp.render.shadow_maps import ShadowDrawer, ShadowView, Subject, distant_view, light_views
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.lights import Light
+
+CLUSTER_COUNT = 1024
+"""Clusters that light bounces between: a subject of 1.7 m has one every 5 cm."""
+
+LIGHT_TAPS, REGION_TAPS = (16, 32), (8, 12)
+"""Taps that search, and that filter: of a light's map, and of a region's, whose errors are averaged over regions."""
+
+KEPT_ENVIRONMENTS = 8
+"""How many environments made ready are kept."""
+
+NO_LIGHT = EnvironmentMap.constant((0.0, 0.0, 0.0), height=4)
+"""What stands for no environment."""
+
+
+class PreparedEnvironments:
+    """Environments made ready on a device, the last few that were asked for."""
+
+    def __init__(self, region_count: int, device: Any) -> None:
+        """Begin without any; ``region_count`` 0 cuts none."""
+        self._region_count, self._device = region_count, device
+        self._kept: dict[EnvironmentMap, tuple[EnvironmentLighting, EnvironmentRegions | None]] = {}
+
+    def of(self, environment: EnvironmentMap) -> tuple[EnvironmentLighting, EnvironmentRegions | None]:
+        """Return what was made of an environment; it is made if it is not the same object as one of the last few."""
+        if environment not in self._kept:
+            lighting = EnvironmentLighting.from_environment(environment, device=str(self._device))
+            lit = self._region_count and environment is not NO_LIGHT
+            regions = EnvironmentRegions.of(environment, self._region_count) if lit else None
+            self._kept[environment] = (lighting, regions)
+            if len(self._kept) > KEPT_ENVIRONMENTS:
+                del self._kept[next(iter(self._kept))]
+        return self._kept[environment]
+
+
+class ArrivingLight:
+    """Lights and an environment on a device, their shadow maps, and what of them arrives at Gaussians.
+
+    Attributes:
+        distant: The environment, for kernels.
+        regions: Its shadows.
+        lights: Other lights.
+        shadows: Theirs.
+        generation: Grows whenever what launches are given becomes another: graphs of them must be recorded again.
+    """
+
+    def __init__(
+        self, gaussian_count: int, options: DeferredOptions, environments: PreparedEnvironments, device: Any
+    ) -> None:
+        """Allocate for some number of Gaussians; there is no light yet."""
+        self._count, self._options, self._environments, self._device = gaussian_count, options, environments, device
+        cluster_count = min(CLUSTER_COUNT, gaussian_count)
+        with wp.ScopedDevice(device):
+            self._arriving = wp.zeros(gaussian_count, dtype=wp.vec4)
+            self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
+            self._clusters = _zero_clusters(gaussian_count, cluster_count)
+            self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
+            self.distant = DistantLight()
+            self.distant.turn = wp.zeros(1, dtype=wp.vec2)
+            self._moments = LightMoments()
+            self._no_radiosity = wp.zeros(0, dtype=wp.vec3)
+        self._no_maps = ShadowMaps()
+        self.regions = RegionShadows()
+        self.lights = Lights()
+        self.shadows = LightShadows()
+        self.generation = 0
+        self._region_drawer: ShadowDrawer | None = None
+        self._light_drawer: ShadowDrawer | None = None
+        self._shown: Any = None
+        self._lamps: tuple[Light, ...] | None = None
+        self._map_counts: list[int] = []
+        self._stale = {"regions": True, "lights": True}
+
+    def order(self, positions: wp.array) -> None:
+        """Cluster Gaussians that are near each other; to be called once for every cloud."""
+        if self._count and self._options.bounces:
+            everybody = wp.full(self._count, 1, dtype=int, device=self._device)
+            items, _ = morton_order(positions, positions, everybody)
+            wp.copy(self._clusters.order, items, count=self._count)
+
+    def set_environment(
+        self, environment: EnvironmentMap | None, degrees: float, subject: Subject, *, moved: bool
+    ) -> None:
+        """Take an environment, as turned about z; ``moved`` says that what casts shadows is another."""
+        shown = environment or NO_LIGHT
+        if (shown, degrees) == self._shown and not moved:
+            return
+        lighting, regions = self._environments.of(shown)
+        if self._shown is None or shown is not self._shown[0]:
+            self.distant.light = lighting.light
+            self.generation += 1
+        angle = np.radians(degrees)
+        self.distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
+        self._set_regions(None if regions is None else regions.turned(degrees), subject)
+        self._shown = (shown, degrees)
+
+    def _set_regions(self, regions: EnvironmentRegions | None, subject: Subject) -> None:
+        """Bring regions to the device."""
+        count = 0 if regions is None else len(regions)
+        if self._moments.red is None or len(self._moments.red) != count:
+            for name in ("red", "green", "blue"):
+                setattr(self._moments, name, wp.zeros(count, dtype=wp.vec4, device=self._device))
+            self._region_drawer = None
+        views = []
+        if regions is not None:
+            for name, moments in zip(("red", "green", "blue"), regions.moments, strict=True):
+                getattr(self._moments, name).assign(moments.astype(np.float32))
+            size = self._options.environment_map_size
+            pairs = zip(regions.directions, regions.half_angles, strict=True)
+            views = [distant_view(direction, float(half), subject, size) for direction, half in pairs]
+        self._region_drawer = self._moved(self._region_drawer, views, subject, REGION_TAPS)
+        self.regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
+        self.regions.moments = self._moments
+        self._stale["regions"] = True
+
+    def set_lights(self, lights: tuple[Light, ...], subject: Subject, *, moved: bool) -> None:
+        """Take lights; ``moved`` says that what casts shadows is another."""
+        if lights == self._lamps and not moved:
+            return
+        views = [
+            light_views(light, subject, self._options.light_map_size) if light.casts_shadows else [] for light in lights
+        ]
+        counts = [len(of_light) for of_light in views]
+        uploaded = upload_lights(lights, self._device)
+        if self._lamps is None or counts != self._map_counts:
+            self.lights = uploaded
+            starts = np.concatenate([[0], np.cumsum(counts)])[: max(len(lights), 1)]
+            self.shadows.first_maps = upload(starts.astype(np.int32), int, self._device)
+            self.shadows.map_counts = upload(np.array(counts or [0], np.int32), int, self._device)
+            self._light_drawer = None
+            self.generation += 1
+        else:
+            for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
+                wp.copy(getattr(self.lights, name), getattr(uploaded, name))
+        self._light_drawer = self._moved(
+            self._light_drawer, [view for of_light in views for view in of_light], subject, LIGHT_TAPS
+        )
+        self.shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
+        self._lamps, self._map_counts = lights, counts
+        self._stale["lights"] = True
+
+    def _moved(
+        self, drawer: ShadowDrawer | None, views: list[ShadowView], subject: Subject, taps: tuple[int, int]
+    ) -> ShadowDrawer | None:
+        """Return what draws some views: the same as before if their number is."""
+        if not views:
+            return None
+        if drawer is None:
+            self.generation += 1
+            return ShadowDrawer(self._count, views, subject=subject, taps=taps, device=self._device)
+        if drawer.maps.thickness != np.float32(subject.thickness):
+            self.generation += 1
+        drawer.move(views, subject)
+        return drawer
+
+    def draw(self, gaussians: GaussianArrays, mesh: Any) -> None:
+        """Draw the maps that are out of date, however much room they take, and light the Gaussians.
+
+        Args:
+            gaussians: The Gaussians; if their values have room for what arrives, it is written there.
+            mesh: A `beam_warp.kernels.mesh.surface.MeshSurface`, or None.
+        """
+        stale = any(self._stale.values())
+        if self._region_drawer is not None and self._stale["regions"]:
+            self._region_drawer.draw(gaussians, mesh)
+        if self._light_drawer is not None and self._stale["lights"]:
+            self._light_drawer.draw(gaussians, mesh)
+        self._stale = dict.fromkeys(self._stale, False)
+        if stale:
+            self._light(gaussians)
+
+    def redraw(self, gaussians: GaussianArrays) -> None:
+        """Draw all maps again and light the Gaussians, without waiting; see `Rasterizer.redraw`."""
+        for drawer in (self._region_drawer, self._light_drawer):
+            if drawer is not None:
+                drawer.redraw()
+        self._light(gaussians)
+
+    @property
+    def capacities(self) -> tuple[int, ...]:
+        """Room for pairs of what draws maps: where it changes, graphs must be recorded again."""
+        drawers = (self._region_drawer, self._light_drawer)
+        return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
+
+    def _light(self, gaussians: GaussianArrays) -> None:
+        """Find what arrives at the Gaussians."""
+        if not self._options.lights_gaussians or not self._count:
+            return
+        launch_light_gaussians(
+            gaussians,
+            self.distant,
+            self.regions,
+            self.lights,
+            self.shadows,
+            self._arriving,
+            self._lit,
+            self._device,
+        )
+        radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
+        launch_gather_bounces(
+            gaussians.positions, self._arriving, self._clusters, radiosity, gaussians.values, self._device
+        )
+
+    def _bounced(self, gaussians: GaussianArrays) -> wp.array:
+        """Return the radiosity of the clusters after all bounces but the last."""
+        launch_sum_clusters(gaussians, self._lit, self.distant.light.albedo_terms, self._clusters, self._device)
+        radiosity = self._clusters.sent
+        for bounce in range(self._options.bounces - 1):
+            following = self._radiosity[bounce % 2]
+            launch_bounce_clusters(self._clusters, radiosity, following, self._device)
+            radiosity = following
+        return radiosity
+
+
+def _zero_clusters(count: int, cluster_count: int) -> Clusters:
+    """Allocate clusters on the current device."""
+    clusters = Clusters()
+    clusters.order = wp.zeros(count, dtype=int)
+    for name in ("positions", "normals", "reflectance", "sent"):
+        setattr(clusters, name, wp.zeros(cluster_count, dtype=wp.vec3))
+    for name in ("areas", "occlusion"):
+        setattr(clusters, name, wp.zeros(cluster_count, dtype=float))
+    return clusters

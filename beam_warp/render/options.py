@@ -1,0 +1,56 @@
+"""How shots are shaded by deferred rendering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beam_warp.checks import require_choice, require_count
+from beam_warp.errors import InvalidOptionError
+from beam_warp.light.regions import MOST_REGIONS
+
+LAYERS = ("base_color", "roughness", "ambient_occlusion", "normals", "depth")
+"""Every layer that an image may come with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeferredOptions:
+    """How shots are shaded.
+
+    Attributes:
+        environment_shadows: Directions that stand for the environment where shadows are cast, a power of two; 0 takes
+            ambient occlusion instead.
+        bounces: How often light goes from surface to surface of the Gaussians; 0 for none.
+        light_map_size: Side of every light's shadow maps [texel].
+        environment_map_size: Side of the environment's shadow maps [texel].
+        samples: Side of the square of samples of a pixel: the image is their mean.
+        layers: Of `LAYERS`, what images come with besides colour and alpha.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    environment_shadows: int = 16
+    bounces: int = 2
+    light_map_size: int = 1024
+    environment_map_size: int = 256
+    samples: int = 1
+    layers: tuple[str, ...] = LAYERS
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        count = require_count("environment_shadows", self.environment_shadows, 0, MOST_REGIONS)
+        if count & (count - 1):
+            raise InvalidOptionError(
+                f"environment_shadows must be 0 or a power of two, got {count}. Choose {2 ** (count.bit_length() - 1)}."
+            )
+        require_count("bounces", self.bounces, 0, 16)
+        require_count("light_map_size", self.light_map_size, 16, 8192)
+        require_count("environment_map_size", self.environment_map_size, 16, 4096)
+        require_count("samples", self.samples, 1, 16)
+        for name in self.layers:
+            require_choice("layers", name, LAYERS)
+
+    @property
+    def lights_gaussians(self) -> bool:
+        """Whether what arrives is found for every Gaussian, and not only for pixels."""
+        return bool(self.environment_shadows or self.bounces)

@@ -1,0 +1,1 @@
+"""Cases on which methods fail, and what becomes of them here."""

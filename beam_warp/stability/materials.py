@@ -1,0 +1,312 @@
+"""What the measurement of materials makes of subjects and lights on which it fails: what it found, how far it is off.
+
+A case fails if what must be found or flagged was not, if something is found where nothing is wrong, if base colours are
+wrong without a word, or if the run ends in anything but materials or a refusal where one is asked for.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.capture.findings import Finding
+from beam_warp.device.arrays import device_label, resolve_device
+from beam_warp.errors import BeamError
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.agreement import (
+    judge_clipping,
+    judge_environment,
+    largest_value,
+    match_silhouettes,
+    require_match,
+)
+from beam_warp.materials.base_color import BaseColor, solve_base_color
+from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.light import check_light
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialCase, MaterialStress, MaterialStudio
+from beam_warp.trace.scene import Scene
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import Observability
+
+FLAGGED = 0.9
+"""Part of the Gaussians that a case is about from which on they count as flagged."""
+
+LIGHT_SUBSET = 256
+"""Gaussians that the light is checked by: on a ball so many see all of it."""
+
+WRONG = 0.1
+STATED = 3.0
+"""A base colour is wrong without a word if it is off by more than the former, and by more than so many stated standard
+errors, of a Gaussian without a flag, and nothing was found."""
+
+SILENT_PART = 0.02
+"""Part of all Gaussians that may be wrong without a word. Of the sound ball 0.002 are: some by its poles, which
+silhouettes show alone, and by what the photographs blur between neighbours."""
+
+
+@dataclass(frozen=True)
+class ColorErrors:
+    """How far base colours of some Gaussians are off, over channels.
+
+    Attributes:
+        count: How many Gaussians.
+        median: Median absolute error.
+        high: Its 95 % quantile.
+        stated: Median of the stated standard error.
+        within: Part within two stated standard errors: 0.95 or more where they are honest.
+        flags: Part with each flag, by name; those that none has are left out.
+    """
+
+    count: int
+    median: float
+    high: float
+    stated: float
+    within: float
+    flags: Mapping[str, float]
+
+    @classmethod
+    def of(cls, solved: BaseColor, truth: NDArray[np.float32], rows: NDArray[np.bool_]) -> ColorErrors | None:
+        """Measure some rows; None if there are none."""
+        if not rows.any():
+            return None
+        error, stated = np.abs(solved.base_color - truth)[rows], solved.standard_error[rows]
+        found = solved.observability[rows]
+        parts = {flag.name or "": float((found & np.uint8(flag) != 0).mean()) for flag in Observability if flag}
+        return cls(
+            count=int(rows.sum()),
+            median=float(np.median(error)),
+            high=float(np.quantile(error, 0.95)),
+            stated=float(np.median(stated)),
+            within=float((error <= 2.0 * stated).mean()),
+            flags={name: part for name, part in parts.items() if part > 0.0},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOutcome:
+    """What became of one case.
+
+    Attributes:
+        case: Its name.
+        device: Warp device.
+        gaussians: How many.
+        views: Photographs.
+        found: Codes of what was found.
+        refused: The error it was refused with; empty if it was not.
+        hit: Of the Gaussians that the case is about; None if it is about none, or was refused.
+        rest: Of the others.
+        silent: Part of all that is wrong without a word.
+        faults: What should not be; empty if all is well.
+        seconds: Time of the measurement.
+    """
+
+    case: str
+    device: str
+    gaussians: int
+    views: int
+    found: tuple[str, ...] = ()
+    refused: str = ""
+    hit: ColorErrors | None = None
+    rest: ColorErrors | None = None
+    silent: float = 0.0
+    faults: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is at fault."""
+        return not self.faults
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-able record."""
+        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        parts = {name: None if record[name] is None else dict(vars(record[name])) for name in ("hit", "rest")}
+        lists = {"found": list(self.found), "faults": list(self.faults)}
+        return record | parts | lists | {"passed": self.passed, "seconds": round(self.seconds, 3)}
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> MaterialOutcome:
+        """Return what `as_dict` gave."""
+        values = {entry.name: record[entry.name] for entry in fields(cls)}
+        parts = {name: None if values[name] is None else ColorErrors(**values[name]) for name in ("hit", "rest")}
+        return cls(**{**values, **parts, "found": tuple(values["found"]), "faults": tuple(values["faults"])})
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Where cases are run; lights that cases share are prepared once.
+
+    Attributes:
+        studio: Where they come from; its device is also that of the measurement.
+    """
+
+    studio: MaterialStudio
+    _lights: dict[int, tuple[EnvironmentMap, MaterialLight]] = field(default_factory=dict)
+
+    def light(self, environment: EnvironmentMap) -> MaterialLight:
+        """Return a light prepared on the device."""
+        if id(environment) not in self._lights:  # the map is held beside, so that its id stays its own
+            prepared = MaterialLight.from_environment(environment, resolve_device(self.studio.device))
+            self._lights[id(environment)] = (environment, prepared)
+        return self._lights[id(environment)][1]
+
+
+def run_material_cases(
+    studio: MaterialStudio,
+    cases: Sequence[MaterialCase],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[MaterialOutcome]:
+    """Run case after case.
+
+    Args:
+        studio: Where they come from.
+        cases: From `MATERIAL_CASES`.
+        progress: Called with (cases done, cases in all).
+    """
+    bench = Bench(studio)
+    for done, case in enumerate(cases, start=1):
+        yield run_material_case(bench, case)
+        if progress is not None:
+            progress(done, len(cases))
+
+
+def run_material_case(bench: Bench, case: MaterialCase) -> MaterialOutcome:
+    """Measure one case and judge it."""
+    stress = case.build(bench.studio)
+    known: dict[str, Any] = {
+        "case": case.name,
+        "device": device_label(wp.get_device(resolve_device(bench.studio.device))),
+        "gaussians": len(stress.cloud),
+        "views": len(stress.views),
+    }
+    start = time.perf_counter()
+    try:
+        solved, findings = decompose(bench, stress)
+    except BeamError as error:
+        faults = () if stress.refused else (f"refused: {error}",)
+        return MaterialOutcome(**known, refused=str(error), faults=faults, seconds=time.perf_counter() - start)
+    except Exception as error:  # a crash is a finding of this suite, and the other cases are still to be run
+        crash = f"ended with {type(error).__name__}: {error}"
+        return MaterialOutcome(**known, faults=(crash,), seconds=time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    silent = 0.0 if any(finding.severity != "note" for finding in findings) else silent_part(solved, stress.base_color)
+    return MaterialOutcome(
+        **known,
+        found=tuple(finding.code for finding in findings),
+        hit=ColorErrors.of(solved, stress.base_color, stress.hit),
+        rest=ColorErrors.of(solved, stress.base_color, ~stress.hit),
+        silent=silent,
+        faults=tuple(_faults(stress, solved, findings, silent)),
+        seconds=seconds,
+    )
+
+
+def decompose(bench: Bench, stress: MaterialStress) -> tuple[BaseColor, list[Finding]]:
+    """Check and measure what a case gives, as `beam decompose` does with one frame.
+
+    Raises:
+        BeamError: It is refused.
+    """
+    device = bench.studio.device
+    ceiling = largest_value(stress.views, stress.color_space)
+    match = match_silhouettes(stress.cloud, stress.views, device=device)
+    require_match(match)
+    findings = judge_environment(stress.environment) + judge_clipping(stress.views, ceiling)
+    findings += [] if match.finding is None else [match.finding]
+    cameras = [view.camera for view in stress.views]
+    evidence = view_evidence(stress.cloud, cameras, stress.views, ceiling=ceiling, device=device)
+    scene = Scene.from_gaussians(stress.cloud, device)
+    points = SurfacePoints.seen_by(stress.cloud, evidence, scene)
+    findings += check_light(scene, points, evidence, stress.environment, subset=LIGHT_SUBSET).findings
+    light = bench.light(stress.environment)
+    measured = measure_materials(
+        stress.cloud, scene, points, stress.roughness, light, options=MaterialOptions(), views=evidence
+    )
+    normals = np.where(points.seen[:, None], evidence.normals.numpy(), np.array([0.0, 0.0, 1.0], np.float32))
+    cloud = stress.cloud.with_arrays(normals=normals, normal_confidence=points.confidence)
+    return solve_base_color(cloud, measured.evidence, light.mean_irradiance), findings
+
+
+def silent_part(solved: BaseColor, truth: NDArray[np.float32]) -> float:
+    """Return which part of all Gaussians is wrong without a word."""
+    error = np.abs(solved.base_color - truth)
+    wrong = ((error > WRONG) & ~(error <= STATED * solved.standard_error)).any(axis=1)
+    return float((wrong & (solved.observability == 0)).mean())
+
+
+def _faults(stress: MaterialStress, solved: BaseColor, findings: Sequence[Finding], silent: float) -> list[str]:
+    """Return what should not be."""
+    if stress.refused:
+        return ["must be refused, and was not"]
+    faults = []
+    if not (np.isfinite(solved.base_color).all() and np.isfinite(solved.standard_error).all()):
+        faults.append("base colours or errors are not finite")
+    codes = {finding.code for finding in findings if finding.severity != "note"}
+    if stress.finding and stress.finding not in codes:
+        faults.append(f"not found: {stress.finding}")
+    faults += [f"found where it is not: {code}" for code in sorted(codes - {stress.finding})]
+    if stress.flags and stress.hit.any():
+        flagged = float((solved.observability[stress.hit] & np.uint8(stress.flags) != 0).mean())
+        if not flagged >= FLAGGED:
+            faults.append(f"{flagged:.0%} flagged as {stress.flags.name}, {FLAGGED:.0%} must be")
+    if not silent <= SILENT_PART:
+        faults.append(f"{silent:.1%} wrong without a word")
+    return faults
+
+
+TITLES = (
+    "case",
+    "a decomposition without precautions",
+    "must",
+    "found",
+    "flagged, of what it is about",
+    "error there: median, 95 %",
+    "stated there",
+    "within 2 stated",
+    "error elsewhere: median, 95 %",
+    "within 2 stated",
+    "wrong without a word",
+    "verdict",
+)
+
+
+def markdown_table(outcomes: Sequence[MaterialOutcome]) -> str:
+    """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
+    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
+    for case in MATERIAL_CASES:
+        lines += [
+            _row((case.name, case.fails, case.must, *cells(outcome)))
+            for outcome in outcomes
+            if outcome.case == case.name
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def cells(outcome: MaterialOutcome) -> tuple[str, ...]:
+    """Return what a table says of a case, from *found* on."""
+    hit, rest = outcome.hit, outcome.rest
+    flags = {} if hit is None else hit.flags
+    return (
+        f"refused: {outcome.refused}" if outcome.refused else ", ".join(outcome.found) or "nothing",
+        ", ".join(f"{name} {part:.0%}" for name, part in flags.items() if part >= 0.01) or "–",
+        "–" if hit is None else f"{hit.median:.3f}, {hit.high:.3f}",
+        "–" if hit is None else f"{hit.stated:.3f}",
+        "–" if hit is None else f"{hit.within:.0%}",
+        "–" if rest is None else f"{rest.median:.3f}, {rest.high:.3f}",
+        "–" if rest is None else f"{rest.within:.0%}",
+        "–" if outcome.refused else f"{outcome.silent:.1%}",
+        "; ".join(outcome.faults) or "ok",
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

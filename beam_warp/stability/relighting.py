@@ -1,0 +1,278 @@
+"""What renderers make of subjects and lights on which relighting fails: what was measured, and whether it holds.
+
+The path tracer draws every case with several seeds: what is measured is the mean over them, with its standard error
+from their spread. A bound is missed if the mean is beyond it by more than chance explains; if chance explains more than
+the bounds leave room for, nothing was shown, and that is a fault too.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from beam_warp.device.arrays import device_label, resolve_device
+from beam_warp.errors import BeamError
+from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
+from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.stability.relighting_cases import (
+    DEFERRED,
+    PATH,
+    RELIGHTING_CASES,
+    RENDERERS,
+    Demand,
+    Drawn,
+    RelightingCase,
+    RelightStress,
+    RelightStudio,
+)
+from beam_warp.world.shot import ImageRenderer, RenderedImage, Shot
+
+SEEDS = 8
+"""Images of the path tracer by which its noise is told."""
+
+LARGEST_T = 7.06
+"""Standard errors, estimated from `SEEDS` values, that chance explains: Student's t of 7 degrees of freedom exceeds it
+either way with a probability of 2e-4."""
+
+REFERENCE_SEED = 1000
+REFERENCE_TIMES = 4
+"""Of the samples of a reference, how many times as many as an image's."""
+
+BOUNCES = 4
+
+
+@dataclass(frozen=True)
+class Held:
+    """What was measured for one demand.
+
+    Attributes:
+        what: It is.
+        value: The mean over seeds.
+        error: Its standard error; 0 for a renderer without noise.
+        low: It must not be below.
+        high: It must not be above.
+        because: Where the bounds come from.
+    """
+
+    what: str
+    value: float
+    error: float
+    low: float
+    high: float
+    because: str
+
+    @property
+    def fault(self) -> str:
+        """What is wrong; empty if nothing is. NaN is."""
+        chance = LARGEST_T * self.error
+        if not self.low - chance <= self.value <= self.high + chance:
+            return f"{self.what} must be {self.asked}, got {self.measured}"
+        if not chance <= max(self.high - self.low, 0.0):
+            return f"{self.what} must be {self.asked}, got {self.measured}, too noisy to tell"
+        return ""
+
+    @property
+    def asked(self) -> str:
+        """The bounds, for a table."""
+        if self.low == self.high:
+            return f"{self.high:.4g}"
+        return f"at most {self.high:.4g}" if self.low == 0.0 else f"{self.low:.4g} … {self.high:.4g}"
+
+    @property
+    def measured(self) -> str:
+        """The value, for a table."""
+        return f"{self.value:.4g}" + (f" ± {self.error:.1g}" if self.error > 0.0 else "")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelightingOutcome:
+    """What one renderer made of one case.
+
+    Attributes:
+        case: Its name.
+        renderer: ``"deferred"`` or ``"path"``.
+        device: Warp device.
+        gaussians: How many, in the largest shot.
+        size: Columns and rows of the images.
+        samples: Of a pixel, for each seed; 1 for the deferred renderer.
+        done: What happened to the input.
+        held: What was measured.
+        faults: What should not be; empty if all is well.
+        seconds: Time of the first images, compilation included.
+    """
+
+    case: str
+    renderer: str
+    device: str
+    gaussians: int
+    size: tuple[int, int]
+    samples: int
+    done: str = "nothing"
+    held: tuple[Held, ...] = ()
+    faults: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is at fault."""
+        return not self.faults
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-able record."""
+        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        lists = {"size": list(self.size), "faults": list(self.faults), "held": [dict(vars(row)) for row in self.held]}
+        return record | lists | {"passed": self.passed, "seconds": round(self.seconds, 3)}
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> RelightingOutcome:
+        """Return what `as_dict` gave."""
+        values: dict[str, Any] = {entry.name: record[entry.name] for entry in fields(cls)}
+        lists: dict[str, Any] = {name: tuple(values[name]) for name in ("size", "faults")}
+        lists["held"] = tuple(Held(**row) for row in values["held"])
+        return cls(**values | lists)
+
+
+@dataclass(frozen=True, eq=False)
+class RelightingBench:
+    """Where cases are drawn.
+
+    Attributes:
+        studio: Where they come from.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+        deferred: How the deferred renderer draws.
+        seeds: Images of the path tracer.
+    """
+
+    studio: RelightStudio = field(default_factory=RelightStudio)
+    device: str | None = None
+    deferred: DeferredOptions = field(default_factory=DeferredOptions)
+    seeds: int = SEEDS
+
+    def renderer(self, name: str, seed: int = 0, *, times: int = 1) -> ImageRenderer:
+        """Return a renderer that drew nothing yet, with so many times the samples."""
+        if name == DEFERRED:
+            return DeferredRenderer(self.deferred, device=self.device)
+        options = PathOptions(samples=times * self.studio.samples, bounces=BOUNCES, seed=seed)
+        return PathRenderer(options, device=resolve_device(self.device))
+
+    def draw(self, shots: Sequence[Shot], name: str, seed: int = 0, *, times: int = 1) -> list[RenderedImage]:
+        """Draw shots with one renderer."""
+        renderer = self.renderer(name, seed, times=times)
+        return [renderer.draw(shot) for shot in shots]
+
+
+def run_relighting_cases(
+    bench: RelightingBench,
+    cases: Sequence[RelightingCase],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[RelightingOutcome]:
+    """Run case after case with every renderer.
+
+    Args:
+        bench: Where they are drawn.
+        cases: From `RELIGHTING_CASES`.
+        progress: Called with (cases done, cases in all).
+    """
+    for done, case in enumerate(cases, start=1):
+        stress = case.build(bench.studio)
+        for name in RENDERERS:
+            yield run_relighting_case(bench, case.name, stress, name)
+        if progress is not None:
+            progress(done, len(cases))
+
+
+def run_relighting_case(bench: RelightingBench, case: str, stress: RelightStress, renderer: str) -> RelightingOutcome:
+    """Draw one case with one renderer and judge it."""
+    camera = stress.shots[0].camera
+    known = RelightingOutcome(
+        case=case,
+        renderer=renderer,
+        device=device_label(wp.get_device(resolve_device(bench.device))),
+        gaussians=max(len(shot.cloud) for shot in stress.shots),
+        size=(camera.width, camera.height),
+        samples=1 if renderer == DEFERRED else bench.studio.samples,
+        done=stress.done,
+    )
+    demands = [demand for demand in stress.demands if renderer in demand.of]
+    start, seconds, values, faults = time.perf_counter(), 0.0, [], []
+    try:
+        reference = cache(lambda: bench.draw(stress.shots, PATH, REFERENCE_SEED, times=REFERENCE_TIMES))
+        for seed in range(bench.seeds if renderer == PATH and stress.noisy else 1):
+            images = bench.draw(stress.shots, renderer, seed)
+            seconds = seconds or time.perf_counter() - start
+            faults += [fault for fault in image_faults(images) if fault not in faults]
+            drawn = Drawn(images, partial(_draw_alone, bench, stress, renderer, seed), reference)
+            values.append([demand.measure(drawn) for demand in demands])
+    except BeamError as error:
+        return replace(known, faults=(f"refused: {error}",), seconds=time.perf_counter() - start)
+    except Exception as error:  # a crash is a finding of this suite, and the other cases are still to be run
+        crash = f"ended with {type(error).__name__}: {error}"
+        return replace(known, faults=(crash,), seconds=time.perf_counter() - start)
+    held = tuple(hold(demand, of_seeds) for demand, of_seeds in zip(demands, np.transpose(values), strict=True))
+    faults += [row.fault for row in held if row.fault]
+    return replace(known, held=held, faults=tuple(faults), seconds=seconds)
+
+
+def _draw_alone(bench: RelightingBench, stress: RelightStress, renderer: str, seed: int) -> list[RenderedImage]:
+    """Draw every shot with a renderer of its own."""
+    return [bench.draw([shot], renderer, seed)[0] for shot in stress.shots]
+
+
+def hold(demand: Demand, values: Sequence[float]) -> Held:
+    """Return what was measured over seeds, in the demand's bounds."""
+    found = np.asarray(values, np.float64)
+    error = float(found.std(ddof=1) / np.sqrt(len(found))) if len(found) > 1 else 0.0
+    return Held(demand.what, float(found.mean()), error, demand.low, demand.high, demand.because)
+
+
+def image_faults(images: Sequence[RenderedImage]) -> list[str]:
+    """Return what no image may have."""
+    faults = []
+    for image in images:
+        for name, array in {"rgb": image.rgb, "alpha": image.alpha, **image.layers}.items():
+            if not np.isfinite(array).all():
+                faults.append(f"{name} is not finite in {(~np.isfinite(array)).sum()} values")
+        if not ((image.alpha >= 0.0) & (image.alpha <= 1.0)).all():
+            faults.append(f"alpha must be in [0, 1], got {image.alpha.min():g} … {image.alpha.max():g}")
+        if not (image.rgb >= 0.0).all():
+            faults.append(f"radiance must not be negative, got {image.rgb.min():g}")
+    return faults
+
+
+TITLES = ("case", "a renderer without precautions", "must", "renderer", "measured", "asked", "verdict")
+
+
+def markdown_table(outcomes: Sequence[RelightingOutcome]) -> str:
+    """Return the outcomes as a table for a page, a row for every case and renderer, in the order of the registry."""
+    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
+    for case in RELIGHTING_CASES:
+        lines += [
+            _row((case.name, case.fails, case.must, *cells(outcome)))
+            for outcome in outcomes
+            if outcome.case == case.name
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def cells(outcome: RelightingOutcome) -> tuple[str, ...]:
+    """Return what a table says of a case, from *renderer* on."""
+    measured = "; ".join(f"{row.what}: {row.measured}" for row in outcome.held) or "–"
+    if outcome.done != "nothing":
+        measured = f"{outcome.done}; {measured}"
+    return (
+        outcome.renderer,
+        measured,
+        "; ".join(f"{row.asked} ({row.because})" for row in outcome.held) or "–",
+        "; ".join(outcome.faults) or "ok",
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

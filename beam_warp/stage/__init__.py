@@ -1,0 +1,1 @@
+"""What is rendered over time: assets, meshes, lights and cameras on a stage, and where frames go."""

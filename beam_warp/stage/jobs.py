@@ -1,0 +1,223 @@
+"""Rendering many images: which are to be done, one after the other, and what is left when it is interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp._version import __version__
+from beam_warp.errors import OutputError
+from beam_warp.image.files import read_image
+from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
+from beam_warp.stage.output import Film, FrameLog, FramePattern, require_folder
+from beam_warp.stage.pictures import PictureWriter
+from beam_warp.stage.shot_digests import ShotDigests
+from beam_warp.world.camera import Camera
+from beam_warp.world.shot import RenderedImage, Shot
+
+
+class Report(Protocol):
+    """Hears how far a stage of the work is."""
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
+
+
+class ShotSource(Protocol):
+    """What is rendered, over time: a `beam_warp.stage.stage.Stage`."""
+
+    def shot(self, time: float, width: int, height: int) -> Shot:
+        """Return what is to be rendered at a time [s], for an image of a size [pixel]."""
+        ...
+
+
+@dataclass(frozen=True)
+class FrameContext:
+    """What a renderer may use besides the shot.
+
+    Attributes:
+        number: Of the frame in its sequence.
+        checkpoint: Where it may keep what is done of it.
+        report: Told (samples done, samples at most) of a frame that takes long.
+    """
+
+    number: int
+    checkpoint: Path
+    report: Callable[[int, int], None]
+
+
+class FrameRenderer(Protocol):
+    """Renders the frames of a sequence."""
+
+    @property
+    def decisive(self) -> tuple[Any, ...]:
+        """Plain data that decides the images besides their shots."""
+        ...
+
+    def draw(self, shot: Shot, context: FrameContext) -> RenderedImage:
+        """Render one frame."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """One image to render.
+
+    Attributes:
+        number: In its sequence.
+        time: On the stage [s].
+        width: Of the image [pixel].
+        height: Of the image [pixel].
+        camera: Who looks, instead of the stage's own camera.
+    """
+
+    number: int
+    time: float
+    width: int
+    height: int
+    camera: Camera | None = None
+
+
+@dataclass(eq=False)
+class Tally:
+    """What was done.
+
+    Attributes:
+        rendered: Numbers of the frames that were rendered now, in order.
+        kept: Numbers of those that were there.
+        gaussian_count: Most Gaussians of an image that was rendered now.
+    """
+
+    rendered: list[int] = field(default_factory=list)
+    kept: list[int] = field(default_factory=list)
+    gaussian_count: int = 0
+
+
+class RenderInterruptedError(KeyboardInterrupt):
+    """Somebody stopped a render; its message says what is there and how to go on."""
+
+
+class RenderJob:
+    """Renders frames of a stage with one renderer into files of one kind."""
+
+    def __init__(self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: Report) -> None:
+        """Take what is rendered, by whom, how it is shown, and who wants to know."""
+        self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
+        self._digests = ShotDigests(__version__, renderer.decisive, writer.options)
+
+    def render_stills(self, images: Sequence[tuple[Frame, Path]]) -> Tally:
+        """Render single images, writing over what is there; frames in the order of time are read once.
+
+        Raises:
+            OutputError: One cannot be written.
+            RenderInterruptedError: Interrupted; images are whole or not there.
+        """
+        tally = Tally()
+        try:
+            for frame, path in images:
+                self._draw(frame, path, tally)
+                self._report("render", len(tally.rendered), len(images))
+        except KeyboardInterrupt as error:
+            done = f"{len(tally.rendered)} of {len(images)} images are written"
+            if any(_checkpoint(path).exists() for _, path in images):
+                done += "; of the next one what is done is kept, and the same command goes on from there"
+            raise RenderInterruptedError(done) from error
+        return tally
+
+    def render_frames(self, pattern: FramePattern, frames: Sequence[Frame], *, overwrite: bool = False) -> Tally:
+        """Render numbered images; those that are there and of this render are kept.
+
+        Raises:
+            OutputError: Frames of another render are there and may not be overwritten, or one cannot be written.
+            RenderInterruptedError: Interrupted; the same call goes on.
+        """
+        require_folder(pattern)
+        log = FrameLog(pattern)
+        planned = {frame.number: frame for frame in frames}
+        with _resumable(str(pattern), tally := Tally(), len(planned)):
+            compared = count(1)
+
+            def digest_of(number: int) -> str:
+                self._report("compare", next(compared), len(planned))
+                return self._digests.of(self._shot(planned[number]))
+
+            todo = log.missing(planned, digest_of, overwrite=overwrite)
+            tally.kept = [number for number in planned if number not in set(todo)]
+            self._report("render", len(tally.kept), len(planned))
+            for number in todo:
+                shot = self._shot(planned[number])
+                log.write(
+                    number,
+                    self._digests.of(shot),
+                    lambda path, number=number, shot=shot: self._draw(planned[number], path, tally, shot),
+                )
+                self._report("render", len(tally.kept) + len(tally.rendered), len(planned))
+        return tally
+
+    def render_film(
+        self, film: Film, frames: Sequence[Frame], options: VideoOptions, *, ffmpeg: str, overwrite: bool = False
+    ) -> Tally:
+        """Render the frames of a film beside it, and encode them when all are there.
+
+        Raises:
+            OutputError: There is a film and it may not be overwritten, or see `render_frames` and `write_mp4`.
+            RenderInterruptedError: Interrupted; the same call goes on.
+        """
+        require_folder(film)
+        if film.path.exists() and not overwrite:
+            raise OutputError(
+                f"out must be a new file, got {film.path}, which is there. Pass --overwrite, or choose another name."
+            )
+        require_encoder(ffmpeg)
+        tally = self.render_frames(film.work, frames, overwrite=True)  # whatever lies there is ours
+        with _resumable(str(film.path), tally, len(frames)):
+            write_mp4(film.path, self._pictures(film.work, frames), options, ffmpeg=ffmpeg)
+        film.discard_work()
+        return tally
+
+    def _pictures(self, work: FramePattern, frames: Sequence[Frame]) -> Iterator[NDArray[np.uint8]]:
+        """Read the frames of a film back."""
+        for done, frame in enumerate(frames, start=1):
+            yield np.rint(read_image(work.path(frame.number)).rgb() * 255.0).astype(np.uint8)
+            self._report("encode", done, len(frames))
+
+    def _shot(self, frame: Frame) -> Shot:
+        shot = self._stage.shot(frame.time, frame.width, frame.height)
+        return shot if frame.camera is None else replace(shot, camera=frame.camera)
+
+    def _draw(self, frame: Frame, path: Path, tally: Tally, shot: Shot | None = None) -> None:
+        """Render an image and write it."""
+        seen = self._shot(frame) if shot is None else shot
+        total = len(tally.rendered) + len(tally.kept)
+        context = FrameContext(
+            frame.number,
+            _checkpoint(path),
+            lambda done, most: self._report("samples", done, most, f"image {total + 1}"),
+        )
+        self._writer.write(path, seen, self._renderer.draw(seen, context))
+        tally.rendered.append(frame.number)
+        tally.gaussian_count = max(tally.gaussian_count, len(seen.cloud))
+
+
+def _checkpoint(path: Path) -> Path:
+    """Return where a renderer keeps what is done of an image."""
+    return path.with_name(f".{path.name}.checkpoint")
+
+
+@contextmanager
+def _resumable(name: str, tally: Tally, total: int) -> Iterator[None]:
+    """Turn an interruption into words about what is there."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        whole = len(tally.rendered) + len(tally.kept)
+        raise RenderInterruptedError(
+            f"{whole} of {total} images are whole in {name}; the same command goes on from there"
+        ) from error

@@ -1,0 +1,1 @@
+"""Studies of cost against error: plans, truth, tables, charts and pages."""

@@ -1,0 +1,341 @@
+"""What decomposing costs and how wrong it is on a given capture and device: the materials study of ``beam chart``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp._version import __version__
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.light.prepared import MaterialLight
+from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
+from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.evidence import ViewEvidence, view_evidence
+from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import read_truth_mesh
+from beam_warp.study.materials_plan import MaterialsPlan
+from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews, interval_of
+from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, Subject
+from beam_warp.study.tracing import device_name
+from beam_warp.study.tracing_plan import parse_offset
+from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.trace.scene import Scene
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
+
+SHARP = RasterOptions(antialiased=True, low_pass=0.1)
+"""How Gaussians on a true surface are drawn."""
+
+GAUSSIANS = {False: 4000, True: 60_000}
+"""On the true surface of a capture that comes without a reconstruction, on a CPU and on CUDA."""
+
+ROUGHNESS = 0.5
+"""Where Gaussians have none."""
+
+BAKING_RAYS = 64
+"""Rays a pixel that drawing and baking take the time of, about."""
+
+REFERENCE_SEED = 1 << 31
+"""References draw other samples than every measurement, whose seeds count up from 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialsSubject:
+    """What is decomposed.
+
+    Attributes:
+        cloud: Gaussians with captured radiance, axes "rfu".
+        views: What was captured, scene-linear.
+        environment: The light of the capture.
+        raster: How the Gaussians were fitted.
+        capture: Where truth may be.
+        frame: Its number there.
+        name: What to call it.
+        ceiling: Largest value that the images can hold.
+    """
+
+    cloud: GaussianCloud
+    views: Sequence[CapturedView]
+    environment: EnvironmentMap
+    raster: RasterOptions
+    capture: Capture
+    frame: int
+    name: str
+    ceiling: float = float("inf")
+
+    @classmethod
+    def on_true_surface(
+        cls, capture: Capture, environment: EnvironmentMap, frame: int, name: str, device: str | None
+    ) -> MaterialsSubject:
+        """Take Gaussians on the true surface of a capture's frame, with colours solved from its images.
+
+        Raises:
+            MissingFileError: The capture has no true surface.
+        """
+        mesh = read_truth_mesh(capture, frame)
+        views = [record.view() for record in capture.select(split="train", frames={frame})]
+        count = GAUSSIANS[resolve_device(device).is_cuda]
+        bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
+        cloud = colored_by_views(bare, views, options=SHARP, device=device)
+        return cls(cloud, views, environment, SHARP, capture, frame, name)
+
+
+def materials_study(
+    subject: MaterialsSubject, plan: MaterialsPlan | None = None, *, device: str | None = None
+) -> Study:
+    """Prepare the materials study: scene, light, what views show, and what errors are against.
+
+    With exact channels in the capture's test views, errors are against the truth: noise, what the method leaves out,
+    and the error of the reconstruction together. Without, they are against many rays with the default settings.
+
+    Args:
+        subject: What is decomposed.
+        plan: What to measure; None takes everything there is.
+        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+
+    Raises:
+        DeviceError: There is no such device.
+        InvalidArrayError: The Gaussians have no radiance, or the truth shows no subject.
+    """
+    chosen, target = plan or MaterialsPlan(), resolve_device(device)
+    bench = _Bench(subject, chosen, target)
+    axes = (
+        Axis("rays", "Rays", chosen.rays, "rays", "Rays a Gaussian; a pixel's for occlusion, and twice for light."),
+        *(Axis(name, name.capitalize(), levels, "", _SENTENCES[name]) for name, levels in chosen.axes().items()),
+    )
+    described = Subject(
+        name="materials",
+        title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians",
+        axes=axes,
+        metrics=(
+            Metric(
+                OCCLUSION,
+                "RMS error of ambient occlusion",
+                color="offset",
+                marker="path",
+                line="sampler",
+                sentence=f"Against {bench.reference.note}.",
+            ),
+            Metric(
+                COLOR,
+                "RMS error of base colour, sRGB-encoded",
+                color="density",
+                marker="path",
+                line="bounce",
+                sentence=f"Against {bench.reference.note}; unscaled.",
+            ),
+        ),
+        cost=f"Time of a frame of {len(subject.views)} views, {len(subject.cloud):,} Gaussians",
+        cost_unit="s",
+        ladder="rays",
+        notes={
+            "Reference": bench.reference.note,
+            "Time": f"fastest to slowest of {chosen.repeats} calls, from images and Gaussians in memory to materials; "
+            "without compilation and preparing the light",
+            "Device": device_name(target),
+            "Error bars": "95 %, bootstrap over blocks of pixels or Gaussians",
+            "Plan": "one factor at a time around the defaults, the first level of each axis; density and ratio crossed",
+            "Versions": f"beam-warp {__version__}, Warp {wp.__version__}",
+        },
+    )
+    curves = chosen.settings()
+    return Study(described, [{"rays": n, **curve} for curve in curves for n in chosen.rays], bench.measure, bench.work)
+
+
+_SENTENCES = {
+    "path": "direct: rays from every Gaussian. images: rays from every pixel of every view, baked.",
+    "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
+    "offset": "Lift of ray origins: auto, by what lies above the surface, or metres.",
+    "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
+    "ratio": "ratio: exact unshadowed light times a ratio of two estimates. plain: one estimate.",
+    "bounce": "Light from other surfaces, by their captured radiance.",
+    "weight": "What the specular lobe leaves for diffusion.",
+    "fit": "robust: views that disagree with the others count little.",
+    "observed": "difference: fitted radiance plus what images show beside it. images: images spread back.",
+    "denoiser": "Of the path by images; auto is Open Image Denoise where it is installed.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """What settings of one offset and one kind of observation share, and how long it took to make [s]."""
+
+    evidence: ViewEvidence
+    points: SurfacePoints
+    seconds: float
+
+
+class _Bench:
+    """Everything that settings are measured on."""
+
+    def __init__(self, subject: MaterialsSubject, plan: MaterialsPlan, device: Any) -> None:
+        """Prepare the light and the reference."""
+        self.subject, self.plan, self.device = subject, plan, device
+        self.light = MaterialLight.from_environment(subject.environment, device)
+        self._compiled: set[str] = set()
+        rough = subject.cloud.roughness
+        self.roughness = np.full(len(subject.cloud), ROUGHNESS, np.float32) if rough is None else rough
+        self._prepared: dict[tuple[str, str], _Prepared] = {}
+        self.reference = self._find_reference()
+
+    def _find_reference(self) -> Reference:
+        subject = self.subject
+        test = subject.capture.select(split="test", frames={subject.frame})
+        true = [record for record in test if record.truth_path is not None]
+        if true:
+            return TrueViews(subject.cloud, true, subject.raster, device=str(self.device))
+        default = MaterialsPlan().settings()[0]
+        found = self._direct({**default, "rays": self.plan.reference_rays}, REFERENCE_SEED)
+        prepared = self._prepare("difference", "auto")
+        return ManyRays(*found, prepared.points.seen, self.plan.reference_rays)
+
+    def work(self, settings: Settings) -> int:
+        """Return about how many rays a setting's measurement traces."""
+        rays = int(settings["rays"])
+        if settings["path"] == "direct":
+            return 2 * rays * len(self.subject.cloud) * self.plan.repeats
+        pixels = sum(
+            view.camera.width * view.camera.height if view.alpha is None else int((view.alpha > 0.5).sum())
+            for view in self.subject.views
+        )
+        return 3 * (rays + BAKING_RAYS) * pixels * self.plan.repeats
+
+    def measure(self, settings: Settings) -> Row:
+        """Time a setting, and compare what it gives with the reference."""
+        direct = settings["path"] == "direct"
+        run = self._direct if direct else self._by_images
+        key = str({name: level for name, level in settings.items() if name not in ("rays", "offset")})
+        if key not in self._compiled:
+            run({**settings, "rays": 4}, 0)  # compiles what is not compiled yet
+            self._compiled.add(key)
+        common = self._prepare(str(settings["observed"]), str(settings["offset"])).seconds if direct else 0.0
+        seconds: list[float] = []
+        squares: dict[str, list[NDArray[np.float64]]] = {}
+        for repeat in range(self.plan.repeats):
+            wp.synchronize_device(self.device)
+            started = time.perf_counter()
+            color, openness = run(settings, repeat)
+            wp.synchronize_device(self.device)
+            seconds.append(common + time.perf_counter() - started)
+            for name, part in self.reference.squares(color, openness).items():
+                squares.setdefault(name, []).append(part)
+        errors = {name: interval_of(np.mean(parts, axis=0)) for name, parts in squares.items()}
+        if not self._changes_occlusion(settings):
+            del errors[OCCLUSION]
+        return Row(settings, Interval.of_median(seconds), errors)
+
+    def _changes_occlusion(self, settings: Settings) -> bool:
+        """Return whether ambient occlusion is not that of a setting that is measured anyway."""
+        axes = self.plan.axes()
+        other = ("density", "ratio", "bounce", "weight", "fit", "observed")
+        return all(settings[name] == axes[name][0] for name in other if name in settings)
+
+    def _prepare(self, observed: str, offset: str) -> _Prepared:
+        """Return what views show, made once and timed the second time: the first compiles."""
+        key = observed, offset
+        if key not in self._prepared:
+            make = self._maker(observed, offset)
+            make()
+            started = time.perf_counter()
+            evidence, points = make()
+            wp.synchronize_device(self.device)
+            self._prepared[key] = _Prepared(evidence, points, time.perf_counter() - started)
+        return self._prepared[key]
+
+    def _maker(self, observed: str, offset: str) -> Callable[[], tuple[ViewEvidence, SurfacePoints]]:
+        subject, device = self.subject, str(self.device)
+        cloud = without_color(subject.cloud) if observed == "images" else subject.cloud
+        kind, metres = parse_offset(offset)
+
+        def make() -> tuple[ViewEvidence, SurfacePoints]:
+            scene = Scene.from_gaussians(subject.cloud, device)
+            evidence = view_evidence(
+                cloud,
+                [view.camera for view in subject.views],
+                subject.views,
+                options=subject.raster,
+                ceiling=subject.ceiling,
+                device=device,
+            )
+            lift: Any = "auto" if kind == "auto" else metres
+            return evidence, SurfacePoints.seen_by(subject.cloud, evidence, scene, lift)
+
+        return make
+
+    def _direct(self, settings: Settings, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return base colour and ambient occlusion by the direct path."""
+        cloud = self.subject.cloud
+        prepared = self._prepare(str(settings["observed"]), str(settings["offset"]))
+        options: dict[str, Any] = {
+            "sample_count": settings["rays"],
+            "sampler": settings["sampler"],
+            "density": settings["density"],
+            "ratio": settings["ratio"] == "ratio",
+            "bounce": settings["bounce"] == "one",
+            "diffuse_weight": settings["weight"],
+            "robust": settings["fit"] == "robust",
+            "seed": seed,
+        }
+        measured = measure_materials(
+            cloud,
+            Scene.from_gaussians(cloud, str(self.device)),
+            prepared.points,
+            self.roughness,
+            self.light,
+            options=MaterialOptions(**options),
+            views=prepared.evidence,
+        )
+        known = cloud.with_arrays(normals=_upright(prepared.points), normal_confidence=prepared.points.confidence)
+        solved = solve_base_color(known, measured.evidence, self.light.mean_irradiance)
+        openness, _ = fill_from_neighbors(
+            cloud.positions,
+            measured.ambient_occlusion[:, None],
+            measured.ambient_occlusion_error[:, None],
+            ~prepared.points.seen,
+        )
+        return solved.base_color, openness[:, 0].astype(np.float32)
+
+    def _by_images(self, settings: Settings, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return base colour and ambient occlusion by the image path."""
+        subject = self.subject
+        rays: Any = settings["rays"]
+        denoiser: Any = settings["denoiser"]
+        found = decompose_by_images(
+            subject.cloud,
+            Scene.from_gaussians(subject.cloud, str(self.device)),
+            subject.views,
+            self.roughness,
+            self.light.sampled,
+            ImagePathOptions(
+                occlusion_samples=rays,
+                light_samples=2 * rays,
+                offset=parse_offset(str(settings["offset"]))[1],
+                denoiser=denoiser,
+                seed=seed,
+            ),
+            raster_options=subject.raster,
+        )
+        return found.base_color, found.ambient_occlusion
+
+
+def without_color(cloud: GaussianCloud) -> GaussianCloud:
+    """Return Gaussians that send out nothing: what is spread back of the difference is then the image itself."""
+    black = np.full((len(cloud), 1, 3), -0.5 / SH_C0, np.float32)
+    return cloud.with_arrays(radiance=black, radiance_color_space=LINEAR_REC709)
+
+
+def _upright(points: SurfacePoints) -> NDArray[np.float32]:
+    """Return unit normals, +z where there are none."""
+    return np.where(points.seen[:, None], points.normals.numpy(), (0.0, 0.0, 1.0)).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Rays through Gaussians: visibility, occlusion, irradiance, first surfaces, and their gradients."""

@@ -1,0 +1,1 @@
+"""The viewer: our own frames in a browser, with controls."""

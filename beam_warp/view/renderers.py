@@ -1,0 +1,70 @@
+"""Which renderers a viewer has: one that lights at once, one that traces paths, and what a display shows of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.tone import ViewTransform, display_over
+from beam_warp.raster.records import RasterOptions
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import DeferredOptions
+from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.view.state import Color
+from beam_warp.world.shot import RenderedImage, Shot
+
+MOST_PATHS = 2**20
+"""Paths of a pixel beyond which none are added."""
+
+QUICK_MAP_SIZE = 256
+"""Side of shadow maps of lamps while something moves, where there is no GPU [texel]."""
+
+
+class DeferredPair:
+    """Renders at once: thoroughly, or quickly where shadows of the environment would take seconds."""
+
+    def __init__(self, raster: RasterOptions, device: str | None) -> None:
+        """Choose renderers; on a GPU, what is thorough is quick."""
+        self._is_fast = bool(resolve_device(device).is_cuda)
+        self._lit: object = None
+        plain = DeferredOptions(layers=(), environment_shadows=0, bounces=0)
+        if not self._is_fast:
+            plain = replace(plain, light_map_size=QUICK_MAP_SIZE)
+        self._quick = DeferredRenderer(plain, raster=raster, device=device)
+        self._thorough = DeferredRenderer(DeferredOptions(layers=()), raster=raster, device=device)
+
+    def draw(self, shot: Shot, *, lighting: object, is_thorough: bool, is_quick: bool) -> RenderedImage:
+        """Render a shot.
+
+        Args:
+            shot: What is rendered.
+            lighting: What light depends on: where it is what it was, what was found for it is there.
+            is_thorough: Whether the environment is to cast shadows.
+            is_quick: Whether something moves.
+        """
+        if not is_thorough or (is_quick and not self._is_fast and lighting != self._lit):
+            return self._quick.draw(shot)
+        image = self._thorough.draw(shot)
+        self._lit = lighting
+        return image
+
+
+def path_tracer(device: str | None) -> PathRenderer:
+    """Return what traces paths, to be stopped when there are enough."""
+    return PathRenderer(PathOptions(samples=MOST_PATHS), device=device)
+
+
+def displayed(image: RenderedImage, transform: ViewTransform, stops: float, background: Color) -> NDArray[np.uint8]:
+    """Return what a display shows of an image over a display colour, ``(H, W, 3)``: see `tone_mapping.display_over`."""
+    behind = np.asarray(background, np.uint8)
+    shown = np.broadcast_to(behind, image.rgb.shape).copy()
+    rows, columns = (np.flatnonzero((image.alpha > 0.0).any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return shown
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)  # the rest is background
+    rgb, alpha = image.rgb[part], image.alpha[part]
+    shown[part] = display_over(rgb, alpha, transform, stops, behind / 255.0)
+    return shown

@@ -1,0 +1,1 @@
+"""What every family of kernels uses: launching, random streams, sums in a fixed order, and small maths."""

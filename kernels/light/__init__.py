@@ -1,0 +1,1 @@
+"""Light and reflection: environments, lamps, the BRDF, and directions drawn by them."""

@@ -1,0 +1,53 @@
+"""Directions drawn from a GGX lobe by its visible normals: map, density and inverse, in the frame of the normal (+z).
+
+Source: Dupuy and Benyoub 2023: seen from a stretched view direction, visible normals are a uniform spherical cap.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.light.brdf import ggx_distribution
+
+PI = wp.constant(3.14159265358979323846)
+
+
+@wp.func
+def stretched(view: wp.vec3, alpha: float) -> wp.vec3:
+    """The view direction where the lobe is a hemisphere."""
+    return wp.normalize(wp.vec3(alpha * view[0], alpha * view[1], view[2]))
+
+
+@wp.func
+def square_to_visible_reflection(view: wp.vec3, alpha: float, u: float, v: float) -> wp.vec3:
+    """Reflect ``view`` about a visible normal; the result may lie below the surface, where the lobe is 0."""
+    axis = stretched(view, alpha)
+    phi = 2.0 * PI * u
+    z = (1.0 - v) * (1.0 + axis[2]) - axis[2]
+    radius = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    h = wp.vec3(radius * wp.cos(phi), radius * wp.sin(phi), z) + axis
+    half = wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], h[2]))
+    return wp.normalize(2.0 * wp.dot(view, half) * half - view)
+
+
+@wp.func
+def square_to_visible_reflection_pdf(view: wp.vec3, light: wp.vec3, alpha: float) -> float:
+    """G1(v) D(h) / (4 n.v) [1/sr]; it holds below the surface too, so that it integrates to one."""
+    half = wp.normalize(view + light)
+    density = float(0.0)
+    if half[2] > 0.0 and view[2] > 0.0:
+        a2 = alpha * alpha
+        masking = view[2] + wp.sqrt(view[2] * view[2] * (1.0 - a2) + a2)
+        density = 0.5 * ggx_distribution(half[2], alpha) / masking
+    return density
+
+
+@wp.func
+def visible_reflection_to_square(view: wp.vec3, light: wp.vec3, alpha: float) -> wp.vec2:
+    """The point of the unit square that `square_to_visible_reflection` takes to ``light``."""
+    axis = stretched(view, alpha)
+    half = wp.normalize(view + light)
+    m = wp.normalize(wp.vec3(half[0] / alpha, half[1] / alpha, half[2]))
+    c = 2.0 * wp.dot(axis, m) * m - axis
+    turn = wp.atan2(c[1], c[0]) / (2.0 * PI)
+    if turn < 0.0:
+        turn += 1.0
+    return wp.vec2(turn, 1.0 - (c[2] + axis[2]) / (1.0 + axis[2]))

@@ -1,0 +1,1 @@
+"""Decomposition: evidence of views, residues, baking, and roughness."""

@@ -1,0 +1,170 @@
+"""What the neighbours of each Gaussian say about the surface: its thinnest direction, and the normal they agree on."""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def covariance(orientation: wp.quat, scale: wp.vec3) -> wp.mat33:
+    axes = wp.quat_to_matrix(wp.normalize(orientation)) * wp.diag(scale)
+    return axes * wp.transpose(axes)
+
+
+@wp.kernel
+def thinnest_direction_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    neighbors: wp.array2d[int],
+    out_direction: wp.array[wp.vec3],
+    out_planarity: wp.array[float],
+):
+    """Smallest principal axis of the neighbours' mixture, and 1 - lambda_0 / lambda_1.
+
+    A mixture's covariance is the weighted mean of its members' covariances plus that of their centres. Weights are
+    opacities times a Gaussian of half the distance to the farthest neighbour.
+    """
+    i = first + wp.tid()
+    count = neighbors.shape[1]
+    center = positions[i]
+    reach = wp.max(wp.length(positions[neighbors[i, count - 1]] - center), 1.0e-12)
+    total = float(1.0e-12)
+    mean = wp.vec3()
+    for k in range(count):
+        offset = positions[neighbors[i, k]] - center
+        distance = wp.length(offset) / reach
+        weight = opacities[neighbors[i, k]] * wp.exp(-2.0 * distance * distance)
+        total += weight
+        mean += offset * weight
+    mean /= total
+    spread = wp.mat33()
+    for k in range(count):
+        j = neighbors[i, k]
+        offset = positions[j] - center
+        distance = wp.length(offset) / reach
+        weight = opacities[j] * wp.exp(-2.0 * distance * distance) / total
+        spread += (wp.outer(offset - mean, offset - mean) + covariance(orientations[j], scales[j])) * weight
+    spread /= wp.max(wp.trace(spread), 1.0e-30)  # to order 1, where float32 iterations converge
+    vectors, values = wp.eig3(spread)
+    smallest = int(0)
+    if values[1] < values[smallest]:
+        smallest = 1
+    if values[2] < values[smallest]:
+        smallest = 2
+    a = values[(smallest + 1) % 3]
+    b = values[(smallest + 2) % 3]
+    direction = wp.vec3(vectors[0, smallest], vectors[1, smallest], vectors[2, smallest])
+    if not (wp.length(direction) > 0.5):
+        direction = wp.vec3(0.0, 0.0, 1.0)  # coincident points without extent have no thinnest direction
+    out_direction[i] = wp.normalize(direction)
+    out_planarity[i] = wp.clamp(1.0 - values[smallest] / wp.max(wp.min(a, b), 1.0e-30), 0.0, 1.0)
+
+
+@wp.kernel
+def consult_neighbors_kernel(
+    first: int,
+    normals: wp.array[wp.vec3],
+    certainty: wp.array[float],
+    openness: wp.array[float],
+    neighbors: wp.array2d[int],
+    out_normals: wp.array[wp.vec3],
+    out_agreement: wp.array[float],
+):
+    """Move each normal towards its neighbours' weighted mean as far as it is uncertain itself.
+
+    Where rays do not tell the sides apart, the neighbours decide the sign. Agreement is the length of their mean.
+    """
+    i = first + wp.tid()
+    total = float(1.0e-12)
+    mean = wp.vec3()
+    for k in range(1, neighbors.shape[1]):  # column 0 is the Gaussian itself
+        j = neighbors[i, k]
+        weight = certainty[j] * openness[j] + 1.0e-6
+        total += weight
+        mean += normals[j] * weight
+    mean /= total
+    length = wp.min(wp.length(mean), 1.0)
+    direction = mean / wp.max(length, 1.0e-12)
+    n = normals[i]
+    if openness[i] < 0.25 and length > 0.5 and wp.dot(n, direction) < 0.0:
+        n = -n
+    share = (1.0 - wp.min(certainty[i] * (0.5 + openness[i]), 1.0)) * length
+    mixed = n * (1.0 - share) + direction * share
+    if wp.length(mixed) > 1.0e-6:
+        n = wp.normalize(mixed)
+    out_normals[i] = n
+    out_agreement[i] = length
+
+
+@wp.kernel
+def reach_above_kernel(
+    first: int,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    centers: wp.array[wp.vec3],
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    weights: wp.array[float],
+    neighbors: wp.array2d[int],
+    out_reach: wp.array[float],
+):
+    """Root mean square of how far a point's neighbours reach above its tangent plane.
+
+    Each by the height of its centre, if that is above, and its standard deviation along the normal. What lies below
+    a point of the surface hides no light from it, however deep the layer is.
+    """
+    i = first + wp.tid()
+    n = normals[i]
+    total = float(0.0)
+    squares = float(0.0)
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
+        height = wp.max(wp.dot(centers[j] - points[i], n), 0.0)
+        along = wp.quat_rotate_inv(wp.normalize(orientations[j]), n)
+        extent = wp.cw_mul(along, scales[j])
+        total += weights[j]
+        squares += weights[j] * (height * height + wp.dot(extent, extent))
+    reach = float(0.0)
+    if total > 0.0:
+        reach = wp.sqrt(squares / total)
+    out_reach[i] = reach
+
+
+def launch_thinnest_direction(
+    positions, orientations, scales, opacities, neighbors, out_direction, out_planarity, device
+):
+    """Analyse every Gaussian's neighbourhood: in ``neighbors``, column 0 is the Gaussian itself."""
+    launch(
+        thinnest_direction_kernel,
+        len(positions),
+        inputs=[positions, orientations, scales, opacities, neighbors],
+        outputs=[out_direction, out_planarity],
+        device=device,
+    )
+
+
+def launch_consult_neighbors(normals, certainty, openness, neighbors, out_normals, out_agreement, device):
+    """Do one pass of smoothing."""
+    launch(
+        consult_neighbors_kernel,
+        len(normals),
+        inputs=[normals, certainty, openness, neighbors],
+        outputs=[out_normals, out_agreement],
+        device=device,
+    )
+
+
+def launch_reach_above(points, normals, gaussians, weights, neighbors, out_reach, device):
+    """Measure how far neighbours reach above points; ``gaussians`` are centres, orientations and scales."""
+    launch(
+        reach_above_kernel,
+        len(points),
+        inputs=[points, normals, *gaussians, weights, neighbors],
+        outputs=[out_reach],
+        device=device,
+    )

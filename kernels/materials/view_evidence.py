@@ -1,0 +1,188 @@
+"""What the pixels of views say of the Gaussians that they show: where the surface is, which way it faces, its colour.
+
+Pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an origin, 3-5
+normal, 6 weight of both; 7 weight of saturated pixels; 8-10 captured colour less the rendered one, 11 its weight.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.spherical_harmonics import captured_radiance, srgb_to_linear
+from beam_warp.kernels.raster.project import View
+
+wp.set_module_options({"enable_backward": False})
+
+PIXEL_CHANNELS = 12
+
+LEAST_SURFACE_ALPHA = wp.constant(0.95)
+"""Coverage by Gaussians from which on a pixel shows a surface."""
+
+LEAST_COVERAGE = wp.constant(0.99)
+"""Coverage in the image from which on its colour is the subject's alone: below are silhouettes."""
+
+
+@wp.struct
+class SurfacePixels:
+    """What a rasteriser drew, one view after the other: of each pixel the radiance and the normal, and how deep."""
+
+    colors: wp.array2d[float]  # radiance in columns 0-2, normals in 3-5, sums weighted by visibility
+    alpha: wp.array[float]
+    depth: wp.array[float]
+    display_srgb: int  # whether radiance is display sRGB
+
+
+@wp.struct
+class CapturedPixels:
+    """What one camera saw; arrays of length 0 where it has no image, or no coverage."""
+
+    color: wp.array[wp.vec3]  # scene-linear, premultiplied
+    coverage: wp.array[float]
+    ceiling: float  # value that the image cannot exceed
+
+
+@wp.kernel
+def write_pixels_kernel(
+    first: int,
+    view: View,
+    drawn: SurfacePixels,
+    captured: CapturedPixels,
+    origin: wp.vec3,
+    out_pixels: wp.array2d[float],
+):
+    local = first + wp.tid()
+    pixel = view.first_pixel + local
+    for c in range(12):
+        out_pixels[pixel, c] = 0.0
+    alpha = drawn.alpha[pixel]
+    if not (alpha > LEAST_SURFACE_ALPHA):
+        return
+    x = (float(local % view.width) + 0.5 - view.center[0]) / view.focal[0]
+    y = (float(local / view.width) + 0.5 - view.center[1]) / view.focal[1]
+    ray = wp.transpose(view.world_to_camera) * wp.vec3(x, y, 1.0)
+    place = (view.position - origin) + ray * drawn.depth[pixel]
+    normal = wp.normalize(wp.vec3(drawn.colors[pixel, 3], drawn.colors[pixel, 4], drawn.colors[pixel, 5]))
+    for c in range(3):
+        out_pixels[pixel, c] = place[c]
+        out_pixels[pixel, 3 + c] = normal[c]
+    out_pixels[pixel, 6] = 1.0
+    if captured.color.shape[0] == 0:
+        return
+    if captured.coverage.shape[0] > 0:
+        if not (captured.coverage[local] > LEAST_COVERAGE):
+            return
+    color = captured.color[local]
+    if wp.max(color[0], wp.max(color[1], color[2])) >= captured.ceiling:
+        out_pixels[pixel, 7] = 1.0
+        return
+    for c in range(3):
+        rendered = wp.max(drawn.colors[pixel, c], 0.0)
+        if drawn.display_srgb == 1:
+            rendered = srgb_to_linear(wp.min(rendered, 1.0))
+        out_pixels[pixel, 8 + c] = color[c] - rendered
+    out_pixels[pixel, 11] = 1.0
+
+
+@wp.kernel
+def add_rows_kernel(first: int, rows: wp.array2d[float], view_count: int, columns: int, out_sums: wp.array2d[float]):
+    """Add what some views spread back to each Gaussian's sums, view by view."""
+    i = first + wp.tid()
+    count = out_sums.shape[0]
+    for view in range(view_count):
+        for c in range(columns):
+            out_sums[i, c] = out_sums[i, c] + rows[view * count + i, c]
+
+
+@wp.kernel
+def observe_kernel(
+    first: int,
+    rows: wp.array2d[float],
+    positions: wp.array[wp.vec3],
+    radiance: wp.array2d[wp.vec3],
+    display_srgb: int,
+    views: wp.array[View],
+    first_view: int,
+    out_colors: wp.array2d[wp.vec4],
+    out_directions: wp.array2d[wp.vec3],
+):
+    """Fitted radiance towards each camera, corrected by what the image shows beside it.
+
+    Pixels are blends of Gaussians: spread back as they are they give blurred colours. A fit has undone the blend, so
+    what is spread back is only the difference between image and rendering.
+    """
+    splat = first + wp.tid()
+    count = positions.shape[0]
+    i = splat % count
+    local = splat / count
+    toward = wp.normalize(views[local].position - positions[i])
+    weight = rows[splat, 11]
+    color = wp.vec3()
+    if weight > 0.0:
+        color = captured_radiance(radiance, i, -toward, display_srgb)
+        color += wp.vec3(rows[splat, 8], rows[splat, 9], rows[splat, 10]) / weight
+    out_colors[first_view + local, i] = wp.vec4(color[0], color[1], color[2], weight)
+    out_directions[first_view + local, i] = toward
+
+
+@wp.kernel
+def finish_surface_kernel(
+    first: int,
+    sums: wp.array2d[float],
+    positions: wp.array[wp.vec3],
+    origin: wp.vec3,
+    seen: wp.array[int],
+    out_positions: wp.array[wp.vec3],
+    out_normals: wp.array[wp.vec3],
+    out_agreement: wp.array[float],
+):
+    """Means of the sums; a Gaussian that is not seen keeps its own place and has no normal."""
+    i = first + wp.tid()
+    weight = sums[i, 6]
+    place = positions[i]
+    normal = wp.vec3()
+    agreement = float(0.0)
+    if seen[i] != 0:
+        place = origin + wp.vec3(sums[i, 0], sums[i, 1], sums[i, 2]) / weight
+        mean = wp.vec3(sums[i, 3], sums[i, 4], sums[i, 5]) / weight
+        agreement = wp.min(wp.length(mean), 1.0)
+        normal = wp.normalize(mean)
+    out_positions[i] = place
+    out_normals[i] = normal
+    out_agreement[i] = agreement
+
+
+def launch_write_pixels(view, drawn, captured, origin, out_pixels, device):
+    """Write what one view's pixels say."""
+    launch(
+        write_pixels_kernel,
+        view.width * view.height,
+        inputs=[view, drawn, captured, origin],
+        outputs=[out_pixels],
+        device=device,
+    )
+
+
+def launch_add_rows(rows, view_count, columns, out_sums, device):
+    """Add the first columns of some views' rows to the Gaussians' sums."""
+    launch(add_rows_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device)
+
+
+def launch_observe(rows, positions, radiance, display_srgb, views, first_view, out_colors, out_directions, device):
+    """Write what some views show of every Gaussian."""
+    launch(
+        observe_kernel,
+        len(views) * len(positions),
+        inputs=[rows, positions, radiance, display_srgb, views, first_view],
+        outputs=[out_colors, out_directions],
+        device=device,
+    )
+
+
+def launch_finish_surface(sums, positions, origin, seen, out_positions, out_normals, out_agreement, device):
+    """Turn sums into a surface."""
+    launch(
+        finish_surface_kernel,
+        len(positions),
+        inputs=[sums, positions, origin, seen],
+        outputs=[out_positions, out_normals, out_agreement],
+        device=device,
+    )

@@ -1,0 +1,1 @@
+"""The rasteriser: projection, tiles, compositing, their adjoints, and losses on images."""

@@ -1,0 +1,213 @@
+"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
+
+The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
+pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
+atomics, one order of additions, the same bits every run.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from beam_warp.kernels.common.lanes import (
+    ADD_TO_SUMS,
+    BEGIN_SUMS,
+    END_SUMS,
+    ballot,
+    greatest_of_block,
+    greatest_of_lanes,
+    lowest_lane,
+    share_channels_function,
+    share_row_function,
+    sum_block_function,
+    wait_for_block,
+)
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.row_loads import load_row
+from beam_warp.kernels.raster.bin_tiles import SIDE
+from beam_warp.kernels.raster.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite_adjoint import (
+    Adjoints,
+    add_pixel_function,
+    pair_length,
+    pair_vector,
+    pixel_adjoint,
+)
+from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
+from beam_warp.kernels.raster.project import LOG_CUT
+from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
+
+PART = wp.constant(8)
+"""Side of the pixels of a warp."""
+
+WARPS = 4
+"""Warps of a block: a tile is 16 x 16 pixels."""
+
+THREADS = wp.constant(32 * WARPS)
+
+
+@cache
+def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
+    """Return the kernel that writes the moments and channels of every pair, a block a tile."""
+    Channels = channel_vector(channel_count)
+    Pair = pair_vector(channel_count, exact)
+    add_pixel = add_pixel_function(channel_count, exact)
+    share_row = share_row_function(4 if exact else 3, 1)
+    share_channels = share_channels_function(Channels, 1)
+    sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def composite_blocks_adjoint_kernel(
+        first: int,
+        frame: Frame,
+        channels: wp.array[Channels],
+        images: Images,
+        channel_adjoints: wp.array[Channels],
+        adjoints: Adjoints,
+        out_pairs: wp.array[Pair],
+    ):
+        item = first + wp.tid()
+        thread = item % THREADS
+        lane = item % LANES
+        part = thread / LANES
+        listed = item / THREADS
+        tile = frame.band.first_tile + listed
+        view = frame.views[frame.tile_views[tile]]
+        listed_range = frame.lists.ranges[listed]
+        corner = (part / 2) * PART * SIDE + (part % 2) * PART
+        box = pixel_place(view, tile, corner)
+        own = corner + (lane / PART) * SIDE + lane % PART
+        upper = pixel_place(view, tile, own)
+        lower = pixel_place(view, tile, own + SIDE * PART / 2)
+        upper_end = int(-1)
+        lower_end = int(-1)
+        upper_median = int(-1)
+        lower_median = int(-1)
+        upper_adjoint = wp.vec3(0.0, 0.0, 0.0)
+        lower_adjoint = wp.vec3(0.0, 0.0, 0.0)
+        to_upper = Channels()
+        to_lower = Channels()
+        upper_transmittance = float(0.0)
+        lower_transmittance = float(0.0)
+        upper_behind = float(0.0)
+        lower_behind = float(0.0)
+        if upper.index >= 0:
+            upper_end = images.ends[upper.index]
+            upper_median = images.medians[upper.index]
+            upper_adjoint = pixel_adjoint(images, adjoints, upper.index)
+            to_upper = channel_adjoints[upper.index]
+            upper_transmittance = images.transmittance[upper.index]
+        if lower.index >= 0:
+            lower_end = images.ends[lower.index]
+            lower_median = images.medians[lower.index]
+            lower_adjoint = pixel_adjoint(images, adjoints, lower.index)
+            to_lower = channel_adjoints[lower.index]
+            lower_transmittance = images.transmittance[lower.index]
+        own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
+        end = greatest_of_block(own_end)
+        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
+            out_pairs[frame.lists.slots[k]] = Pair()
+        while end > listed_range[0]:
+            mine = end - 1 - lane
+            slot = int(-1)
+            splat = int(-1)
+            if mine >= listed_range[0]:
+                slot = frame.lists.slots[mine]
+                splat = frame.lists.splats[mine]
+                if part == 0:
+                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
+                if part == 1:
+                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
+                if part == 2:
+                    share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+                if part == 3:
+                    share_channels(1, lane, channels, splat)
+                    if wp.static(exact):
+                        share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+            sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
+            wait_for_block()
+            wanted = int(0)
+            if splat >= 0 and mine < own_end:
+                wanted = reaches(
+                    share_row(0, CENTER, lane, wp.vec4()),
+                    share_row(0, SHAPE, lane, wp.vec4()),
+                    box.position,
+                    PART,
+                    PART,
+                )
+            waiting = ballot(wanted)
+            while waiting != 0:
+                i = lowest_lane(waiting)
+                waiting = waiting & (waiting - 1)
+                k = end - 1 - i
+                center = share_row(0, CENTER, i, wp.vec4())
+                shape = share_row(0, SHAPE, i, wp.vec4())
+                upper_offset = offset_from(center, upper.position)
+                lower_offset = offset_from(center, lower.position)
+                upper_e = whiten(shape, upper_offset)
+                lower_e = whiten(shape, lower_offset)
+                upper_log_alpha = log_alpha_of(center, upper_e)
+                lower_log_alpha = log_alpha_of(center, lower_e)
+                in_upper = k < upper_end and upper_log_alpha >= -LOG_CUT
+                in_lower = k < lower_end and lower_log_alpha >= -LOG_CUT
+                if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
+                    continue
+                slope = share_row(0, SLOPE, i, wp.vec4())
+                bend = float(0.0)
+                if wp.static(exact):
+                    bend = share_row(0, BEND, i, wp.vec4())[0]
+                row = share_channels(0, i, channels, 0)
+                total = Pair()
+                total, upper_transmittance, upper_behind = add_pixel(
+                    total,
+                    upper_transmittance,
+                    upper_behind,
+                    wp.where(in_upper, alpha_of(upper_log_alpha), 0.0),
+                    k == upper_median,
+                    upper_adjoint,
+                    to_upper,
+                    center,
+                    shape,
+                    slope,
+                    bend,
+                    frame.near,
+                    upper_offset,
+                    upper_e,
+                    row,
+                )
+                total, lower_transmittance, lower_behind = add_pixel(
+                    total,
+                    lower_transmittance,
+                    lower_behind,
+                    wp.where(in_lower, alpha_of(lower_log_alpha), 0.0),
+                    k == lower_median,
+                    lower_adjoint,
+                    to_lower,
+                    center,
+                    shape,
+                    slope,
+                    bend,
+                    frame.near,
+                    lower_offset,
+                    lower_e,
+                    row,
+                )
+                sum_block(ADD_TO_SUMS, i, total, out_pairs)
+            wait_for_block()
+            sum_block(END_SUMS, 0, Pair(), out_pairs)
+            wait_for_block()
+            end -= LANES
+
+    return composite_blocks_adjoint_kernel
+
+
+def launch_composite_adjoint_cuda(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
+    """Write the moments and channels of a band's pairs into their slots."""
+    launch(
+        composite_adjoint_cuda_kernel(channels.dtype._length_, exact),
+        (frame.band.end_tile - frame.band.first_tile) * THREADS,
+        inputs=[frame, channels, images, channel_adjoints, adjoints],
+        outputs=[out_pairs],
+        device=device,
+        block_dim=32 * WARPS,
+    )

@@ -1,0 +1,92 @@
+"""The gradient of each splat: moments summed over its pairs in a fixed order, and what they say of its rows."""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.raster.composite_adjoint import MOMENTS
+from beam_warp.kernels.raster.project import Splats
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Pairs:
+    """The moments and channels of all pairs of a band; those of a splat lie side by side, splats in depth order."""
+
+    rows: wp.array2d[float]
+    order: wp.array[int]
+    counts: wp.array[int]
+    ends: wp.array[int]
+
+
+@wp.kernel
+def sum_pairs_kernel(first: int, pairs: Pairs, out_sums: wp.array2d[float]):
+    """Add one column of the rows of a splat."""
+    item = first + wp.tid()
+    length = pairs.rows.shape[1]
+    place = item / length
+    column = item % length
+    count = pairs.counts[place]
+    if count <= 0:
+        return
+    total = float(0.0)
+    # Ends beyond the range of integers come out negative: what was not listed has no rows.
+    for row in range(wp.max(pairs.ends[place] - count, 0), wp.min(pairs.ends[place], pairs.rows.shape[0])):
+        total += pairs.rows[row, column]
+    splat = pairs.order[place]
+    out_sums[splat, column] = out_sums[splat, column] + total
+
+
+@wp.kernel
+def resolve_sums_kernel(
+    first: int, sums: wp.array2d[float], splats: Splats, channel_count: int, exact: int, out_gradients: Splats
+):
+    """Add what the moments of `kernels.composite_adjoint`, summed over a splat, say to the gradients of its rows."""
+    splat = first + wp.tid()
+    if not (splats.centers[splat][2] > -wp.inf):
+        return
+    shape = splats.shapes[splat]
+    slope = splats.slopes[splat]
+    s0 = shape[0]
+    s1 = shape[1]
+    s2 = shape[2]
+    facing = sums[splat, 8]
+    to_gx = sums[splat, 9] / s0
+    to_gy = sums[splat, 10] / s2 + s1 * to_gx
+    to_x = s1 * s2 * sums[splat, 2] - s0 * sums[splat, 1] + facing * slope[0]
+    to_y = -s2 * sums[splat, 2] + facing * slope[1]
+    to_bends = wp.vec3(0.0, 0.0, 0.0)
+    if exact != 0:
+        column = MOMENTS + channel_count
+        bend = splats.bends[splat]
+        b_x = sums[splat, column] / s0
+        b_y = sums[splat, column + 1] / s2 + s1 * b_x
+        b_xx = sums[splat, column + 2] / (s0 * s0)
+        mixed = sums[splat, column + 3] / (s0 * s2)
+        b_xy = mixed + s1 * b_xx
+        b_yy = sums[splat, column + 4] / (s2 * s2) + s1 * (2.0 * mixed + s1 * b_xx)
+        to_x += 2.0 * (slope[2] * b_x + slope[3] * b_y)
+        to_y += 2.0 * (slope[3] * b_x + bend * b_y)
+        to_bends = wp.vec3(b_xx, 2.0 * b_xy, b_yy)
+    out_gradients.centers[splat] = out_gradients.centers[splat] + wp.vec4(-to_x, -to_y, sums[splat, 0], sums[splat, 6])
+    out_gradients.shapes[splat] = out_gradients.shapes[splat] + wp.vec4(
+        -sums[splat, 3] / s0, s2 / s0 * sums[splat, 4], -sums[splat, 5] / s2, sums[splat, 7]
+    )
+    out_gradients.slopes[splat] = out_gradients.slopes[splat] + wp.vec4(to_gx, to_gy, to_bends[0], to_bends[1])
+    out_gradients.bends[splat] = out_gradients.bends[splat] + to_bends[2]
+
+
+def launch_sum_pairs(pairs, sums, device):
+    """Add the rows of all pairs to the sums of their splats."""
+    launch(sum_pairs_kernel, len(pairs.counts) * pairs.rows.shape[1], inputs=[pairs], outputs=[sums], device=device)
+
+
+def launch_resolve_sums(sums, splats, channel_count, exact, gradients, device):
+    """Add what all sums say to the gradients of the splats' rows."""
+    launch(
+        resolve_sums_kernel,
+        sums.shape[0],
+        inputs=[sums, splats, channel_count, exact],
+        outputs=[gradients],
+        device=device,
+    )

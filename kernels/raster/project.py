@@ -1,0 +1,182 @@
+"""From Gaussians in the world to splats on the image plane: elliptical weighted averaging with a low-pass filter.
+
+Source: Zwicker et al. 2001, EWA Volume Splatting; Kerbl et al. 2023 for the constants. Both square forms are kept as
+factors, so that nothing cancels: with T = J M (2 x 3; M the scaled axes in camera space), det(T T^T) = |t0 x t1|^2 is a
+sum of squares (Cauchy-Binet), and the exponent is a sum of two squares by Cholesky. A needle a thousand pixels long is
+then as exact as a ball.
+
+Depth is that of the largest response on the pixel's ray. With a = W R^T c and b = W R^T d (c the centre's ray, d the
+way from it to the pixel's, both on the plane z = 1; W the inverse scales up to a factor), it is z / (l + e / l), where
+l = 1 + a.b / a.a and e = |a x b|^2 / (a.a)^2: no inverse of a covariance, and finite for a disc of no thickness. For
+that disc e = 0, so that z / l is exact over its whole footprint; for others z / l is the plane through the centre that
+is tangent to the surface of largest response (Zhang et al. 2024, RaDe-GS), and z / (l + e / l) the surface itself.
+
+The module has an adjoint, which Warp makes: the kernel writes nothing but what it is differentiated for, since the
+adjoint writes its outputs again.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch, launch_adjoint
+
+LOG_CUT = wp.constant(5.541263545158426)
+"""ln 255: an alpha below 1/255 does not reach an 8-bit image and is left out."""
+
+DEPTH_REACH = wp.constant(3.0)
+"""A depth stays within this many of the largest standard deviation of the centre's, where the Gaussian ends."""
+
+SMALLEST_SCALE = wp.constant(1.0e-12)
+"""A thickness of 0 is taken for this [m]: a disc keeps a normal."""
+
+
+@wp.struct
+class View:
+    """A camera, and where its tiles and pixels are among those of all cameras that are drawn together."""
+
+    world_to_camera: wp.mat33
+    position: wp.vec3
+    focal: wp.vec2
+    center: wp.vec2
+    width: int
+    height: int
+    columns: int  # tiles in a row
+    first_tile: int
+    first_pixel: int
+
+
+@wp.struct
+class Projection:
+    """How Gaussians become splats."""
+
+    low_pass: float  # variance [pixel^2] of the pixel filter that every splat is widened by
+    near: float  # depth [m] before which a Gaussian's centre is not drawn
+    antialiased: int  # 1: what the filter adds in area it takes in height
+
+
+@wp.struct
+class Splats:
+    """Splats of every (view, Gaussian), view by view.
+
+    A splat that is not drawn has an opacity of 0. With d the pixel's offset from the centre, alpha is
+    exp(ln o - (e0^2 + e1^2) / 2), e0 = s0 dx, e1 = s2 (dy - s1 dx).
+    """
+
+    centers: wp.array[wp.vec4]  # x, y [pixel], ln opacity, depth of the centre [m]
+    shapes: wp.array[wp.vec4]  # s0 = 1/sqrt(xx), s1 = xy/xx, s2 = sqrt(xx/det) of the filtered covariance; reach [m]
+    slopes: wp.array[wp.vec4]  # l = 1 + gx dx + gy dy; e = exx dx^2 + 2 exy dx dy + eyy dy^2: gx, gy, exx, exy
+    bends: wp.array[float]  # eyy
+    normals: wp.array[wp.vec3]  # unit, in the world, towards the camera: of the surface of largest response
+
+
+@wp.kernel
+def project_gaussians_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    views: wp.array[View],
+    projection: Projection,
+    out_centers: wp.array[wp.vec4],
+    out_shapes: wp.array[wp.vec4],
+    out_slopes: wp.array[wp.vec4],
+    out_bends: wp.array[float],
+    out_normals: wp.array[wp.vec3],
+):
+    splat = first + wp.tid()
+    count = positions.shape[0]
+    i = splat % count
+    view = views[splat / count]
+    out_centers[splat] = wp.vec4(0.0, 0.0, -wp.inf, 0.0)
+    p = view.world_to_camera * (positions[i] - view.position)
+    z = p[2]
+    if not (z > projection.near):
+        return
+    u = p[0] / z
+    v = p[1] / z
+    width = float(view.width)
+    height = float(view.height)
+    focal = view.focal
+    middle = view.center
+    # The Jacobian is taken inside the image grown by 15 % of its size to each side: far outside it would explode.
+    margin_x = 0.15 * width / focal[0]
+    margin_y = 0.15 * height / focal[1]
+    ju = wp.clamp(u, -middle[0] / focal[0] - margin_x, (width - middle[0]) / focal[0] + margin_x)
+    jv = wp.clamp(v, -middle[1] / focal[1] - margin_y, (height - middle[1]) / focal[1] + margin_y)
+    orientation = orientations[i]
+    # Warp normalises a quaternion of NaN to 0, and turns 0 into a rotation.
+    if not (wp.dot(orientation, orientation) > 0.0):
+        return
+    axes = view.world_to_camera * wp.quat_to_matrix(wp.normalize(orientation))
+    s = scales[i]
+    scaled = axes * wp.diag(s)
+    row_x = wp.vec3(scaled[0, 0], scaled[0, 1], scaled[0, 2])
+    row_y = wp.vec3(scaled[1, 0], scaled[1, 1], scaled[1, 2])
+    row_z = wp.vec3(scaled[2, 0], scaled[2, 1], scaled[2, 2])
+    t0 = (focal[0] / z) * (row_x - ju * row_z)
+    t1 = (focal[1] / z) * (row_y - jv * row_z)
+    sharp_xx = wp.dot(t0, t0)
+    xy = wp.dot(t0, t1)
+    sharp_yy = wp.dot(t1, t1)
+    cross = wp.cross(t0, t1)
+    sharp_det = wp.dot(cross, cross)
+    low_pass = projection.low_pass
+    det = sharp_det + low_pass * (sharp_xx + sharp_yy) + low_pass * low_pass
+    xx = sharp_xx + low_pass
+    opacity = opacities[i]
+    kept = float(1.0)
+    if projection.antialiased != 0:
+        # Yu et al. 2024, Mip-Splatting, Eq. 9.
+        kept = sharp_det / det
+    x = focal[0] * u + middle[0]
+    y = focal[1] * v + middle[1]
+    # What is too faint is not drawn: after this line no logarithm or root is near its pole. Positions beyond 1e19
+    # overflow.
+    faint = not (opacity * opacity * kept > 1.5378700499807768e-05)  # 1 / 255^2
+    if faint or not (wp.isfinite(x) and wp.isfinite(y) and wp.isfinite(det) and det > 0.0):
+        return
+    log_opacity = wp.log(opacity) + 0.5 * wp.log(kept)
+    # Floored one by one: the adjoint of a maximum of equal numbers goes to one of them, and scales are often equal.
+    thick = wp.vec3(wp.max(s[0], SMALLEST_SCALE), wp.max(s[1], SMALLEST_SCALE), wp.max(s[2], SMALLEST_SCALE))
+    least = wp.min(thick[0], wp.min(thick[1], thick[2]))
+    largest = wp.max(s[0], wp.max(s[1], s[2]))
+    inverse = wp.vec3(least / thick[0], least / thick[1], least / thick[2])
+    away = wp.vec3(u, v, 1.0)
+    a = wp.cw_mul(inverse, wp.transpose(axes) * away)
+    b0 = wp.cw_mul(inverse, wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])) / focal[0]
+    b1 = wp.cw_mul(inverse, wp.vec3(axes[1, 0], axes[1, 1], axes[1, 2])) / focal[1]
+    aa = wp.dot(a, a)
+    c0 = wp.cross(a, b0) / aa
+    c1 = wp.cross(a, b1) / aa
+    normal = -(axes * wp.cw_mul(inverse, a))
+    out_centers[splat] = wp.vec4(x, y, log_opacity, z)
+    out_shapes[splat] = wp.vec4(1.0 / wp.sqrt(xx), xy / xx, wp.sqrt(xx / det), DEPTH_REACH * largest)
+    out_slopes[splat] = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
+    out_bends[splat] = wp.dot(c1, c1)
+    out_normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
+
+
+def launch_project(gaussians, views, projection, splats, device):
+    """Project every Gaussian into every view; ``gaussians`` are positions, orientations, scales and opacities."""
+    launch(
+        project_gaussians_kernel,
+        len(splats.centers),
+        inputs=[*gaussians, views, projection],
+        outputs=[splats.centers, splats.shapes, splats.slopes, splats.bends, splats.normals],
+        device=device,
+    )
+
+
+def launch_project_adjoint(gaussians, views, projection, splats, splat_gradients, gradients, device):
+    """Add to ``gradients`` (of the four ``gaussians``) what ``splat_gradients`` (of the five outputs) say."""
+    count = len(gaussians[0])
+    for view in range(len(views)):  # one view at a time: each Gaussian is then added to once a launch, in this order
+        launch_adjoint(
+            project_gaussians_kernel,
+            range(view * count, (view + 1) * count),
+            inputs=[*gaussians, views, projection],
+            outputs=[splats.centers, splats.shapes, splats.slopes, splats.bends, splats.normals],
+            input_gradients=[*gradients, None, Projection()],
+            output_gradients=splat_gradients,
+            device=device,
+        )

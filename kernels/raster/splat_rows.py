@@ -1,0 +1,189 @@
+"""One splat at one pixel: its response, its depth there, and which pixels of a row it reaches."""
+
+import warp as wp
+
+from beam_warp.kernels.raster.project import LOG_CUT
+
+EXTENT_MARGIN = wp.constant(0.01)
+"""Pixels added to an extent, so that rounding in it never hides a pixel that passes the alpha cut."""
+
+RELATIVE_MARGIN = wp.constant(1.0e-5)
+"""Part of an extent added to it: single precision, a few operations, a margin of ten."""
+
+ALPHA_CAP = wp.constant(0.99)
+"""Largest alpha of one splat (Kerbl et al. 2023): light behind an opaque one keeps a gradient."""
+
+TRANSMITTANCE_STOP = wp.constant(1.0e-4)
+"""A pixel is done once less than this passes. The splat that gets it there still counts: leaving it out, as 3DGS does,
+can drop 1 % of a pixel; what is left out here is below this number."""
+
+MEDIAN = wp.constant(0.5)
+"""The median depth is that of the last splat that more than this passes before."""
+
+SMALLEST_FACING = wp.constant(1.0e-6)
+"""Depth at a pixel whose ray runs along a Gaussian's surface, or away from it, is that of the ray that meets it so."""
+
+
+@wp.func
+def squared_extent(log_opacity: float) -> float:
+    """Squared number of standard deviations at which alpha falls to 1/255."""
+    return 2.0 * (LOG_CUT + log_opacity)
+
+
+@wp.func
+def reach_rows(shape: wp.vec4, squared: float) -> float:
+    """Largest distance along y from the centre to where alpha is 1/255 [pixel]."""
+    e = shape[1] * shape[2]
+    reach = wp.sqrt(squared * (shape[0] * shape[0] + e * e)) / (shape[0] * shape[2])
+    return reach * (1.0 + RELATIVE_MARGIN) + EXTENT_MARGIN
+
+
+@wp.func
+def reach_columns(shape: wp.vec4, squared: float, top: float, bottom: float) -> wp.vec2:
+    """Least and greatest x of the ellipse where alpha is 1/255 between two y, all from the centre [pixel].
+
+    The ellipse's ends along x lie at y = -s1 r and s1 r, r = reach / s0: if these are outside, the ends of what is
+    between the two y are on the nearer of them.
+    """
+    e = shape[1] * shape[2]
+    k = shape[0] * shape[0] + e * e
+    end = wp.sqrt(squared) * shape[1] / shape[0]
+    left_y = wp.clamp(-end, top, bottom)
+    right_y = wp.clamp(end, top, bottom)
+    c = shape[0] * shape[0] * shape[2] * shape[2]
+    left = e * shape[2] * left_y - wp.sqrt(wp.max(k * squared - c * left_y * left_y, 0.0))
+    right = e * shape[2] * right_y + wp.sqrt(wp.max(k * squared - c * right_y * right_y, 0.0))
+    margin = RELATIVE_MARGIN * wp.max(wp.abs(left), wp.abs(right)) / k + EXTENT_MARGIN
+    return wp.vec2(left / k - margin, right / k + margin)
+
+
+@wp.struct
+class RowReach:
+    """What the pixels that a splat reaches in a row of pixels follow from, the same for all rows."""
+
+    lean: float  # x of their middle over y, both from the centre
+    widest: float  # square of half their extent in the centre's row
+    narrowing: float  # how much of it each squared y takes
+
+
+@wp.func
+def row_reach(shape: wp.vec4, squared: float) -> RowReach:
+    e = shape[1] * shape[2]
+    k = shape[0] * shape[0] + e * e
+    found = RowReach()
+    found.lean = e * shape[2] / k
+    found.widest = squared / k
+    sharpness = shape[0] * shape[2] / k
+    found.narrowing = sharpness * sharpness
+    return found
+
+
+@wp.func
+def reach_row(row: RowReach, y: float) -> wp.vec2:
+    """Least and greatest x of the ellipse where alpha is 1/255 at a y, from the centre; `reach_columns` of one row."""
+    middle = row.lean * y
+    half = wp.sqrt(wp.max(row.widest - row.narrowing * y * y, 0.0))
+    margin = RELATIVE_MARGIN * (wp.abs(middle) + half) + EXTENT_MARGIN
+    return wp.vec2(middle - half - margin, middle + half + margin)
+
+
+@wp.func
+def first_pixel_from(edge: float, limit: int) -> int:
+    """First of ``limit`` pixels whose centre is not before an edge; clamped as a float: no integer holds every one."""
+    start = wp.clamp(edge - 0.5, 0.0, float(limit))
+    whole = int(start)
+    return whole + wp.where(float(whole) < start, 1, 0)
+
+
+@wp.func
+def end_pixel_at(edge: float, limit: int) -> int:
+    """End of those of ``limit`` pixels whose centre is not beyond an edge."""
+    return int(wp.clamp(edge + 0.5, 0.0, float(limit)))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __expf(x);
+#else
+    return expf(x);
+#endif
+""")
+def quick_exp(x: float) -> float:
+    """The exponential; on CUDA within 2 + |1.16 x| ulp: relative 1.0e-6 for the faintest alpha there is."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __fdividef(x, y);
+#else
+    return x / y;
+#endif
+""")
+def quick_divide(x: float, y: float) -> float:
+    """A quotient; on CUDA within 2 ulp, and 0 where the divisor is beyond 2^126."""
+    ...
+
+
+@wp.func
+def offset_from(center: wp.vec4, position: wp.vec2) -> wp.vec2:
+    """Way from a centre to a pixel [pixel]."""
+    return wp.vec2(position[0] - center[0], position[1] - center[1])
+
+
+@wp.func
+def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
+    """An offset in standard deviations: (e0, e1) of `kernels.project.Splats`."""
+    return wp.vec2(offset[0] * shape[0], (offset[1] - shape[1] * offset[0]) * shape[2])
+
+
+@wp.func
+def log_alpha_of(center: wp.vec4, e: wp.vec2) -> float:
+    """Logarithm of opacity times response."""
+    return center[2] - 0.5 * (e[0] * e[0] + e[1] * e[1])
+
+
+@wp.func
+def alpha_of(log_alpha: float) -> float:
+    """Alpha of what passes the cut."""
+    return wp.min(quick_exp(log_alpha), ALPHA_CAP)
+
+
+@wp.func
+def facing_at(slope: wp.vec4, offset: wp.vec2) -> float:
+    """The factor l of `kernels.project` at an offset from the centre."""
+    return 1.0 + slope[0] * offset[0] + slope[1] * offset[1]
+
+
+@wp.func
+def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
+    """The form e of `kernels.project` at an offset from the centre."""
+    x = offset[0]
+    y = offset[1]
+    return slope[2] * x * x + 2.0 * slope[3] * x * y + bend * y * y
+
+
+@wp.func
+def clamp_depth(center: wp.vec4, shape: wp.vec4, near: float, inverse: float) -> float:
+    """Depth of a centre over ``inverse``, kept where the Gaussian is."""
+    far = center[3] + shape[3]
+    depth = wp.where(inverse > 0.0, wp.min(quick_divide(center[3], inverse), far), far)
+    return wp.max(depth, wp.max(center[3] - shape[3], near))
+
+
+@wp.func
+def plane_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
+    """Depth of the plane at an offset from the centre; beyond its horizon the far end. ``bend`` has no part in it."""
+    return clamp_depth(center, shape, near, facing_at(slope, offset))
+
+
+@wp.func
+def exact_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
+    """Depth of the largest response on the ray at an offset from the centre."""
+    facing = wp.max(facing_at(slope, offset), SMALLEST_FACING)
+    return clamp_depth(center, shape, near, facing + quick_divide(bend_at(slope, bend, offset), facing))
+
+
+def depth_function(exact: bool):
+    """Return the function (center, shape, slope, bend, near, offset) that gives a splat's depth at a pixel."""
+    return exact_depth_at if exact else plane_depth_at

@@ -1,0 +1,25 @@
+"""What the views of a scene say of its Gaussians, summed over the views."""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def sum_views_kernel(first: int, rows: wp.array2d[float], out_sums: wp.array2d[float]):
+    """Add one column of a Gaussian's rows, view by view."""
+    item = first + wp.tid()
+    count = out_sums.shape[0]
+    gaussian = item / out_sums.shape[1]
+    column = item % out_sums.shape[1]
+    total = float(0.0)
+    for view in range(rows.shape[0] / count):
+        total += rows[view * count + gaussian, column]
+    out_sums[gaussian, column] = total
+
+
+def launch_sum_views(rows, sums, device):
+    """Sum ``(V * N, K)`` rows over the views to ``(N, K)``."""
+    launch(sum_views_kernel, sums.shape[0] * sums.shape[1], inputs=[rows], outputs=[sums], device=device)

@@ -1,0 +1,1 @@
+"""Fitting and tracking Gaussians: parameters, regularisers, skinning, and the visual hull."""

@@ -1,0 +1,118 @@
+"""Linear images as a viewer sees them: pixels as means of samples, the sRGB curve, continued above 1, and the way back.
+
+Errors in the dark are seen more than those in the light; a loss on encoded colours weighs them so. A photograph's pixel
+is the mean over its area, in linear light: with several samples for each, so is ours.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+KNEE = wp.constant(0.0031308)
+
+
+@wp.func
+def mean_sample(samples: wp.array3d[float], y: int, x: int, channel: int, factor: int) -> float:
+    total = float(0.0)
+    for j in range(factor):
+        for i in range(factor):
+            total += samples[y * factor + j, x * factor + i, channel]
+    return total / float(factor * factor)
+
+
+@wp.kernel
+def encode_kernel(first: int, samples: wp.array3d[float], factor: int, out_encoded: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / out_encoded.shape[1]
+    x = item % out_encoded.shape[1]
+    for channel in range(out_encoded.shape[2]):
+        value = mean_sample(samples, y, x, channel, factor)
+        encoded = 12.92 * value
+        if value > KNEE:
+            encoded = 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
+        out_encoded[y, x, channel] = encoded
+
+
+@wp.kernel
+def add_sample_gradients_kernel(
+    first: int, samples: wp.array3d[float], factor: int, gradients: wp.array3d[float], out_gradients: wp.array3d[float]
+):
+    item = first + wp.tid()
+    y = item / gradients.shape[1]
+    x = item % gradients.shape[1]
+    for channel in range(gradients.shape[2]):
+        value = mean_sample(samples, y, x, channel, factor)
+        slope = float(12.92)
+        if value > KNEE:
+            slope = (1.055 / 2.4) * wp.pow(value, 1.0 / 2.4 - 1.0)
+        share = slope * gradients[y, x, channel] / float(factor * factor)
+        for j in range(factor):
+            for i in range(factor):
+                out_gradients[y * factor + j, x * factor + i, channel] += share
+
+
+@wp.kernel
+def average_kernel(first: int, samples: wp.array3d[float], factor: int, out_means: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / out_means.shape[1]
+    x = item % out_means.shape[1]
+    for channel in range(out_means.shape[2]):
+        out_means[y, x, channel] = mean_sample(samples, y, x, channel, factor)
+
+
+@wp.kernel
+def spread_kernel(first: int, gradients: wp.array3d[float], factor: int, out_gradients: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / gradients.shape[1]
+    x = item % gradients.shape[1]
+    for channel in range(gradients.shape[2]):
+        share = gradients[y, x, channel] / float(factor * factor)
+        for j in range(factor):
+            for i in range(factor):
+                out_gradients[y * factor + j, x * factor + i, channel] += share
+
+
+@wp.kernel
+def square_error_kernel(first: int, encoded: wp.array3d[float], target: wp.array3d[float], out_errors: wp.array[float]):
+    item = first + wp.tid()
+    y = item / target.shape[1]
+    x = item % target.shape[1]
+    total = float(0.0)
+    for channel in range(target.shape[2]):
+        difference = wp.clamp(encoded[y, x, channel], 0.0, 1.0) - wp.clamp(target[y, x, channel], 0.0, 1.0)
+        total += difference * difference
+    out_errors[item] = total
+
+
+def launch_encode(samples: Any, factor: int, out_encoded: Any, device: Any) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode; arrays may be strided."""
+    pixels = out_encoded.shape[0] * out_encoded.shape[1]
+    launch(encode_kernel, pixels, inputs=[samples, factor], outputs=[out_encoded], device=device)
+
+
+def launch_add_sample_gradients(samples: Any, factor: int, gradients: Any, out_gradients: Any, device: Any) -> None:
+    """Add the gradients of linear samples, given those of the encoded image."""
+    pixels = gradients.shape[0] * gradients.shape[1]
+    inputs = [samples, factor, gradients]
+    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
+
+
+def launch_average(samples: Any, factor: int, out_means: Any, device: Any) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel."""
+    pixels = out_means.shape[0] * out_means.shape[1]
+    launch(average_kernel, pixels, inputs=[samples, factor], outputs=[out_means], device=device)
+
+
+def launch_spread(gradients: Any, factor: int, out_gradients: Any, device: Any) -> None:
+    """Add the gradients of samples, given those of their averages."""
+    pixels = gradients.shape[0] * gradients.shape[1]
+    launch(spread_kernel, pixels, inputs=[gradients, factor], outputs=[out_gradients], device=device)
+
+
+def launch_square_error(encoded: Any, target: Any, out_errors: Any, device: Any) -> None:
+    """Write each pixel's sum of squared differences of values clipped to [0, 1]."""
+    launch(square_error_kernel, out_errors.size, inputs=[encoded, target], outputs=[out_errors], device=device)

@@ -1,0 +1,80 @@
+"""How points on a surface push each other apart until they lie evenly on it."""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+
+wp.set_module_options({"enable_backward": False})
+
+STEP = wp.constant(0.4)
+"""Part of its neighbours' overlaps that a point moves by: above a half, two points would jump over each other."""
+
+LONGEST_STEP = wp.constant(0.5)
+"""Of the spacing: a point stays in its neighbourhood."""
+
+
+@wp.kernel
+def push_apart_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    neighbors: wp.array2d[int],
+    spacing: float,
+    mesh: wp.uint64,
+    vertex_normals: wp.array[wp.vec3],
+    faces: wp.array[int],
+    out_positions: wp.array[wp.vec3],
+    out_normals: wp.array[wp.vec3],
+):
+    i = first + wp.tid()
+    here = positions[i]
+    normal = normals[i]
+    push = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
+        away = here - positions[j]
+        distance = wp.length(away)
+        # The other side of something thin is no neighbour; nor is a point itself.
+        if distance > 0.0 and distance < spacing and wp.dot(normal, normals[j]) > 0.0:
+            push += away * ((spacing - distance) / distance)
+    push = STEP * (push - normal * wp.dot(push, normal))
+    length = wp.length(push)
+    if length > LONGEST_STEP * spacing:
+        push = push * (LONGEST_STEP * spacing / length)
+    moved = here + push
+    turned = normal
+    nearest = wp.mesh_query_point_no_sign(mesh, moved, 4.0 * spacing)
+    if nearest.result:
+        a = faces[3 * nearest.face]
+        b = faces[3 * nearest.face + 1]
+        c = faces[3 * nearest.face + 2]
+        w = 1.0 - nearest.u - nearest.v
+        moved = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
+        turned = wp.normalize(vertex_normals[a] * nearest.u + vertex_normals[b] * nearest.v + vertex_normals[c] * w)
+    else:
+        moved = here
+    out_positions[i] = moved
+    out_normals[i] = turned
+
+
+def launch_push_apart(
+    positions: Any,
+    normals: Any,
+    neighbors: Any,
+    spacing: float,
+    mesh: Any,
+    vertex_normals: Any,
+    out_positions: Any,
+    out_normals: Any,
+    device: Any,
+) -> None:
+    """Move every point away from neighbours nearer than ``spacing``, and back to the mesh."""
+    launch(
+        push_apart_kernel,
+        len(positions),
+        inputs=[positions, normals, neighbors, spacing, mesh.id, vertex_normals, mesh.indices],
+        outputs=[out_positions, out_normals],
+        device=device,
+    )

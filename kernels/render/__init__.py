@@ -1,0 +1,1 @@
+"""Renderers: shadow maps, deferred shading, and path tracing."""

@@ -1,0 +1,119 @@
+"""Irradiance that arrives at every Gaussian, straight from the environment and from lights, shadows taken into account.
+
+With e_k(n) the irradiance that region k of an environment sheds on a normal and V_k the share of it that is seen, what
+arrives is E(n) sum V_k e_k(n) / sum e_k(n), by channel: a ratio, so that E, known in closed form, stays exact. Without
+regions it is E(n) times ambient occlusion.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.sampling import hash_word, unit_float
+from beam_warp.kernels.light.latlong import latlong_bilinear
+from beam_warp.kernels.light.lights import Lights
+from beam_warp.kernels.render.shadow_maps import ShadowMaps, visible_share
+from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows, lit_irradiance, unturned
+from beam_warp.kernels.trace.incident_light import LightMoments, above_horizon
+
+wp.set_module_options({"enable_backward": False})
+
+TAU = wp.constant(6.283185307179586)
+
+ROUGHNESS = wp.constant(3)
+"""Columns of a Gaussian's values: base colour first; then these."""
+
+OCCLUSION = wp.constant(4)
+NORMAL = wp.constant(5)
+ARRIVING = wp.constant(8)
+OPENNESS = wp.constant(11)
+
+POINT_CHUNK = 256
+"""Fewest points of one launch on the CPU: each reads many texels."""
+
+
+@wp.struct
+class RegionShadows:
+    """Regions of an environment, and a map of each; no regions for none."""
+
+    maps: ShadowMaps
+    moments: LightMoments  # as turned
+
+
+@wp.func
+def random_turn(item: int) -> wp.vec2:
+    """Cosine and sine of an angle that an item's number hashes to."""
+    angle = TAU * unit_float(hash_word(wp.uint32(item)))
+    return wp.vec2(wp.cos(angle), wp.sin(angle))
+
+
+@wp.func
+def environment_openness(regions: RegionShadows, point: wp.vec3, normal: wp.vec3, turn: wp.vec2) -> wp.vec3:
+    """Share of each channel's irradiance that arrives; 1 where no region is above the horizon."""
+    total = wp.vec3()
+    seen = wp.vec3()
+    moments = regions.moments
+    for k in range(moments.red.shape[0]):
+        light = wp.vec3(
+            above_horizon(moments.red[k], normal),
+            above_horizon(moments.green[k], normal),
+            above_horizon(moments.blue[k], normal),
+        )
+        if light[0] + light[1] + light[2] > 0.0:
+            total += light
+            seen += light * visible_share(regions.maps, k, point, normal, turn)
+    openness = wp.vec3(1.0, 1.0, 1.0)
+    for c in range(3):
+        if total[c] > 0.0:
+            openness[c] = wp.min(seen[c] / total[c], 1.0)
+    return openness
+
+
+@wp.func
+def luminance(rgb: wp.vec3) -> float:
+    return 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
+
+
+@wp.func
+def row_vector(values: wp.array2d[float], row: int, column: int) -> wp.vec3:
+    return wp.vec3(values[row, column], values[row, column + 1], values[row, column + 2])
+
+
+@wp.kernel
+def light_gaussians_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    values: wp.array2d[float],
+    environment: DistantLight,
+    regions: RegionShadows,
+    lights: Lights,
+    shadows: LightShadows,
+    out_arriving: wp.array[wp.vec4],
+    out_lit: wp.array[wp.vec3],
+):
+    """``out_arriving`` is the environment's, and its share of the unshadowed luminance; ``out_lit`` all lights'."""
+    i = first + wp.tid()
+    normal = row_vector(values, i, NORMAL)
+    point = positions[i]
+    turn = random_turn(i)
+    free = latlong_bilinear(environment.light.irradiance, unturned(environment, normal))
+    arriving = free * values[i, OCCLUSION]
+    share = values[i, OCCLUSION]
+    if regions.moments.red.shape[0] > 0:
+        arriving = wp.cw_mul(free, environment_openness(regions, point, normal, turn))
+        if luminance(free) > 0.0:
+            share = luminance(arriving) / luminance(free)
+    out_arriving[i] = wp.vec4(arriving[0], arriving[1], arriving[2], share)
+    out_lit[i] = arriving + lit_irradiance(lights, shadows, point, normal, turn)
+
+
+def launch_light_gaussians(gaussians, environment, regions, lights, shadows, out_arriving, out_lit, device):
+    """Find what arrives at the Gaussians, of their positions and values."""
+    launch(
+        light_gaussians_kernel,
+        len(gaussians.positions),
+        inputs=[gaussians.positions, gaussians.values, environment, regions, lights, shadows],
+        outputs=[out_arriving, out_lit],
+        device=device,
+        block_dim=128,
+        min_chunk=POINT_CHUNK,
+    )

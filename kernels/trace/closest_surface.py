@@ -1,0 +1,264 @@
+"""What a ray sees, front to back: depth, normal, blended attributes and what is left of the light.
+
+Hits are collected in rounds of the nearest `BUFFER_SIZE` behind the last one, in the order (t, index), so that
+coincident Gaussians are neither lost nor counted twice; then they are blended, until transmittance falls below the
+stop.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.common.constants import LARGEST_FLOAT
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.row_loads import load_row
+from beam_warp.kernels.mesh.occluder import nearest_on_mesh
+from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak, whitening_times
+from beam_warp.kernels.trace.settings import TraceSettings, counts
+from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
+from beam_warp.kernels.trace.wide_tree import Stack, WideTree, first_bit, lowest_bit, meet_leaf, meet_node, reciprocal
+
+wp.set_module_options({"enable_backward": False})
+
+BUFFER_SIZE = 16
+Times = wp.types.vector(length=BUFFER_SIZE, dtype=wp.float32)
+Indices = wp.types.vector(length=BUFFER_SIZE, dtype=wp.int32)
+LAST = wp.constant(BUFFER_SIZE - 1)
+
+
+@wp.struct
+class HitBuffer:
+    """The nearest hits of a round in order; free places hold infinity."""
+
+    t: Times
+    index: Indices
+    count: int  # hits met, those that found no place included
+
+
+@wp.func
+def is_before(t: float, index: int, other_t: float, other_index: int) -> bool:
+    return t < other_t or (t == other_t and index < other_index)
+
+
+@wp.func
+def insert_hit(buffer: HitBuffer, t: float, index: int) -> HitBuffer:
+    """Sink a hit to its place; the last one falls out. Unrolled, so that the buffer stays in registers."""
+    result = buffer
+    moving_t = t
+    moving_index = index
+    for k in range(BUFFER_SIZE):
+        if is_before(moving_t, moving_index, result.t[k], result.index[k]):
+            other_t = result.t[k]
+            other_index = result.index[k]
+            result.t[k] = moving_t
+            result.index[k] = moving_index
+            moving_t = other_t
+            moving_index = other_index
+    result.count += 1
+    return result
+
+
+@wp.func
+def empty_buffer() -> HitBuffer:
+    buffer = HitBuffer()
+    for k in range(BUFFER_SIZE):
+        buffer.t[k] = LARGEST_FLOAT
+        buffer.index[k] = 0x7FFFFFFF
+    return buffer
+
+
+@wp.func
+def nearest_hits(
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_last: float,
+    index_last: int,
+    t_max: float,
+) -> HitBuffer:
+    """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``.
+
+    Children are visited from near to far along their node's axis; what lies behind a full buffer is passed over.
+    """
+    inverse = reciprocal(direction)
+    stack = Stack()
+    depth = int(0)
+    first_node = int(0)
+    inner = int(1)
+    axis = int(0)
+    buffer = empty_buffer()
+    while inner != 0:
+        bit = first_bit(inner, direction[axis] < 0.0)
+        node = first_node + bit
+        inner = inner & ~(1 << bit)
+        if inner != 0:
+            stack[depth] = (first_node << 6) | (axis << 4) | inner
+            depth += 1
+        reach = wp.min(t_max, buffer.t[LAST])
+        hits = meet_node(tree, node, origin, inverse, t_last, reach)
+        first_node = hits.first_node
+        inner = hits.inner
+        axis = hits.axis
+        leaf = hits.leaf
+        while leaf != 0:
+            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
+            leaf = leaf & (leaf - 1)
+            if peak.alpha > 0.0 and is_before(t_last, index_last, peak.t, peak.index):
+                buffer = insert_hit(buffer, peak.t, peak.index)
+        if inner == 0 and depth > 0:
+            depth -= 1
+            first_node = stack[depth] >> 6
+            axis = (stack[depth] >> 4) & 3
+            inner = stack[depth] & 15
+    return buffer
+
+
+@wp.func
+def nearest_hits(  # noqa: F811
+    tree: WarpTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_last: float,
+    index_last: int,
+    t_max: float,
+) -> HitBuffer:
+    """The same through ``wp.Bvh``, whose order is its own."""
+    buffer = empty_buffer()
+    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
+    index = int(0)
+    # A millionth more: boxes must come strictly before the limit, equal hits must not be lost.
+    while wp.bvh_query_next(query, index, wp.min(t_max, buffer.t[LAST] * 1.000001)):
+        peak = ray_peak(gaussians, index, origin, direction)
+        if counts(gaussians, settings, index, peak, direction, t_max):
+            if is_before(t_last, index_last, peak.t, index):
+                buffer = insert_hit(buffer, peak.t, index)
+    return buffer
+
+
+@wp.func
+def entry_normal(gaussians: Gaussians, index: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """Unit normal of the support's ellipsoid where the ray enters it: R S^-1 y, y its point on the unit Gaussian.
+
+    In the space of the unit Gaussian the ellipsoid is a sphere of the support's radius; normals carry over by the
+    transpose of the whitening M = S^-1 R^T, which for a point y of that space is R S^-1 y.
+    """
+    center = load_row(gaussians.center_opacity, index)
+    p = origin - wp.vec3(center[0], center[1], center[2])
+    p = p - direction * wp.dot(p, direction)
+    q = whitening_times(gaussians, index, p)
+    d = whitening_times(gaussians, index, direction)
+    dd = wp.dot(d, d)
+    q = q - d * (wp.dot(q, d) / dd)
+    a = load_row(gaussians.whitening_0, index)
+    b = load_row(gaussians.whitening_1, index)
+    c = load_row(gaussians.whitening_2, index)
+    y = q - d * wp.sqrt(wp.max(a[3] - wp.dot(q, q), 0.0) / dd)
+    normal = wp.vec3(a[0], a[1], a[2]) * y[0] + wp.vec3(b[0], b[1], b[2]) * y[1] + wp.vec3(c[0], c[1], c[2]) * y[2]
+    return wp.normalize(normal)
+
+
+@wp.struct
+class SurfaceRecords:
+    """What rays see, one row each."""
+
+    threshold_depth: wp.array[float]
+    expected_depth: wp.array[float]
+    normals: wp.array[wp.vec3]
+    attributes: wp.array2d[float]
+    transmittance: wp.array[float]
+    gaussians: wp.array[int]
+    hit_counts: wp.array[int]
+    mesh_depth: wp.array[float]
+    mesh_faces: wp.array[int]
+
+
+@wp.kernel
+def trace_surface_kernel(
+    first: int,
+    occluders: Any,
+    settings: TraceSettings,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    reaches: wp.array[float],
+    threshold: float,
+    attributes: wp.array2d[float],
+    out_records: SurfaceRecords,
+):
+    i = first + wp.tid()
+    origin = origins[i] - occluders.origin
+    direction = directions[i]
+    reach = reaches[wp.min(i, reaches.shape[0] - 1)]
+    mesh = nearest_on_mesh(occluders.mesh, origin, direction, reach)
+    channels = attributes.shape[1]
+    for channel in range(channels):
+        out_records.attributes[i, channel] = 0.0
+    transmittance = float(1.0)
+    opacity = float(0.0)  # sum of the weights: 1 - transmittance would lose digits of faint hits
+    depth = float(0.0)
+    normal = wp.vec3()
+    threshold_depth = float(wp.inf)
+    threshold_gaussian = int(-1)
+    hits = int(0)
+    t_last = float(0.0)
+    index_last = int(-1)
+    more = int(1)
+    while more == 1:
+        buffer = nearest_hits(
+            occluders.tree, occluders.gaussians, settings, origin, direction, t_last, index_last, mesh.t
+        )
+        taken = wp.min(buffer.count, BUFFER_SIZE)
+        for k in range(BUFFER_SIZE):
+            if k < taken and transmittance >= settings.stop:
+                index = buffer.index[k]
+                peak = ray_peak(occluders.gaussians, index, origin, direction)
+                if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
+                    weight = transmittance * peak.alpha
+                    opacity += weight
+                    depth += weight * buffer.t[k]
+                    normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
+                    for channel in range(channels):
+                        out_records.attributes[i, channel] += weight * attributes[index, channel]
+                    transmittance *= 1.0 - peak.alpha
+                    hits += 1
+                    if threshold_gaussian < 0 and transmittance < threshold:
+                        threshold_gaussian = index
+                        threshold_depth = buffer.t[k]
+        t_last = buffer.t[LAST]
+        index_last = buffer.index[LAST]
+        more = 0
+        # A full buffer may have hidden others from view.
+        if buffer.count >= BUFFER_SIZE and transmittance >= settings.stop:
+            more = 1
+    if hits > 0:
+        depth /= opacity
+        normal = wp.normalize(normal)
+        for channel in range(channels):
+            out_records.attributes[i, channel] = out_records.attributes[i, channel] / opacity
+    else:
+        depth = wp.inf
+    if threshold_gaussian < 0 and mesh.face >= 0:
+        threshold_depth = mesh.t
+    out_records.threshold_depth[i] = threshold_depth
+    out_records.expected_depth[i] = depth
+    out_records.normals[i] = normal
+    out_records.transmittance[i] = transmittance
+    out_records.gaussians[i] = threshold_gaussian
+    out_records.hit_counts[i] = hits
+    out_records.mesh_depth[i] = wp.where(mesh.face >= 0, mesh.t, wp.inf)
+    out_records.mesh_faces[i] = mesh.face
+
+
+def launch_trace_surface(occluders, settings, origins, directions, reaches, threshold, attributes, out_records, device):
+    """Trace one ray a thread, front to back."""
+    launch(
+        trace_surface_kernel,
+        len(origins),
+        inputs=[occluders, settings, origins, directions, reaches, threshold, attributes],
+        outputs=[out_records],
+        device=device,
+        block_dim=64,
+    )

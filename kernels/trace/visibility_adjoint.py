@@ -1,0 +1,463 @@
+"""Reverse pass of visibility: each ray is traversed again, and its hits are handed to the Gaussians that they hit.
+
+V = product of (1 - alpha_i), so dV/dlog(alpha_i) = -V alpha_i / (1 - alpha_i) whatever the order. Autodiff through the
+traversal's loop is silently wrong; here the first traversal counts hits and finds V, the second stores them at slots
+that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
+No float atomics: the same bits in every run, for any number of threads.
+
+A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over hits around `tally_hit` and `store_hit`,
+in the same order both times.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from beam_warp.kernels.common.constants import ALPHA_MAX
+from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.mesh.occluder import mesh_blocks
+from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak
+from beam_warp.kernels.trace.hit_gradients import (
+    CloudGradients,
+    HitMoments,
+    HitRecords,
+    add_hits,
+    add_sums,
+    log_response_slope,
+    orientation_gradient,
+    scale_gradient,
+    single,
+    transposed_whitening_times,
+    whitened_closest_point,
+)
+from beam_warp.kernels.trace.settings import TraceSettings, counts
+from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
+from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+
+wp.set_module_options({"enable_backward": False})
+
+
+SUM_BLOCK = wp.constant(256)
+"""Hits in a block that one thread sums: a Gaussian with n hits costs its thread at most 512 + n / 256 additions."""
+
+
+@wp.struct
+class HitTally:
+    """What the first traversal of a ray finds."""
+
+    transmittance: float
+    count: int  # of hits that have a gradient: alpha at its cap has none
+
+
+@wp.struct
+class RayReturn:
+    """What the second traversal of a ray carries."""
+
+    weight: float  # -V times the ray's adjoint
+    slot: int  # where the next hit goes
+    end: int
+    origin: wp.vec3  # gradients with respect to the ray
+    direction: wp.vec3
+
+
+@wp.func
+def tally_hit(tally: HitTally, alpha: float) -> HitTally:
+    result = tally
+    result.transmittance *= 1.0 - alpha
+    if alpha < ALPHA_MAX:
+        result.count += 1
+    return result
+
+
+@wp.func
+def store_hit(
+    ray: RayReturn,
+    gaussians: Gaussians,
+    index: int,
+    alpha: float,
+    t: float,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    out_hits: HitRecords,
+) -> RayReturn:
+    """Store a hit with its peak at ``t``, unless it has no gradient, and add that gradient to the ray's."""
+    result = ray
+    if alpha < ALPHA_MAX:
+        q = whitened_closest_point(gaussians, index, origin, direction)
+        e = ray.weight * alpha / (1.0 - alpha)
+        out_hits.gaussian[ray.slot] = index
+        out_hits.record[ray.slot] = wp.vec4(q[0], q[1], q[2], e)
+        w = e * log_response_slope(gaussians.degree, wp.dot(q, q))
+        pull = transposed_whitening_times(gaussians, index, q) * (2.0 * w)
+        result.origin += pull
+        result.direction += pull * t
+        result.slot += 1
+    return result
+
+
+@wp.func
+def tally_hits(
+    tree: WarpTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+) -> HitTally:
+    """V and the number of hits with gradients, over what `warp_tree_transmittance` visits."""
+    tally = HitTally()
+    tally.transmittance = float(1.0)
+    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
+    index = int(0)
+    while wp.bvh_query_next(query, index, t_max):
+        peak = ray_peak(gaussians, index, origin, direction)
+        if counts(gaussians, settings, index, peak, direction, t_max):
+            tally = tally_hit(tally, peak.alpha)
+            if tally.transmittance < settings.stop:
+                break
+    return tally
+
+
+@wp.func
+def store_hits(
+    tree: WarpTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    start: RayReturn,
+    out_hits: HitRecords,
+) -> RayReturn:
+    """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
+    ray = start
+    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
+    index = int(0)
+    while wp.bvh_query_next(query, index, t_max):
+        peak = ray_peak(gaussians, index, origin, direction)
+        if counts(gaussians, settings, index, peak, direction, t_max):
+            ray = store_hit(ray, gaussians, index, peak.alpha, peak.t, origin, direction, out_hits)
+            if ray.slot == ray.end:
+                break
+    return ray
+
+
+@wp.func
+def tally_hits(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+) -> HitTally:
+    """The same, over what `wide_tree_transmittance` visits."""
+    inverse = reciprocal(direction)
+    stack = Stack()
+    depth = int(0)
+    first_node = int(0)
+    inner = int(1)
+    tally = HitTally()
+    tally.transmittance = float(1.0)
+    while inner != 0:
+        node = first_node + lowest_bit(inner)
+        inner = inner & (inner - 1)
+        if inner != 0:
+            stack[depth] = (first_node << 4) | inner
+            depth += 1
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
+        first_node = hits.first_node
+        inner = hits.inner
+        leaf = hits.leaf
+        while leaf != 0:
+            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
+            leaf = leaf & (leaf - 1)
+            if peak.alpha > 0.0:
+                tally = tally_hit(tally, peak.alpha)
+                if tally.transmittance < settings.stop:
+                    leaf = 0
+                    inner = 0
+                    depth = 0
+        if inner == 0 and depth > 0:
+            depth -= 1
+            first_node = stack[depth] >> 4
+            inner = stack[depth] & 15
+    return tally
+
+
+@wp.func
+def store_hits(  # noqa: F811
+    tree: WideTree,
+    gaussians: Gaussians,
+    settings: TraceSettings,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    t_max: float,
+    start: RayReturn,
+    out_hits: HitRecords,
+) -> RayReturn:
+    """The same, for the wide tree."""
+    inverse = reciprocal(direction)
+    stack = Stack()
+    depth = int(0)
+    first_node = int(0)
+    inner = int(1)
+    ray = start
+    while inner != 0:
+        node = first_node + lowest_bit(inner)
+        inner = inner & (inner - 1)
+        if inner != 0:
+            stack[depth] = (first_node << 4) | inner
+            depth += 1
+        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
+        first_node = hits.first_node
+        inner = hits.inner
+        leaf = hits.leaf
+        while leaf != 0:
+            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
+            leaf = leaf & (leaf - 1)
+            if peak.alpha > 0.0:
+                ray = store_hit(ray, gaussians, peak.index, peak.alpha, peak.t, origin, direction, out_hits)
+                if ray.slot == ray.end:
+                    leaf = 0
+                    inner = 0
+                    depth = 0
+        if inner == 0 and depth > 0:
+            depth -= 1
+            first_node = stack[depth] >> 4
+            inner = stack[depth] & 15
+    return ray
+
+
+@wp.kernel
+def count_hits_kernel(
+    first: int,
+    occluders: Any,
+    settings: TraceSettings,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    reaches: wp.array[float],
+    adjoints: wp.array[float],
+    out_transmittance: wp.array[float],
+    out_count: wp.array[int],
+):
+    """First traversal. A ray with adjoint 0 has no gradient to hand on and is not traced."""
+    i = first + wp.tid()
+    tally = HitTally()
+    if adjoints[i] != 0.0:
+        t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
+        origin = origins[i] - occluders.origin
+        if not mesh_blocks(occluders.mesh, origin, directions[i], t_max):
+            tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max)
+    out_transmittance[i] = tally.transmittance
+    out_count[i] = tally.count
+
+
+def launch_count_hits(
+    occluders, settings, origins, directions, reaches, adjoints, out_transmittance, out_count, device
+):
+    """Trace one ray a thread and count the hits that have gradients."""
+    launch(
+        count_hits_kernel,
+        len(origins),
+        inputs=[occluders, settings, origins, directions, reaches, adjoints],
+        outputs=[out_transmittance, out_count],
+        device=device,
+        block_dim=64,  # as `launch_trace_visibility`
+    )
+
+
+@wp.kernel
+def store_hits_kernel(
+    first: int,
+    occluders: Any,
+    settings: TraceSettings,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    reaches: wp.array[float],
+    adjoints: wp.array[float],
+    transmittances: wp.array[float],
+    hit_counts: wp.array[int],
+    slot_ends: wp.array[int],
+    gaussian_count: int,
+    out_hits: HitRecords,
+    out_order: wp.array[int],
+    out_origins: wp.array[wp.vec3],
+    out_directions: wp.array[wp.vec3],
+):
+    """Second traversal. ``slot_ends`` is the inclusive scan of ``hit_counts``; ``out_order`` numbers the slots."""
+    i = first + wp.tid()
+    ray = RayReturn()
+    ray.weight = -adjoints[i] * transmittances[i]
+    ray.end = slot_ends[i]
+    begin = ray.end - hit_counts[i]
+    ray.slot = begin
+    if begin < ray.end:
+        t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
+        origin = origins[i] - occluders.origin
+        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray, out_hits)
+    # The compiler may round a tie differently in the two traversals; then a slot stays free, and none overflows.
+    for slot in range(ray.slot, ray.end):
+        out_hits.gaussian[slot] = gaussian_count
+    for slot in range(begin, ray.end):
+        out_order[slot] = slot
+    out_origins[i] = ray.origin
+    out_directions[i] = ray.direction
+
+
+def launch_store_hits(
+    occluders,
+    settings,
+    origins,
+    directions,
+    reaches,
+    adjoints,
+    transmittances,
+    hit_counts,
+    slot_ends,
+    gaussian_count,
+    out_hits,
+    out_order,
+    out_origins,
+    out_directions,
+    device,
+):
+    """Trace one ray a thread and store its hits."""
+    launch(
+        store_hits_kernel,
+        len(origins),
+        inputs=[
+            occluders,
+            settings,
+            origins,
+            directions,
+            reaches,
+            adjoints,
+            transmittances,
+            hit_counts,
+            slot_ends,
+            gaussian_count,
+        ],
+        outputs=[out_hits, out_order, out_origins, out_directions],
+        device=device,
+        block_dim=64,  # as `launch_trace_visibility`
+    )
+
+
+@wp.func
+def first_not_below(sorted_values: wp.array[int], begin: int, end: int, value: int) -> int:
+    """First place in ``begin`` to ``end`` whose value is not below ``value``; ``end`` if there is none.
+
+    ``wp.lower_bound`` returns ``end - 1`` in that case.
+    """
+    low = begin
+    high = end
+    while low < high:
+        middle = low + (high - low) // 2
+        if sorted_values[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.kernel
+def sum_blocks_kernel(
+    first: int,
+    degree: int,
+    hits: HitRecords,
+    order: wp.array[int],
+    out_sums: wp.array[HitMoments],
+):
+    """Sum each block of `SUM_BLOCK` sorted hits that are all of one Gaussian; the other sums are not used."""
+    i = first + wp.tid()
+    begin = i * SUM_BLOCK
+    end = begin + SUM_BLOCK
+    if hits.gaussian[begin] == hits.gaussian[end - 1]:
+        out_sums[i] = add_hits(HitMoments(), degree, hits.record, order, begin, end)
+
+
+def launch_sum_blocks(degree, hits, order, out_sums, device):
+    """Sum whole blocks of sorted hits, one a thread, so that a Gaussian that all rays hit is not one thread's work."""
+    launch(sum_blocks_kernel, len(out_sums), inputs=[degree, hits, order], outputs=[out_sums], device=device)
+
+
+@wp.kernel
+def add_moments_kernel(
+    first: int,
+    degree: int,
+    hits: HitRecords,
+    order: wp.array[int],
+    hit_count: int,
+    sums: wp.array[HitMoments],
+    out_moments: wp.array[HitMoments],
+):
+    """``hits.gaussian`` is sorted, ``order`` says at which slot each hit's record is."""
+    i = first + wp.tid()
+    begin = first_not_below(hits.gaussian, 0, hit_count, i)
+    end = first_not_below(hits.gaussian, begin, hit_count, i + 1)
+    if begin < end:
+        total = out_moments[i]
+        first_block = (begin + SUM_BLOCK - 1) // SUM_BLOCK
+        end_block = end // SUM_BLOCK
+        if first_block < end_block:
+            total = add_hits(total, degree, hits.record, order, begin, first_block * SUM_BLOCK)
+            total = add_sums(total, sums, first_block, end_block)
+            begin = end_block * SUM_BLOCK
+        out_moments[i] = add_hits(total, degree, hits.record, order, begin, end)
+
+
+def launch_add_moments(degree, hits, order, hit_count, sums, moments, device):
+    """Add sorted hits to the moments of their Gaussians, one Gaussian a thread; ``sums`` from `launch_sum_blocks`."""
+    launch(
+        add_moments_kernel,
+        len(moments),
+        inputs=[degree, hits, order, hit_count, sums],
+        outputs=[moments],
+        device=device,
+    )
+
+
+@wp.kernel
+def resolve_moments_kernel(
+    first: int,
+    gaussians: Gaussians,
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    smallest_scale: float,
+    largest_ratio: float,
+    moments: wp.array[HitMoments],
+    out_gradients: CloudGradients,
+):
+    """From moments to gradients of the cloud's arrays; 0 for Gaussians that take no part."""
+    i = first + wp.tid()
+    position = wp.vec3()
+    orientation = wp.vec4()
+    scale = wp.vec3()
+    opacity = float(0.0)
+    if gaussians.whitening_0[i][3] > 0.0:
+        total = moments[i]
+        given = scales[i]
+        floor = wp.max(smallest_scale, wp.max(given) * largest_ratio)  # as `pack_gaussians_kernel`
+        raised = wp.vec3(wp.max(given[0], floor), wp.max(given[1], floor), wp.max(given[2], floor))
+        opacity = wp.float32(total.weight) / gaussians.center_opacity[i][3]
+        position = -2.0 * transposed_whitening_times(gaussians, i, single(total.point))
+        scale = scale_gradient(single(total.square), given, floor)
+        orientation = orientation_gradient(single(total.cross), raised, orientations[i])
+    out_gradients.positions[i] = position
+    out_gradients.orientations[i] = orientation
+    out_gradients.scales[i] = scale
+    out_gradients.opacities[i] = opacity
+
+
+def launch_resolve_moments(
+    gaussians, orientations, scales, smallest_scale, largest_ratio, moments, out_gradients, device
+):
+    """Resolve every Gaussian's moments to its gradients."""
+    launch(
+        resolve_moments_kernel,
+        len(moments),
+        inputs=[gaussians, orientations, scales, smallest_scale, largest_ratio, moments],
+        outputs=[out_gradients],
+        device=device,
+    )

@@ -1,0 +1,225 @@
+"""The relighting benchmark: its scores and z-scores are right where the answer is known, and all of it runs."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import relight as benchmark
+from materials_truth import SHARP, true_cloud
+from relight_accuracy import Known, materials_at, measure_light, scores
+from relight_accuracy import Subject as RelitSubject
+from relight_energy import z_scores
+from relight_plot import LARGEST_FILE, draw_all
+from relight_scenes import MovingFigure, posed
+
+from beam_warp.demo.figure import build_figure
+from beam_warp.demo.lights import demo_environments
+from beam_warp.device.arrays import resolve_device
+from beam_warp.world.environment import EnvironmentMap
+
+TINY = replace(
+    benchmark.QUICK,
+    gaussians=300,
+    size=(24, 16),
+    perfect_gaussians=300,
+    demo_size=(24, 36),
+    demo_spacing=0.02,
+    furnace_gaussians=200,
+    bias_gaussians=200,
+    bias_seeds=(3, 2),
+)
+
+
+@pytest.fixture(scope="module")
+def bench(relit_capture):
+    def make(device, **changes):
+        made = benchmark.bench_of_capture(relit_capture, resolve_device(device), lambda text: None)
+        return replace(made, sky=made.sky.resized(16, 32), effort=TINY, **changes)
+
+    return make
+
+
+@pytest.fixture
+def small_lights(monkeypatch):
+    """What takes long by itself, smaller: environments that are made ready, views that show where surfaces are."""
+    read, demo = EnvironmentMap.read, demo_environments()
+    monkeypatch.setattr("beam_warp.render.traced_relighting.SURROUNDING_SIDE", 32)
+    monkeypatch.setattr("relight_accuracy.EnvironmentMap.read", lambda path: read(path).resized(16, 32))
+    monkeypatch.setattr(
+        "relight_accuracy.demo_environments", lambda: {name: demo[name].resized(16, 32) for name in demo}
+    )
+
+
+def disc_alpha(size=24):
+    x, y = np.meshgrid(*(np.arange(size) - 0.5 * (size - 1),) * 2)
+    return (np.hypot(x, y) < 0.4 * size).astype(np.float32)
+
+
+class TestScores:
+    def test_of_one_grey_and_another_in_closed_form(self):
+        """sRGB of 0.5 and 0.4 differ by d everywhere inside; outside both are black."""
+        alpha = disc_alpha()
+        images = [Known(np.repeat(level * alpha[..., None], 3, axis=-1), alpha) for level in (0.4, 0.5)]
+        difference = 1.055 * (0.5 ** (1 / 2.4) - 0.4 ** (1 / 2.4))
+        found = scores(images[:1], images[1:])
+        assert found["solid_psnr"] == pytest.approx(-20.0 * np.log10(difference), abs=1e-3)
+        rows, columns = np.nonzero(alpha)
+        area = (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
+        inside = -20.0 * np.log10(difference) - 10.0 * np.log10(alpha.sum() / area)
+        assert found["psnr"] == pytest.approx(inside, abs=1e-3)
+        assert found["view_psnr"] == [found["psnr"]]
+
+    def test_true_coverage_takes_silhouettes_away(self):
+        alpha = disc_alpha()
+        thin = 0.5 * alpha
+        ours, known = (Known(np.repeat(0.3 * a[..., None], 3, axis=-1), a) for a in (thin, alpha))
+        found = scores([ours], [known])
+        assert found["psnr"] < 25.0
+        assert found["true_coverage_psnr"] > 100.0
+
+
+class TestScenes:
+    def test_true_materials_are_within_what_views_show(self, relit_capture):
+        cloud = true_cloud(relit_capture, 0, 400, resolve_device("cpu"))
+        truth = next(iter(relit_capture.select(split="test", frames=[0]))).truth()
+        solid = truth.channels["A"] > 0.999
+        for name, array in (("roughness", cloud.roughness), ("ambient_occlusion", cloud.ambient_occlusion)):
+            shown = truth.stack(name)[solid]
+            assert shown.min() - 0.1 < np.median(array) < shown.max() + 0.1
+        assert cloud.base_color.shape == (400, 3)
+
+    def test_materials_of_a_mesh_are_those_of_its_points(self, rng):
+        mesh = build_figure(0.02).at(0.0)
+        faces = rng.integers(0, len(mesh.faces), 200)
+        weights = rng.dirichlet(np.ones(3), 200)
+        points = mesh.interpolate(mesh.vertices, faces, weights).astype(np.float32)
+        color, roughness = materials_at(mesh, points)
+        # Where sheets of the surface touch, a point is on both; a float32 metre is 1e-7 off its triangle.
+        close = np.abs(color - mesh.interpolate(mesh.base_color, faces, weights)).max(axis=1) < 1e-4
+        assert close.mean() > 0.98
+        assert np.abs(roughness - mesh.interpolate(mesh.roughness, faces, weights))[close].max() < 1e-3
+
+    def test_poses_are_rigid_but_for_sway_and_size(self, bench):
+        cloud = bench("cpu").figure().cloud
+        positions, orientations, scales = posed(cloud, 0.5 * np.pi)
+        assert scales == pytest.approx(cloud.scales, rel=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(orientations, axis=1), 1.0, atol=1e-5)
+        swayed = positions - cloud.positions
+        assert 0.0 < np.linalg.norm(swayed, axis=1).max() < 0.25  # ten degrees of a radius of 1.06, and 3 cm
+
+    def test_moving_writes_the_poses_in_turn(self, bench, device):
+        from beam_warp.raster.gbuffer import upload_gaussians
+
+        cloud = bench(device).figure().cloud
+        gaussians = upload_gaussians(cloud, resolve_device(device))
+        moving = MovingFigure(cloud, 2, resolve_device(device))
+        seen = []
+        for _ in range(3):
+            moving.move(gaussians)
+            seen.append(gaussians.positions.numpy().copy())
+        assert not np.array_equal(seen[0], seen[1])
+        np.testing.assert_array_equal(seen[0], seen[2])
+
+
+class TestBias:
+    @pytest.mark.parametrize("bias", [0.0, 0.3])
+    def test_z_scores_find_a_bias_and_no_other(self, rng, bias):
+        """Of normal images: without a bias, a mean of 0, a spread of 1, and tails as Student's t has them."""
+        few, many = rng.normal(10.0, 1.0, (64, 2000)), rng.normal(10.0 + bias, 0.25, (16, 2000))
+        variances = [images.var(axis=0, ddof=1) / len(images) for images in (few, many)]
+        found = z_scores([few.mean(axis=0), many.mean(axis=0)], variances, (64, 16))
+        assert found["pixels"] == 2000
+        if bias:
+            assert found["mean_in_standard_errors"] < -20.0
+            assert found["relative_bias"] == pytest.approx(-0.3 / 10.3, abs=0.002)
+        else:
+            assert abs(found["mean_in_standard_errors"]) < 4.0
+            assert found["root_mean_square"] == pytest.approx(1.0, abs=0.08)
+            assert found["largest"] < 1.3 * found["largest_by_chance"]
+            # a share of 0.4 % of 2000 pixels: 4 standard deviations of a Poisson count
+            assert abs(found["beyond"] - found["beyond_by_chance"]) < 4.0 * np.sqrt(found["beyond_by_chance"] / 2000)
+
+
+def test_levels_that_take_too_long_are_left_out(bench, small_lights):
+    small = bench("cpu")
+    small = replace(small, effort=replace(TINY, levels=(1, 2, 4096), level_seconds=0.5))
+    shot = small.small_figure()
+    truth = Known(np.zeros((18, 32, 3), np.float32), np.ones((18, 32), np.float32))
+    light = EnvironmentMap.constant((1.0, 1.0, 1.0))
+    subject = RelitSubject("figure", shot.cloud, SHARP, [shot.camera], {"white": light}, {"white": [truth]})
+    found = measure_light(small, subject, "white", {})
+    assert found["left_out"] == [4096]
+    assert [row["setting"] for row in found["rows"] if row["method"] == "path traced"] == ["1 samples", "2 samples"]
+
+
+def test_all_of_it_runs(device, bench, tmp_path, small_lights):
+    pytest.importorskip("matplotlib")
+    pictures = tmp_path / "pictures"
+    states = []
+    result = benchmark.measure(bench(device, pictures=pictures), keep=lambda state: states.append(json.dumps(state)))
+    assert result["failed"] == []
+    assert len(states) > 12  # a kill loses one row
+    cases = result["deferred"]["cases"]
+    assert [row["lights"] for row in cases.values()] == [0, 2, 0]
+    assert all(row["launched_is_drawn"] for row in cases.values())
+    for row in cases.values():
+        assert sum(row["shares_ms"].values()) == pytest.approx(row["whole"]["ms"])
+    for row in result["path"]["cases"].values():
+        assert row["covered_samples_per_second"] == pytest.approx(row["covered"] * row["samples_per_second"])
+    covered = [row["covered"] for row in result["path"]["cases"].values()]
+    assert covered[0] == covered[1] < covered[2] == covered[3]
+    assert set(result["moving"]["trees"]) == {"refit", "fast"}
+    subjects = result["accuracy"]["subjects"]
+    assert list(subjects) == ["demo", "demo figure"]
+    for subject in subjects.values():
+        for found in subject["lights"].values():
+            assert {row["method"] for row in found["rows"]} == {"path traced", "deferred", "per Gaussian"}
+            assert [row["against_path"] is None for row in found["rows"]].count(True) == 1
+    furnace = result["furnace"]["rows"]
+    assert len(furnace) == 30
+    assert all(row["pixels"] > 0 for row in furnace)
+    assert result["unbiased"]["pixels"] > 0
+    text = benchmark.markdown(json.loads(states[-1]))
+    assert "| environment |" in text
+    assert "### White furnace" in text
+    written = draw_all([json.loads(states[-1])], tmp_path / "plots", pictures)
+    assert {path.name for path in written} == {"relight_speed_accuracy.png", "relight_comparison.png"}
+    assert all(1000 < path.stat().st_size <= LARGEST_FILE for path in written)
+
+
+def test_a_part_that_fails_says_so_and_the_others_are_kept(bench, monkeypatch):
+    def fail(bench):
+        yield {"cases": {}, "gaussians": 1, "size": [1, 1]}
+        raise ZeroDivisionError
+
+    monkeypatch.setitem(benchmark.PARTS, "deferred", fail)
+    monkeypatch.setitem(benchmark.PARTS, "furnace", lambda bench: iter([{"rows": []}]))
+    result = benchmark.measure(bench("cpu"), only=("deferred", "furnace"))
+    assert result["failed"] == ["deferred"]
+    assert result["deferred"]["cases"] == {}
+    assert "ZeroDivisionError" in benchmark.markdown(result)
+    assert result["furnace"]["rows"] == []
+
+
+def test_tables_of_cuda_results_have_milliseconds(bench):
+    """The CPU's are relative; those of a GPU are what they say."""
+    times = {"ms": 1.5, "fps": 666.7, "latency_ms": 1.75, "all_ms": [1.5]}
+    row = dict.fromkeys(("whole", "still_maps", "moving", "g_buffer"), times)
+    row["shares_ms"] = {"shadow maps and what arrives": 0.0, "G-buffer": 1.0, "shading": 0.5}
+    part = {"cases": {"environment": row}, "gaussians": 140_000, "size": [1920, 1080]}
+    part |= {"targets": {"environment_fps": 600.0}, "reached": {"environment_fps": True}}
+    moving = {"trees": {"refit": times}, "gaussians": 140_000, "size": [1920, 1080], "path_start_ms": times}
+    moving["cases"] = {"environment": dict.fromkeys(("arrays", "deferred", "refit", "fast"), times)}
+    result = {"machine": {"device": "NVIDIA H200"}, "deferred": part, "moving": moving, "failed": []}
+    text = benchmark.markdown(result)
+    assert "| environment | 1.500 | 667 | 1.750 |" in text
+    assert "environment_fps 600: reached" in text
+    assert "1.500 (667 FPS)" in text
+
+
+def test_assets_are_found_by_the_name_of_their_capture(tmp_path):
+    (tmp_path / "walker").mkdir()
+    (tmp_path / "walker" / "asset.usda").write_text("#usda 1.0")
+    assert benchmark.find_assets(tmp_path, ["walker", "runner"]) == {"walker": tmp_path / "walker" / "asset.usda"}
+    assert benchmark.find_assets(None, ["walker"]) == {}

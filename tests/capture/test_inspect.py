@@ -1,0 +1,357 @@
+"""Inspection: every fault that is put into a sound capture is found, by its code, and nothing in a sound one."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.sound_capture import CAMERAS, FLIP, FRAMES, HEIGHT, TARGET, WIDTH, rewrite, rig, save, write_sound
+
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.inspect import inspect_capture, require_reconstructable
+from beam_warp.capture.rigs import MIN_SPREAD, facing_share, frustum_volume, likely_mistakes, meeting_point, seen_by
+from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+from beam_warp.world.camera import Camera
+
+
+def codes(folder):
+    return {finding.code for finding in inspect_capture(Capture.read(folder)).findings}
+
+
+def found(folder, code):
+    return next(f for f in inspect_capture(Capture.read(folder)).findings if f.code == code)
+
+
+def test_a_sound_capture_has_no_findings(tmp_path):
+    write_sound(tmp_path)
+    report = inspect_capture(Capture.read(tmp_path))
+    assert report.findings == ()
+    assert report.is_reconstructable
+    assert len(report.glimpses) == CAMERAS * FRAMES
+    assert json.loads(json.dumps(report.as_dict(), allow_nan=False))["cameras"] == CAMERAS
+    low, high = report.volume
+    assert (low < TARGET).all()
+    assert (high > TARGET).all()
+    ready = require_reconstructable(Capture.read(tmp_path))
+    assert ready.fallbacks == ()
+    assert len(ready.capture.records) == CAMERAS * FRAMES
+
+
+@pytest.mark.parametrize("name", ["walker", "runner"])
+def test_the_captures_have_no_findings(data_dir, name):
+    report = inspect_capture(Capture.read(data_dir / "captures" / name), max_images=48)
+    assert report.findings == ()
+    low, high = report.volume
+    mesh = np.load(data_dir / "captures" / name / "truth" / "mesh_0000.npz")["vertices"]
+    assert (low < mesh.min(axis=0)).all()
+    assert (high > mesh.max(axis=0)).all()
+
+
+def test_the_buddha_has_no_masks(data_dir):
+    report = inspect_capture(Capture.read(data_dir / "photos" / "buddha"))
+    assert {finding.code for finding in report.findings} == {"no-coverage", "assumed"}
+    assert report.is_reconstructable
+
+
+def drop_alpha(pixels):
+    return pixels[..., :3]
+
+
+def blacken(pixels):
+    pixels[..., :3] = 0
+
+
+def empty(pixels):
+    pixels[..., 3] = 0
+
+
+def fill(pixels):
+    pixels[..., 3] = 255
+
+
+def dim(pixels):
+    pixels[..., 3] //= 255
+
+
+def invert(pixels):
+    pixels[..., 3] = 255 - pixels[..., 3]
+
+
+def darken(pixels):
+    pixels[..., :3] //= 2  # of sRGB: 2.3 stops
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern", "code", "severity"),
+    [
+        (drop_alpha, "*/*", "no-coverage", "warning"),
+        (drop_alpha, "c03/*", "some-coverage", "warning"),
+        (blacken, "c03/*", "black-image", "warning"),
+        (blacken, "*/*", "black-image", "error"),
+        (empty, "c03/0001.png", "empty-mask", "warning"),
+        (empty, "*/*", "empty-mask", "error"),
+        (fill, "c03/*", "full-mask", "warning"),
+        (dim, "c03/*", "mask-range", "error"),
+        (invert, "c03/*", "inverted-mask", "warning"),
+        (darken, "c03/*", "camera-exposure", "warning"),
+        (darken, "c03/0001.png", "frame-exposure", "warning"),
+        (darken, "*/0002.png", "frame-exposure", "warning"),
+        (lambda pixels: pixels[:20], "c03/*", "image-size", "error"),
+    ],
+)
+def test_faults_of_images(tmp_path, change, pattern, code, severity):
+    write_sound(tmp_path)
+    changed = sorted((tmp_path / "images").glob(pattern))
+    for path in changed:
+        rewrite(path, change)
+    bare = {"frame-without-images"} if len(changed) == CAMERAS * FRAMES and severity == "error" else set()
+    assert codes(tmp_path) == {code} | bare
+    finding = found(tmp_path, code)
+    assert finding.severity == severity
+    if pattern.startswith("c03"):
+        assert "c03" in finding.where
+    if severity == "error":
+        with pytest.raises(AssetFormatError, match="capture must be fit for reconstruction, got"):
+            require_reconstructable(Capture.read(tmp_path))
+    else:
+        assert require_reconstructable(Capture.read(tmp_path)).fallbacks[0].code == code
+
+
+def test_a_black_camera_is_left_out_in_all_its_frames(tmp_path):
+    write_sound(tmp_path)
+    for path in (tmp_path / "images/c03").iterdir():
+        rewrite(path, blacken)
+    ready = require_reconstructable(Capture.read(tmp_path), max_images=CAMERAS)  # one frame is looked at
+    assert {record.camera_name for record in ready.capture.records} == {f"c{k:02d}" for k in range(CAMERAS) if k != 3}
+
+
+def test_missing_and_damaged_images_are_left_out(tmp_path):
+    write_sound(tmp_path)
+    (tmp_path / "images/c01/0001.png").unlink()
+    content = (tmp_path / "images/c02/0000.png").read_bytes()
+    (tmp_path / "images/c02/0000.png").write_bytes(content[: len(content) // 2])
+    (tmp_path / "images/c04/0002.png").write_bytes(b"not an image")
+    report = inspect_capture(Capture.read(tmp_path))
+    assert {(f.code, f.severity) for f in report.findings} == {
+        ("missing-image", "warning"),
+        ("damaged-image", "warning"),
+    }
+    assert report.left_out == {"c01_0001", "c02_0000", "c04_0002"}
+    assert len(require_reconstructable(Capture.read(tmp_path)).capture.records) == CAMERAS * FRAMES - 3
+
+
+def test_too_many_missing_images_are_an_error(tmp_path):
+    write_sound(tmp_path)
+    for path in sorted((tmp_path / "images").glob("*/0001.png"))[1:]:
+        path.unlink()
+    assert codes(tmp_path) == {"missing-image", "frame-without-images"}
+    with pytest.raises(
+        MissingFileError, match=r"1 frame of 3 is left with under 2 images at frames 1\. Copy their images"
+    ):
+        require_reconstructable(Capture.read(tmp_path))
+    for path in (tmp_path / "images").glob("*/*"):
+        path.unlink()
+    with pytest.raises(MissingFileError, match=r"36 images of 36 are missing .* There are 1 more errors"):
+        require_reconstructable(Capture.read(tmp_path))
+
+
+def change_poses(content, change, only=None):
+    for record in content["frames"]:
+        if only is None or record["camera"] == only:
+            record["transform_matrix"] = change(np.array(record["transform_matrix"])).tolist()
+
+
+def mask_missing(content):
+    content["frames"][4]["mask_path"] = "masks/none.png"
+
+
+def test_a_missing_mask_is_left_out(tmp_path):
+    content = write_sound(tmp_path)
+    mask_missing(content)
+    save(tmp_path, content)
+    report = inspect_capture(Capture.read(tmp_path))
+    assert [finding.code for finding in report.findings] == ["missing-mask"]
+    assert report.left_out == {"c01_0001"}
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (lambda pose: pose @ FLIP, "OpenCV poses were given as OpenGL's"),
+        (lambda pose: np.linalg.inv(pose), "world-to-camera poses in OpenGL axes were given"),
+        (lambda pose: np.linalg.inv(pose @ FLIP), "world-to-camera poses in OpenCV axes were given"),
+    ],
+)
+def test_swapped_axes_are_told_apart(tmp_path, change, remedy):
+    content = write_sound(tmp_path)
+    change_poses(content, change)
+    save(tmp_path, content)
+    finding = found(tmp_path, "swapped-axes")
+    assert finding.severity == "error"
+    assert remedy in finding.remedy
+    with pytest.raises(
+        AssetFormatError, match="capture must be fit for reconstruction, got the cameras do not look at"
+    ):
+        require_reconstructable(Capture.read(tmp_path))
+
+
+def test_cameras_around_that_look_outwards_have_no_overlap(tmp_path):
+    outward = []
+    for k in range(CAMERAS):
+        angle = 2 * np.pi * k / CAMERAS
+        way = np.array([np.cos(angle), np.sin(angle), 0.0])
+        options = {"width": WIDTH, "height": HEIGHT, "vertical_fov": 20.0}
+        outward.append(Camera.look_at((0.0, 0.0, 0.2 * (k % 3)), 2 * way + (0, 0, 0.2 * (k % 3)), **options))
+    write_sound(tmp_path, outward, frames=1)
+    assert "no-overlap" in codes(tmp_path)
+
+
+def test_one_stray_camera_is_left_out(tmp_path):
+    content = write_sound(tmp_path)
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # about its own up: it looks away
+    change_poses(content, lambda pose: pose @ turn, only="c05")
+    save(tmp_path, content)
+    assert codes(tmp_path) == {"sees-nothing"}
+    assert {r.camera_name for r in require_reconstructable(Capture.read(tmp_path)).capture.records} == {
+        f"c{k:02d}" for k in range(CAMERAS) if k != 5
+    }
+
+
+def test_up_along_y(tmp_path):
+    content = write_sound(tmp_path)
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z becomes y
+    change_poses(content, lambda pose: turn @ pose)
+    save(tmp_path, content)
+    assert codes(tmp_path) == {"up-direction"}
+    assert "up is about +y" in found(tmp_path, "up-direction").what
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"fl_x": 1e6, "fl_y": 1e6}, "singular-intrinsics"),
+        ({"cx": 4000.0}, "principal-point"),
+        ({"fl_y": 90.0}, "uneven-pixels"),
+    ],
+)
+def test_faults_of_intrinsics(tmp_path, fields, code):
+    content = write_sound(tmp_path)
+    for record in content["frames"]:
+        if record["camera"] == "c05":
+            record.update(fields)
+    save(tmp_path, content)
+    assert code in codes(tmp_path)
+    assert found(tmp_path, code).where == "c05"
+
+
+def test_the_same_pose_twice(tmp_path):
+    cameras = rig()
+    cameras[7] = cameras[2]
+    write_sound(tmp_path, cameras)
+    assert codes(tmp_path) == {"duplicate-pose"}
+    assert found(tmp_path, "duplicate-pose").where == "c02 = c07"
+
+
+def test_frames_that_lack_cameras(tmp_path):
+    content = write_sound(tmp_path)
+    content["frames"] = [r for r in content["frames"] if (r["camera"], r["frame"]) != ("c04", 1)]
+    save(tmp_path, content)
+    assert codes(tmp_path) == {"frame-lacks-cameras"}
+    assert "frame 1 without c04" in found(tmp_path, "frame-lacks-cameras").what
+
+
+def test_gaps_in_the_frames(tmp_path):
+    content = write_sound(tmp_path, rig(8), frames=5)
+    for numbers, missing in (((0, 2, 4), None), ((0, 1, 4), "2 frames"), ((0, 2, 3), "1 frame "), ((1, 3), None)):
+        save(tmp_path, {**content, "frames": [r for r in content["frames"] if r["frame"] in numbers]})
+        if missing is None:
+            assert codes(tmp_path) == set()
+        else:
+            assert codes(tmp_path) == {"missing-frames"}
+            assert found(tmp_path, "missing-frames").what.startswith(missing)
+
+
+@pytest.mark.parametrize(("count", "code"), [(1, "too-few-cameras"), (4, "few-cameras")])
+def test_few_cameras(tmp_path, count, code):
+    write_sound(tmp_path, rig(12)[:count])
+    assert codes(tmp_path) == {code}
+
+
+def test_no_training_records(tmp_path):
+    content = write_sound(tmp_path)
+    for record in content["frames"]:
+        record["split"] = "test"
+    save(tmp_path, content)
+    assert codes(tmp_path) == {"too-few-cameras"}
+
+
+def test_few_images_are_read_of_a_long_capture(tmp_path):
+    write_sound(tmp_path, rig(8), frames=9)
+    report = inspect_capture(Capture.read(tmp_path), max_images=24)
+    assert sorted({glimpse.record.frame for glimpse in report.glimpses}) == [0, 4, 8]
+    assert len(inspect_capture(Capture.read(tmp_path), max_images=5).glimpses) == 5
+    with pytest.raises(InvalidOptionError, match="max_images must be an integer"):
+        inspect_capture(Capture.read(tmp_path), max_images=0)
+
+
+def test_axes_meet_at_the_target_despite_strays():
+    cameras = rig()
+    poses = np.array([camera.camera_to_world for camera in cameras])
+    np.testing.assert_allclose(meeting_point(poses), TARGET, atol=1e-9)
+    assert facing_share(cameras) == 1.0
+    assert likely_mistakes(cameras) == ()
+    poses[3, :3, 3] += (5.0, 1.0, -2.0)
+    np.testing.assert_allclose(meeting_point(poses), TARGET, atol=1e-2)  # its weight is 1e-3 of the others'
+    parallel = np.tile(np.eye(4), (4, 1, 1))
+    parallel[:, 0, 3] = range(4)
+    assert meeting_point(parallel) is None
+    tilt = 2.0 * np.arcsin(np.sqrt(MIN_SPREAD))  # two axes this far apart: the eigenvalue is sin^2 of half of it
+    for factor, meets in ((0.9, False), (1.1, True)):
+        two = np.tile(np.eye(4), (2, 1, 1))
+        half = 0.5 * factor * tilt
+        for pose, angle in zip(two, (-half, half), strict=True):
+            pose[:3, 2] = (np.sin(angle), 0.0, np.cos(angle))
+        assert (meeting_point(two) is not None) == meets
+
+
+@pytest.mark.parametrize("name", ["walker", "runner"])
+def test_mistakes_in_the_poses_of_the_captures_are_told_apart(data_dir, name):
+    records = Capture.read(data_dir / "captures" / name).select(split="train", frames=[0])
+    cameras = [record.camera for record in records]
+    wrongs = {
+        "OpenCV poses were given as OpenGL's": lambda q: q @ FLIP,
+        "world-to-camera poses in OpenGL axes": lambda q: np.linalg.inv(q @ FLIP) @ FLIP,
+        "world-to-camera poses in OpenCV axes": lambda q: np.linalg.inv(q) @ FLIP,
+        "world-to-camera poses were given": np.linalg.inv,
+    }
+    assert likely_mistakes(cameras) == ()
+    for told, wrong in wrongs.items():
+        changed = [replace(camera, camera_to_world=wrong(camera.camera_to_world)) for camera in cameras]
+        assert [mistake[: len(told)] for mistake in likely_mistakes(changed)] == [told]
+
+
+def test_the_common_volume_is_what_is_seen():
+    cameras = rig()
+    low, high = frustum_volume(cameras)
+    points = np.random.default_rng(0).uniform(TARGET - 3, TARGET + 3, size=(4000, 3))
+    counts = np.sum([seen_by(camera, points) for camera in cameras], axis=0)
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    assert inside[counts >= 0.75 * CAMERAS].mean() > 0.99
+    stray = [*cameras, Camera.look_at((50, 0, 0), (60, 0, 0), width=40, height=30, vertical_fov=20.0)]
+    again = frustum_volume(stray)
+    np.testing.assert_allclose(again, (low, high), atol=0.1 * float((high - low).max()))
+    with pytest.raises(InvalidOptionError, match="cameras must be at least 2"):
+        frustum_volume(cameras[:1])
+    with pytest.raises(InvalidOptionError, match="cameras must have a volume in common"):
+        frustum_volume([cameras[0], stray[-1]])
+
+
+def test_parallel_cameras_have_a_volume_in_front():
+    cameras = [
+        Camera.look_at((0.1 * k, 0.0, 1.0), (0.1 * k, 5.0, 1.0), width=40, height=30, vertical_fov=40.0)
+        for k in range(4)
+    ]
+    low, high = frustum_volume(cameras)
+    assert high[1] > 0.5
+    assert low[1] > 0.0
+    assert low[2] < 1.0 < high[2]

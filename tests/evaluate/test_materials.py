@@ -1,0 +1,324 @@
+"""Scores of an asset: against itself and known errors in closed form, and the shared tool's numbers on its images."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.figure_asset import OPENNESS, changed, figure_asset
+
+from beam_warp.capture.capture import Capture
+from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
+from beam_warp.evaluate.materials import score_materials, stated_raster
+from beam_warp.evaluate.perceptual import PerceptualMetrics
+from beam_warp.evaluate.relighters import DeferredRelighter, RelitImage
+from beam_warp.image.files import read_image
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.gaussians import GaussianSequence
+
+NO_METRICS = PerceptualMetrics()
+CAP = 120.0
+"""What equal images score [dB]."""
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return figure_asset()
+
+
+@pytest.fixture(scope="module")
+def relighters():
+    """The deferred one, which makes a light ready once."""
+    return {"deferred": DeferredRelighter()}
+
+
+@pytest.fixture(scope="module")
+def evaluated(asset, relit_capture, tmp_path_factory):
+    """The asset's scores against the traced truth, and the folder of its images."""
+    renders = tmp_path_factory.mktemp("evaluated") / "renders"
+    found = evaluate_asset(asset, relit_capture, EvaluateOptions(device="cpu"), renders=renders)
+    return found, renders
+
+
+@pytest.fixture(scope="module")
+def mirror(evaluated, relit_capture, tmp_path_factory):
+    """A capture whose truth is what the asset itself shows."""
+    renders = evaluated[1]
+    folder = tmp_path_factory.mktemp("mirror") / "capture"
+    shutil.copytree(relit_capture.folder, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    for record in content["frames"]:
+        if "truth" in record:
+            name = f"{record['camera']}_{record['frame']:04d}.exr"
+            shutil.copy(renders / name, folder / record["truth"])
+            shutil.copy(renders / name, folder / record["file_path"])
+            for light, path in record["relit"].items():
+                shutil.copy(renders / f"deferred_{light}" / name, folder / path)
+    return Capture.read(folder)
+
+
+def score(sequence, capture, device, **options):
+    return score_materials(sequence, capture, device=device, **{"metrics": NO_METRICS, "relighters": {}, **options})
+
+
+class TestAgainstItself:
+    def test_equal_images_score_the_cap(self, asset, mirror, relighters):
+        found = score(asset, mirror, "cpu", relighters=relighters)
+        everything = {**found.mean_channels(), **found.mean_relit()["deferred"]}
+        assert set(everything) == {
+            "ambient_occlusion", "base_color", "base_color_scaled", "roughness", "novel_view", "sunset", "stage",
+        }  # fmt: skip
+        for name, channel in everything.items():
+            # Files hold what was scored; the scale is 1 but for the rounding of its sums, and so below the cap's 1e-6.
+            assert (channel.psnr, channel.solid_psnr) == (CAP, CAP), name
+            assert channel.ssim == pytest.approx(1.0, abs=1e-9), name
+        assert found.base_color_scale == pytest.approx((1.0, 1.0, 1.0), abs=1e-12)
+        assert found.mean("normals_mean_degrees") < 0.05  # arccos of 1 - 1e-7 is 0.03 degrees
+        assert found.mean("depth_median_mm") == 0.0
+        assert found.mean("overlap") == pytest.approx(1.0)
+        assert found.scale_deviation == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+
+    def test_a_factor_is_found_and_undone(self, asset, mirror, device):
+        """Base colour times k needs 1/k: exactly, but for float32 of colours (6e-8) in the sums."""
+        factors = np.array([0.5, 0.8, 0.9], np.float32)
+        dim = changed(asset, lambda _, cloud: cloud.with_arrays(base_color=cloud.base_color * factors))
+        found = score(dim, mirror, device)
+        assert found.base_color_scale == pytest.approx(tuple(1.0 / factors), rel=1e-6)
+        for view in found.views:
+            assert view.base_color_scale == pytest.approx(tuple(1.0 / factors), rel=1e-6)
+            # The sRGB curve is at most 12.92 steep: 1e-6 of colour is at most 1.3e-5, or 97 dB.
+            assert view.channels["base_color_scaled"].psnr > 97.0
+            assert view.channels["base_color"].psnr < 30.0
+
+    def test_a_flickering_factor_is_flicker_of_the_scale(self, asset, mirror):
+        factors = (1.0, 0.8)
+        uneven = changed(asset, lambda frame, cloud: cloud.with_arrays(base_color=cloud.base_color * factors[frame]))
+        found = score(uneven, mirror, "cpu")
+        assert found.scale_deviation == pytest.approx(3 * (0.5 * (1.0 / 0.8 - 1.0),), rel=1e-5)
+        assert found.frame_scales[1] == pytest.approx(3 * (1.25,), rel=1e-6)
+
+    def test_a_known_error_of_ambient_occlusion(self, asset, mirror, device):
+        """0.1 everywhere, composited on black: 0.1 of the coverage, 20 dB where that is 1."""
+        darker = changed(
+            asset,
+            lambda _, cloud: cloud.with_arrays(ambient_occlusion=np.full(len(cloud), OPENNESS - 0.1, np.float32)),
+        )
+        found = score(darker, mirror, device)
+        for view in found.views:
+            (record,) = (record for record in mirror.records if record.name == view.name)
+            alpha = record.truth().channels["A"].astype(np.float64)
+            rows, columns = np.nonzero(alpha > 0.5)
+            box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+            found_here = view.channels["ambient_occlusion"]
+            # A mean of equal values in float32 is off by less than 1e-6: 1e-5 of the error, or 1e-4 dB.
+            for value, part in ((found_here.psnr, box), (found_here.solid_psnr, alpha > 0.999)):
+                assert value == pytest.approx(-10.0 * np.log10(np.mean((0.1 * alpha[part]) ** 2)), abs=1e-3)
+            assert found_here.solid_psnr == pytest.approx(20.0, abs=0.01)  # alpha above .999: 0.009 dB
+
+    def test_turned_normals_are_turned_by_as_much(self, asset, mirror, device):
+        """By 10 degrees about z: as much as that where a normal is level, not at all where it points up."""
+        angle = np.radians(10.0)
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+        turned = changed(asset, lambda _, cloud: cloud.with_arrays(normals=cloud.normals @ turn.T))
+        found = score(turned, mirror, device)
+        for view in found.views:
+            (record,) = (record for record in mirror.records if record.name == view.name)
+            truth = record.truth()
+            normals = truth.stack("normal.X", "normal.Y", "normal.Z")[truth.channels["A"] > 0.999].astype(np.float64)
+            cosine = np.einsum("ni,ij,nj->n", normals, turn, normals)  # turning commutes with blending
+            angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            assert view.normals_median_degrees == pytest.approx(np.median(angles), abs=0.05)
+            assert view.normals_mean_degrees == pytest.approx(angles.mean(), abs=0.05)
+
+    def test_scaled_relighting_is_that_of_scaled_colour(self, asset, mirror, relighters):
+        dim = changed(asset, lambda _, cloud: cloud.with_arrays(base_color=0.5 * cloud.base_color))
+        found = score(dim, mirror, "cpu", relighters=relighters, scaled_relighting=True)
+        assert found.mean_relit()["deferred"]["sunset"].psnr < 30.0
+        assert found.mean_relit(scaled=True)["deferred"]["sunset"].psnr > 97.0
+        assert found.as_dict()["mean"]["relit_scaled"]["deferred"]["stage"]["psnr"] > 97.0
+
+
+def srgb(x):
+    x = np.clip(x, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def protocol(capture, renders):
+    """The shared protocol's PSNR written again: (box, solid) by channel, means over views."""
+    found = {}
+
+    def add(name, a, b, alpha):
+        rows, columns = np.nonzero(alpha > 0.5)
+        box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+        errors = [np.mean((a[part] - b[part]) ** 2) for part in (box, alpha > 0.999)]
+        found.setdefault(name, []).append([-10 * np.log10(max(error, 1e-12)) for error in errors])
+
+    for record in capture.select(split="test"):
+        truth, ours = record.truth(), read_image(renders / f"{record.name}.exr")
+        known, alpha = truth.channels["A"].astype(np.float64), ours.channels["A"].astype(np.float64)
+        for name in ("ambient_occlusion", "roughness"):
+            add(name, ours.channels[name] * alpha, truth.channels[name] * known, known)
+        names = ("base_color.R", "base_color.G", "base_color.B")
+        a, b = (srgb(image.stack(*names).astype(np.float64)) for image in (ours, truth))
+        add("base_color", a * alpha[..., None], b * known[..., None], known)
+        image = srgb(record.image().rgb().astype(np.float64))
+        add("novel_view", srgb(ours.rgb().astype(np.float64)), image, known)
+        for light in record.relit_paths:
+            lit = read_image(renders / f"deferred_{light}" / f"{record.name}.exr")
+            a, b = (srgb(shown.rgb().astype(np.float64)) for shown in (lit, record.relit(light)))
+            add(light, a, b, known)
+    return {name: np.mean(values, axis=0) for name, values in found.items()}
+
+
+class TestAgainstTruth:
+    def test_numbers_are_those_of_the_protocol(self, evaluated, relit_capture):
+        found, renders = evaluated
+        scores = {**found.scores.mean_channels(), **found.scores.mean_relit()["deferred"]}
+        for name, (box, solid) in protocol(relit_capture, renders).items():
+            assert scores[name].psnr == pytest.approx(box, abs=1e-6), name
+            assert scores[name].solid_psnr == pytest.approx(solid, abs=1e-6), name
+
+    def test_the_shared_tool_agrees(self, evaluated, relit_capture, data_dir):
+        """It is independent of this package: PSNR to its last digit, SSIM, scale and normals to theirs."""
+        tool = data_dir.parent / "tools" / "score_capture.py"
+        if not tool.is_file():
+            pytest.skip(f"the shared scoring tool {tool} is absent")
+        found, renders = evaluated
+        words = [f"{light}={renders / f'deferred_{light}'}" for light in ("sunset", "stage")]
+        said = subprocess.run(
+            [sys.executable, tool, relit_capture.folder, renders, "--relit", *words],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        assert "MISSING" not in said
+        assert "NON-FINITE" not in said
+        lines = re.findall(r"(.+?) +box PSNR +([\d.]+)  SSIM ([\d.]+)  solid PSNR +([\d.]+)  over 4 views", said)
+        theirs = {name: tuple(map(float, values)) for name, *values in lines}
+        scores = found.scores
+        ours = {**scores.mean_channels(), **{f"relit {k}": v for k, v in scores.mean_relit()["deferred"].items()}}
+        for name, title in (
+            ("ambient_occlusion", "AO"), ("base_color", "base color"), ("roughness", "roughness"),
+            ("novel_view", "novel view"), ("relit sunset", "relit sunset"), ("relit stage", "relit stage"),
+        ):  # fmt: skip
+            box, similarity, solid = theirs[title]
+            assert ours[name].psnr == pytest.approx(box, abs=0.01), name
+            assert ours[name].ssim == pytest.approx(similarity, abs=0.001), name
+            assert ours[name].solid_psnr == pytest.approx(solid, abs=0.01), name
+        assert scores.mean("normals_median_degrees") == pytest.approx(theirs["normal deg"][0], abs=0.01)
+        assert scores.mean("depth_median_mm") == pytest.approx(theirs["depth mm"][0], abs=0.01)
+        printed = re.search(r"base color scale \[(.+)\]", said).group(1)
+        assert scores.mean_view_scale == pytest.approx([float(word) for word in printed.split()], abs=0.001)
+
+
+class TestRefusals:
+    def test_frames_and_places_that_do_not_match(self, asset, relit_capture):
+        with pytest.raises(
+            InvalidOptionError, match=r"asset must show a frame whose truth is known \(0, 1\), got one of"
+        ):
+            score(asset, relit_capture, "cpu", frames=(7, 8))
+        away = changed(asset, lambda _, cloud: cloud.with_arrays(positions=cloud.positions + np.float32(0.6)))
+        with pytest.raises(InvalidOptionError, match="asset must stand where the capture shows its subject, got "):
+            score(away, relit_capture, "cpu")
+        lying = changed(asset, lambda _, cloud: cloud.with_arrays(axes="rub"))
+        with pytest.raises(InvalidOptionError, match="Check the axes"):
+            score(lying, relit_capture, "cpu")
+
+    def test_an_asset_without_materials(self, asset, relit_capture):
+        bare = changed(asset, lambda _, cloud: cloud.with_arrays(roughness=None, normals=None))
+        with pytest.raises(InvalidOptionError, match=r"without roughness, normals in frame 0\. Estimate its materials"):
+            score(bare, relit_capture, "cpu")
+
+    def test_a_capture_without_truth(self, asset, relit_capture):
+        with pytest.raises(InvalidOptionError, match="truth must be a capture whose train views have exact channels"):
+            score(asset, relit_capture, "cpu", split="train")
+
+    def test_a_light_that_is_not_there(self, asset, mirror, relighters, tmp_path):
+        folder = tmp_path / "capture"
+        shutil.copytree(mirror.folder, folder)
+        (folder / "truth" / "stage.exr").unlink()
+        with pytest.raises(MissingFileError, match=r"light must be a file, got none at .*stage\.exr"):
+            score(asset, Capture.read(folder), "cpu", relighters=relighters)
+
+
+class TestWhatIsThere:
+    def test_frames_that_the_asset_lacks_are_said(self, asset, mirror):
+        """Its second frame alone, stated as such, scores as it does among both."""
+        second = GaussianSequence.from_clouds([asset[1]], metadata={"capture_frames": "1"})
+        found = score(second, mirror, "cpu")
+        assert [view.frame for view in found.views] == [1, 1]
+        assert found.mean_channels()["base_color"].psnr == CAP
+        assert found.notes == ("the asset does not show frames whose truth is known: 0",)
+        assert found.scale_deviation is None
+        assert found.temporal.absent == {
+            "gaussians": "the asset has one frame",
+            "surface": "fewer than two frames of the asset have a true surface",
+        }
+
+    def test_what_is_absent_is_said(self, asset, mirror):
+        dull = changed(asset, lambda _, cloud: cloud.with_arrays(radiance=None, radiance_color_space=None))
+        found = score(dull, mirror, "cpu")
+        assert "novel_view" not in found.mean_channels()
+        assert found.absent == {
+            "novel_view": "the asset has no captured radiance", "relit": "no relighter was chosen",
+        }  # fmt: skip
+
+    def test_relighters_are_told_how_to_draw(self, asset, mirror):
+        """As the asset states, with the samples asked for, a frame's cameras at a time, under each light."""
+        told = []
+
+        def relighter(cloud, environment, cameras, *, raster, samples, device):
+            told.append((len(cloud), [camera.width for camera in cameras], raster, samples, device))
+            black = np.zeros((cameras[0].height, cameras[0].width), np.float32)
+            return [RelitImage(np.repeat(black[..., None], 3, axis=-1), black) for _ in cameras]
+
+        stated = GaussianSequence.from_clouds(
+            list(asset), metadata={"raster_antialiased": "true", "raster_low_pass": "0.1"}
+        )
+        found = score(stated, mirror, "cpu", samples=3, relighters={"black": relighter})
+        expected = (len(asset[0]), [48, 48], RasterOptions(antialiased=True, low_pass=0.1), 3, "cpu")
+        assert told == [expected] * 4
+        assert set(found.mean_relit()["black"]) == {"sunset", "stage"}
+        assert found.conditions["samples_per_pixel"] == 9
+
+    def test_the_record_is_json(self, evaluated):
+        text = json.dumps(evaluated[0].report, allow_nan=False)
+        found = json.loads(text)
+        assert found["conditions"]["samples_per_pixel"] == 4
+        assert len(found["views"]) == 4
+        assert set(found["mean"]["relit"]["deferred"]) == {"sunset", "stage"}
+
+    def test_perceptual_differences_are_of_what_is_compared(self, asset, mirror):
+        seen = []
+
+        def measure(image, truth):
+            seen.append((image, truth))
+            return float(np.abs(image - truth).mean())
+
+        metrics = PerceptualMetrics({"flip": measure})
+        found = score_materials(asset, mirror, metrics=metrics, relighters={}, device="cpu")
+        assert all(image.shape == truth.shape and image.shape[2] == 3 for image, truth in seen)
+        # Scaled colours differ by rounding: 1e-6 of colour, at most 12.92 times as much when encoded.
+        assert all(score.perceptual["flip"] < 2e-5 for score in found.mean_channels().values())
+
+
+def test_the_filter_that_an_asset_states():
+    assert stated_raster({}) == RasterOptions()
+    stated = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
+    assert stated_raster(stated) == RasterOptions(antialiased=True, low_pass=0.1)
+    for wrong in ({"raster_antialiased": "maybe"}, {"raster_low_pass": "soft"}, {"raster_low_pass": "-1"}):
+        with pytest.raises(InvalidOptionError):
+            stated_raster(wrong)
+
+
+def test_a_capture_without_relit_images_is_scored_all_the_same(asset, mirror):
+    """There is no light to take a mean over: nothing is stated, and the record is valid JSON."""
+    plain = replace(mirror, records=tuple(replace(record, relit_paths={}) for record in mirror.records))
+    record = score(asset, plain, "cpu", relighters={"deferred": DeferredRelighter()}).as_dict()
+    assert record["mean"]["relit_mean"] == {}
+    json.dumps(record, allow_nan=False)

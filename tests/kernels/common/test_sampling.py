@@ -1,0 +1,398 @@
+"""Sample sets and maps: exact stratification, agreement with an independent Sobol', densities by chi-square."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy import stats
+from scipy.stats import qmc
+
+from beam_warp.kernels.common.sampling import (
+    SampleSet,
+    cosine_hemisphere_to_square,
+    draw_square,
+    owen_sobol_x,
+    owen_sobol_y,
+    sobol_second_dimension,
+    square_to_cosine_hemisphere,
+    square_to_cosine_hemisphere_pdf,
+    stratum,
+    stream_of,
+    unit_float,
+)
+from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
+from beam_warp.kernels.light.environment_sampling import radiance_over_pdf
+from beam_warp.kernels.light.product_sampling import (
+    EnvironmentBlocks,
+    launch_accumulate_block_weights,
+    product_to_square,
+    square_to_product,
+    square_to_product_pdf,
+)
+from beam_warp.light.sampled import environment_blocks, suited_height
+from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
+from beam_warp.world.environment import EnvironmentMap
+
+SIGNIFICANCE = 1e-4
+"""Of each statistical test here; seeds are fixed, so a failure is a change of code, not bad luck."""
+
+
+@wp.kernel
+def plain_sobol_kernel(out: wp.array[wp.uint32]):
+    i = wp.tid()
+    out[i] = sobol_second_dimension(wp.uint32(i))
+
+
+@wp.kernel
+def owen_kernel(seed: wp.uint32, count: int, bits: wp.vec2i, out: wp.array2d[wp.vec2], out_stratum: wp.array2d[int]):
+    point, sample = wp.tid()
+    stream = stream_of(seed, wp.uint32(0), wp.uint32(point))
+    x = owen_sobol_x(sample, stream)
+    y = owen_sobol_y(sample, stream)
+    out[point, sample] = wp.vec2(unit_float(x), unit_float(y))
+    out_stratum[point, sample] = stratum(x, y, bits[0], bits[1])
+
+
+@wp.kernel
+def draw_square_kernel(samples: SampleSet, out: wp.array2d[wp.vec2], out_slot: wp.array2d[int]):
+    point, index = wp.tid()
+    at = draw_square(samples, index, stream_of(wp.uint32(7), wp.uint32(0), wp.uint32(point)))
+    out[point, index] = wp.vec2(at.u, at.v)
+    out_slot[point, index] = at.slot
+
+
+@wp.kernel
+def spread_kernel(terms: wp.array2d[float], paired: int, out: wp.array[float]):
+    i = wp.tid()
+    spread = Spread()
+    spread.paired = paired
+    for k in range(terms.shape[1]):
+        spread = add_term(spread, terms[i, k])
+    out[i] = variance_of_sum(spread)
+
+
+@wp.kernel
+def cosine_round_trip_kernel(squares: wp.array[wp.vec2], out: wp.array[wp.vec2], out_direction: wp.array[wp.vec3]):
+    i = wp.tid()
+    direction = square_to_cosine_hemisphere(squares[i][0], squares[i][1])
+    out_direction[i] = direction
+    out[i] = cosine_hemisphere_to_square(direction)
+
+
+@wp.kernel
+def cosine_pdf_kernel(directions: wp.array[wp.vec3], out: wp.array[float]):
+    i = wp.tid()
+    out[i] = square_to_cosine_hemisphere_pdf(directions[i])
+
+
+@wp.kernel
+def product_kernel(
+    blocks: EnvironmentBlocks,
+    cumulative: wp.array2d[float],
+    squares: wp.array[wp.vec2],
+    out_direction: wp.array[wp.vec3],
+    out_radiance: wp.array[wp.vec3],
+    out_back: wp.array[wp.vec2],
+):
+    i = wp.tid()
+    drawn = square_to_product(blocks, cumulative, 0, squares[i][0], squares[i][1])
+    out_direction[i] = drawn.direction
+    out_radiance[i] = radiance_over_pdf(drawn)
+    out_back[i] = product_to_square(blocks, cumulative, 0, drawn.direction)
+
+
+@wp.kernel
+def product_pdf_kernel(
+    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], directions: wp.array2d[wp.vec3], out: wp.array2d[float]
+):
+    row, column = wp.tid()
+    out[row, column] = square_to_product_pdf(blocks, cumulative, 0, directions[row, column])
+
+
+def owen_points(device, points, count, seed=7):
+    bits = count.bit_length() - 1
+    out = wp.empty((points, count), dtype=wp.vec2, device=device)
+    cells = wp.empty((points, count), dtype=int, device=device)
+    wp.launch(
+        owen_kernel,
+        (points, count),
+        inputs=[wp.uint32(seed), count, wp.vec2i(bits // 2, bits - bits // 2)],
+        outputs=[out, cells],
+        device=device,
+    )
+    return out.numpy(), cells.numpy()
+
+
+def draw_sets(device, sampler, points, count):
+    out = wp.empty((points, count), dtype=wp.vec2, device=device)
+    slots = wp.empty((points, count), dtype=int, device=device)
+    wp.launch(
+        draw_square_kernel, (points, count), inputs=[sample_set(sampler, count)], outputs=[out, slots], device=device
+    )
+    return out.numpy().astype(np.float64), slots.numpy()
+
+
+def variance_of_sums(device, terms, paired):
+    out = wp.empty(len(terms), dtype=float, device=device)
+    wp.launch(
+        spread_kernel,
+        len(terms),
+        inputs=[wp.array(terms, dtype=float, device=device), int(paired)],
+        outputs=[out],
+        device=device,
+    )
+    return out.numpy()
+
+
+def test_second_dimension_is_sobols(device):
+    out = wp.empty(256, dtype=wp.uint32, device=device)
+    wp.launch(plain_sobol_kernel, 256, outputs=[out], device=device)
+    expected = qmc.Sobol(2, scramble=False, bits=32).random(256)[:, 1] * 2.0**32
+    index = np.arange(256)
+    assert np.array_equal(out.numpy()[index ^ (index >> 1)], expected.astype(np.uint32))  # scipy walks in Gray code
+
+
+@pytest.mark.parametrize("count", [2, 8, 64, 128])
+def test_each_stratum_holds_one_point(device, count):
+    points, cells = owen_points(device, 50, count)
+    assert (np.sort(cells, axis=1) == np.arange(count)).all()
+    assert ((points >= 0.0) & (points < 1.0)).all()
+    # not only the squarest grid: every elementary interval of a (0,2)-sequence
+    bits = count.bit_length() - 1
+    for a in range(bits + 1):
+        cell = np.floor(points[..., 0] * 2**a) * 2 ** (bits - a) + np.floor(points[..., 1] * 2 ** (bits - a))
+        assert (np.sort(cell, axis=1) == np.arange(count)).all()
+
+
+@pytest.mark.parametrize(
+    ("count", "grid"), [(1, (1, 1)), (12, (3, 4)), (49, (7, 7)), (50, (5, 10)), (64, (8, 8)), (61, (1, 61))]
+)
+def test_stratified_sets_fill_the_squarest_grid(device, count, grid):
+    assert squarest_grid(count) == grid
+    points, slots = draw_sets(device, "stratified", 40, count)
+    # a coordinate within float32 rounding of a cell's edge may read as the neighbour's
+    shifted = np.clip(points, 2.0**-23, None)
+    cell = np.floor(shifted * grid * (1.0 - 2.0**-23)).astype(int)
+    rows = np.where(cell[..., 0] % 2 == 0, cell[..., 1], grid[1] - 1 - cell[..., 1])
+    assert ((cell[..., 0] * grid[1] + rows == slots).mean(axis=1) > 0.999).all()
+    assert (np.sort(slots, axis=1) == np.arange(count)).all()
+    # one after the other in the order of slots, cells share an edge
+    steps = np.abs(np.diff(cell, axis=1)).sum(axis=2)
+    assert (steps == 1).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("count", [16, 30])
+def test_points_of_every_sampler_are_uniform(device, sampler, count):
+    """Each point of a set over many streams: uniform in the square, or, one of each stratum together."""
+    points, _ = draw_sets(device, sampler, 2000, count)
+    assert ((points >= 0.0) & (points < 1.0)).all()
+    one_each = points[np.arange(2000), np.arange(2000) % count]
+    for axis in range(2):
+        assert stats.kstest(one_each[:, axis], "uniform").pvalue > SIGNIFICANCE
+    counts = np.histogram2d(one_each[:, 0], one_each[:, 1], bins=6, range=[[0, 1], [0, 1]])[0]
+    assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE
+
+
+def test_independent_points_are_independent(device):
+    """Within a set, and of the same number in neighbouring sets: pairs of coordinates fill the square evenly."""
+    points, _ = draw_sets(device, "iid", 2000, 32)
+    pairs = {
+        "next x": (points[:, :-1, 0], points[:, 1:, 0]),
+        "next y": (points[:, :-1, 1], points[:, 1:, 1]),
+        "x, y": (points[..., 0], points[..., 1]),
+        "next set": (points[:-1, :, 0], points[1:, :, 0]),
+        "next set across": (points[:-1, :, 0], points[1:, :, 1]),
+    }
+    for name, (a, b) in pairs.items():
+        counts = np.histogram2d(a.ravel(), b.ravel(), bins=16, range=[[0, 1], [0, 1]])[0]
+        assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE, name
+
+
+class TestSpread:
+    def test_independent_terms(self, device, rng):
+        terms = rng.normal(5.0, 2.0, (100, 33)).astype(np.float32)
+        expected = 33 * terms.astype(np.float64).var(axis=1, ddof=1)
+        # Welford's recurrence: a few roundings of the squares a term
+        np.testing.assert_allclose(variance_of_sums(device, terms, False), expected, rtol=33 * 4 * 2.0**-24)
+
+    @pytest.mark.parametrize("count", [2, 3, 8, 9])
+    def test_collapsed_strata(self, device, rng, count):
+        """Groups of two, the last of three if the count is odd: m / (m - 1) times the squared deviations of each."""
+        terms = rng.normal(5.0, 2.0, (100, count)).astype(np.float32)
+        expected = np.zeros(100)
+        edges = [*range(0, count - 1 - count % 2, 2), count]
+        for begin, end in itertools.pairwise(edges):
+            group = terms[:, begin:end].astype(np.float64)
+            expected += (end - begin) * group.var(axis=1, ddof=1)
+        # squares of differences of numbers near 5: rounding 5 * 2^-24 against differences, and cancellation of three
+        np.testing.assert_allclose(variance_of_sums(device, terms, True), expected, rtol=1e-5, atol=1e-4)
+
+    def test_one_term_has_none(self, device):
+        assert variance_of_sums(device, np.ones((1, 1), np.float32), True)[0] == 0.0
+
+
+def test_points_are_uniform_over_streams(device):
+    points, _ = owen_points(device, 4000, 1)
+    for axis in range(2):
+        assert stats.kstest(points[:, 0, axis], "uniform").pvalue > SIGNIFICANCE
+    counts = np.histogram2d(points[:, 0, 0], points[:, 0, 1], bins=8, range=[[0, 1], [0, 1]])[0]
+    assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE
+
+
+def test_scrambled_estimates_are_unbiased_and_beat_independent_samples(device):
+    points, _ = owen_points(device, 2000, 64)
+    values = np.exp(points[..., 0] * points[..., 1])  # integral over the square: sum 1 / (n! (n + 1)^2)
+    truth = sum(1.0 / (float(np.prod(np.arange(1, n + 1))) * (n + 1) ** 2) for n in range(20))
+    means = values.mean(axis=1)
+    z = (means.mean() - truth) / (means.std(ddof=1) / np.sqrt(len(means)))
+    assert abs(z) < stats.norm.isf(SIGNIFICANCE / 2)
+    assert means.std() < 0.15 * values.std() / np.sqrt(64)
+
+
+def test_cosine_map_inverts_and_has_its_density(device, rng):
+    squares = rng.random((20_000, 2)).astype(np.float32)
+    back = wp.empty(len(squares), dtype=wp.vec2, device=device)
+    directions = wp.empty(len(squares), dtype=wp.vec3, device=device)
+    wp.launch(
+        cosine_round_trip_kernel,
+        len(squares),
+        inputs=[wp.array(squares, dtype=wp.vec2, device=device)],
+        outputs=[back, directions],
+        device=device,
+    )
+    d = directions.numpy()
+    # the square's corners map to the rim, where the inverse divides float32 noise by the radius: 1e-5
+    assert np.abs(back.numpy() - squares).max() < 1e-5
+    assert np.abs(np.linalg.norm(d, axis=1) - 1.0).max() < 1e-6
+    # cos^2 and azimuth are uniform and independent under the cosine density
+    phi = np.arctan2(d[:, 1], d[:, 0]) / (2.0 * np.pi) + 0.5
+    counts = np.histogram2d(d[:, 2] ** 2, phi, bins=10, range=[[0, 1], [0, 1]])[0]
+    assert stats.chisquare(counts.ravel()).pvalue > SIGNIFICANCE
+
+
+def test_cosine_density_integrates_to_one(device):
+    """By midpoints of a fine lat-long grid, which the equator does not cut: exact to their second order."""
+    sphere = EnvironmentMap.constant((1.0, 1.0, 1.0), height=256)
+    directions = sphere.directions().reshape(-1, 3).astype(np.float32)
+    out = wp.empty(len(directions), dtype=float, device=device)
+    wp.launch(
+        cosine_pdf_kernel,
+        len(directions),
+        inputs=[wp.array(directions, dtype=wp.vec3, device=device)],
+        outputs=[out],
+        device=device,
+    )
+    density = out.numpy().astype(np.float64)
+    assert (density * sphere.solid_angles().ravel()).sum() == pytest.approx(1.0, abs=(np.pi / 256) ** 2)
+    assert not density[directions[:, 2] < 0.0].any()
+
+
+def sunny_sky(height=64):
+    """A dim sky, a hot sun of one texel, and a black ground."""
+    radiance = np.full((height, 2 * height, 3), 0.5, np.float32)
+    radiance[height // 2 :] = 0.0
+    radiance[height // 6, height // 3] = (4000.0, 3000.0, 2000.0)
+    return EnvironmentMap(radiance)
+
+
+class TestProduct:
+    normal = np.array([0.6, 0.0, 0.8])
+
+    def prepare(self, device, environment):
+        blocks = environment_blocks(environment, wp.get_device(device))
+        normals = wp.array(self.normal[None], dtype=wp.vec3, device=device)
+        cumulative = wp.empty((1, 512), dtype=float, device=device)
+        launch_accumulate_block_weights(blocks, normals, cumulative, device)
+        return blocks, cumulative
+
+    def draw(self, device, environment, squares):
+        blocks, cumulative = self.prepare(device, environment)
+        direction = wp.empty(len(squares), dtype=wp.vec3, device=device)
+        radiance = wp.empty(len(squares), dtype=wp.vec3, device=device)
+        back = wp.empty(len(squares), dtype=wp.vec2, device=device)
+        wp.launch(
+            product_kernel,
+            len(squares),
+            inputs=[blocks, cumulative, wp.array(squares, dtype=wp.vec2, device=device)],
+            outputs=[direction, radiance, back],
+            device=device,
+        )
+        return direction.numpy(), radiance.numpy(), back.numpy()
+
+    def density(self, device, environment):
+        blocks, cumulative = self.prepare(device, environment)
+        out = wp.empty((environment.height, environment.width), dtype=float, device=device)
+        wp.launch(
+            product_pdf_kernel,
+            out.shape,
+            inputs=[blocks, cumulative, wp.array(environment.directions(), dtype=wp.vec3, device=device)],
+            outputs=[out],
+            device=device,
+        )
+        return out.numpy()
+
+    def test_density_integrates_to_one(self, device):
+        environment = sunny_sky()
+        total = (self.density(device, environment).astype(np.float64) * environment.solid_angles()).sum()
+        assert total == pytest.approx(1.0, abs=1e-5)
+
+    def test_density_is_positive_wherever_light_arrives(self, device):
+        environment = sunny_sky()
+        arriving = (environment.directions() @ self.normal > 0.0) & (environment.radiance.sum(-1) > 0.0)
+        assert (self.density(device, environment)[arriving] > 0.0).all()
+
+    def test_samples_have_the_density(self, device, rng):
+        environment = sunny_sky(32)
+        squares = rng.random((40_000, 2)).astype(np.float32)
+        directions, _, _ = self.draw(device, environment, squares)
+        expected = (self.density(device, environment).astype(np.float64) * environment.solid_angles()).ravel()
+        u = 0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2.0 * np.pi)
+        v = np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi
+        row = np.minimum((v * 32).astype(int), 31)
+        column = np.minimum((u * 64).astype(int), 63)
+        counts = np.bincount(row * 64 + column, minlength=32 * 64)
+        # directions within float rounding of a texel's edge may land next door: texels that expect nothing stay out
+        order = np.argsort(expected)[::-1]
+        large = order[expected[order] * len(squares) >= 10.0]
+        rest = np.setdiff1d(order, large)
+        observed = np.append(counts[large], counts[rest].sum())
+        wanted = np.append(expected[large], expected[rest].sum()) * len(squares)
+        assert stats.chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > SIGNIFICANCE
+
+    def test_inverse(self, device, rng):
+        """Rebuilt from float32 directions: the square is only as fine as they are, magnified by the density."""
+        squares = rng.random((5000, 2)).astype(np.float32)
+        environment = sunny_sky(32)
+        directions, _, back = self.draw(device, environment, squares)
+        density = environment.lookup(directions.astype(np.float64)).mean(-1)
+        in_sun = density > 100.0
+        assert 0.1 < in_sun.mean() < 0.9
+        gap = np.abs(back - squares).max(axis=1)
+        # A texel is pi / 32 wide, and a direction's rounding 1e-7 of it 1e-6; the map spends up to 1 on the sun's.
+        # Directions within rounding of an edge go back through the texel next door: fewer than 1 in 200.
+        assert (gap < 1e-4).mean() > 0.995
+
+    def test_irradiance_is_unbiased_and_almost_free_of_noise(self, device, rng):
+        environment = sunny_sky()
+        squares = rng.random((20_000, 2)).astype(np.float32)
+        directions, radiance, _ = self.draw(device, environment, squares)
+        terms = radiance.astype(np.float64) * np.maximum(directions @ self.normal, 0.0)[:, None]
+        cosine = np.maximum(environment.directions() @ self.normal, 0.0)
+        truth = (environment.radiance * (cosine * environment.solid_angles())[..., None]).sum((0, 1))
+        z = (terms.mean(0) - truth) / (terms.std(0) / np.sqrt(len(terms)))
+        assert np.abs(z).max() < stats.norm.isf(SIGNIFICANCE / 6)
+        # one draw's deviation; cosine sampling of this sun has about 30 times the mean
+        assert (terms.std(0) < 0.8 * truth).all()
+
+    def test_darkness_draws_nothing(self, device):
+        directions, radiance, _ = self.draw(
+            device, EnvironmentMap.constant((0.0, 0.0, 0.0), height=32), np.zeros((4, 2))
+        )
+        assert not directions.any()
+        assert not radiance.any()
+
+    @pytest.mark.parametrize(("height", "suited"), [(4, 32), (32, 32), (50, 48), (512, 512), (2048, 512)])
+    def test_any_map_is_fitted_to_blocks(self, height, suited):
+        assert suited_height(height) == suited

@@ -1,0 +1,120 @@
+"""Every kernel compiles for an H200 (sm_90), on machines without a GPU too.
+
+The CPU compiler takes what NVRTC refuses: intrinsics of one side, overloads that only one side resolves, local arrays
+that do not fit. Most changes are made and tested where there is no GPU, so without this such a change would break CUDA
+unnoticed. It runs in processes of its own: declaring overloads changes the modules that other tests have loaded.
+"""
+
+import importlib
+import json
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from beam_warp import kernels
+
+MODULES = sorted(
+    entry.name.removeprefix("beam_warp.kernels.")
+    for entry in pkgutil.walk_packages(kernels.__path__, "beam_warp.kernels.")
+    if not entry.ispkg
+)
+
+TRACING = {
+    "trace.closest_surface",
+    "materials.residues",
+    "trace.surface_rays",
+    "trace.visibility",
+    "trace.counts",
+    "trace.visibility_adjoint",
+}
+"""Some of the modules that must have been compiled for every structure of occluders."""
+
+
+COMPOSITES = ((4, False), (16, True))
+
+RASTER = {
+    "raster.composite": ("composite_kernel", COMPOSITES),
+    "raster.composite_cuda": ("composite_cuda_kernel", COMPOSITES),
+    "raster.composite_adjoint_cuda": ("composite_adjoint_cuda_kernel", COMPOSITES),
+    "raster.back_projection_cuda": ("back_project_cuda_kernel", ((4,), (8,), (12,), (16,))),
+}
+"""Modules that make a kernel for each number of channels and mode of depth: by which function, some of them."""
+
+
+def compile_all(folder, share):
+    """Return {module: [kernels, error]} after compiling every second module under ``folder``, from the share-th on."""
+    import warp as wp
+
+    from beam_warp.kernels.trace.occluders import OCCLUDERS
+
+    found = {}
+    for name, (function, choices) in list(RASTER.items())[1 - share :: 2]:
+        maker = getattr(importlib.import_module(f"beam_warp.kernels.{name}"), function)
+        try:
+            local = 0
+            for arguments in choices:
+                (path,) = wp.compile_aot_module(maker(*arguments).module, arch=90, use_ptx=True, module_dir=folder)
+                local += Path(path).read_text(encoding="utf-8", errors="ignore").count("__local_depot")
+            found[name] = [len(choices), f"{local} uses of local memory" if local else ""]
+        except Exception as error:  # reported by the module's own test
+            found[name] = [0, f"{type(error).__name__}: {error}"]
+    for name in MODULES[share::2]:
+        module = importlib.import_module(f"beam_warp.kernels.{name}")
+        known = list(wp.get_module(module.__name__).kernels.values())
+        if not known:
+            continue
+        try:
+            variants = 0
+            for kernel in known:
+                overloads = OCCLUDERS.values() if kernel.is_generic else [None]
+                for occluders in overloads:
+                    variants += 1
+                    if occluders is not None:
+                        wp.overload(kernel, {"occluders": occluders})
+            (path,) = wp.compile_aot_module(module, arch=90, module_dir=folder)
+            found[name] = [variants, "" if Path(path).stat().st_size else "empty file"]
+        except Exception as error:  # reported by the module's own test
+            found[name] = [0, f"{type(error).__name__}: {error}"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sm_90")
+    found, running = {}, []
+    for share in ("0", "1"):
+        (folder / share).mkdir()
+        command = [sys.executable, __file__, folder / share, folder / f"{share}.json", share]
+        running.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+    for share, process in enumerate(running):
+        said, _ = process.communicate()
+        result = folder / f"{share}.json"
+        assert result.is_file(), said[-4000:]
+        found |= json.loads(result.read_text())
+    return found
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+@pytest.mark.parametrize("name", RASTER)
+def test_the_rasterizer_keeps_its_sums_in_registers(compiled, name):
+    """An array that is indexed by a loop which NVRTC does not unroll lies in local memory: 1.7 times as slow, once."""
+    count, error = compiled[name]
+    assert not error
+    assert count == len(RASTER[name][1])
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+@pytest.mark.parametrize("name", [name for name in MODULES if name not in RASTER])
+def test_compiles_for_sm_90(compiled, name):
+    if name not in compiled:
+        pytest.skip("holds no kernels of its own")
+    count, error = compiled[name]
+    assert not error
+    assert count >= (4 if name in TRACING else 1)
+
+
+if __name__ == "__main__":
+    Path(sys.argv[2]).write_text(json.dumps(compile_all(sys.argv[1], int(sys.argv[3]))))

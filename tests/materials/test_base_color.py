@@ -1,0 +1,103 @@
+"""What base colour is given where it cannot be measured, and why it says that it could not."""
+
+import numpy as np
+import pytest
+
+from beam_warp.materials.base_color import SATURATED_PART, fill_from_neighbors, solve_base_color
+from beam_warp.materials.direct import ColorEvidence
+from beam_warp.world.gaussians import GaussianCloud, Observability
+
+
+def evidence(count, **changes):
+    """Evidence of one frame on a base colour of one half, by ten equally good views."""
+    arrays = {
+        "numerator": np.full((count, 3), 5.0),
+        "denominator": np.full((count, 3), 10.0),
+        "observed": np.full((count, 3), 2.5),
+        "irradiance": np.full((count, 3), np.pi),
+        "openness": np.ones(count),
+        "noise": np.zeros(count),
+        "views": np.full(count, 10.0),
+        "facing": np.ones(count),
+        "saturated": np.zeros(count),
+        "unseen": np.zeros(count),
+    }
+    for name, rows in changes.items():
+        for row, value in rows.items():
+            arrays[name][row] = value
+    return ColorEvidence.from_arrays(arrays)
+
+
+def line(count):
+    """Gaussians a metre apart on a line."""
+    positions = np.zeros((count, 3))
+    positions[:, 0] = np.arange(count)
+    return GaussianCloud(
+        positions=positions,
+        orientations=np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 4)),
+        scales=np.ones((count, 3)),
+        opacities=np.ones(count),
+        normal_confidence=np.ones(count),
+    )
+
+
+NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
+"""No view of the third Gaussian counts."""
+
+
+@pytest.mark.parametrize(
+    ("why", "flags"),
+    [
+        ({}, Observability.UNSEEN | Observability.FILLED),
+        ({"saturated": {2: 1.0}, "facing": {2: 0.0}}, Observability.SATURATED | Observability.FILLED),
+        ({"facing": {2: 0.0}}, Observability.GRAZING | Observability.FILLED),
+        ({"irradiance": {2: 0.0}}, Observability.UNLIT | Observability.FILLED),
+    ],
+)
+def test_what_is_without_evidence_says_why(why, flags):
+    """Cut pixels leave no view, and none that faces the surface; that is neither want of light nor a grazing view."""
+    solved = solve_base_color(line(5), evidence(5, **NOTHING, **why), np.pi)
+    assert solved.observability.tolist() == [0, 0, int(flags), 0, 0]
+    np.testing.assert_allclose(solved.base_color, 0.5)
+
+
+def test_partly_cut_is_measured():
+    solved = solve_base_color(line(3), evidence(3, saturated={1: SATURATED_PART + 0.1}), np.pi)
+    assert solved.observability.tolist() == [0, int(Observability.SATURATED), 0]
+
+
+def test_error_of_what_is_filled_grows_with_distance():
+    """Values rise by a tenth a metre: filled d metres beyond their end, they are off by d tenths, and say so at least.
+
+    Pairs are no farther apart than the line is long, so that beyond that the error stays.
+    """
+    known, beyond = 40, np.arange(1, 21)
+    positions = np.zeros((known + len(beyond), 3), np.float32)
+    positions[:, 0] = np.concatenate([np.arange(known), known - 1 + beyond])
+    values = 0.1 * positions[:, :1].astype(np.float64)
+    missing = np.arange(len(positions)) >= known
+    filled, error = fill_from_neighbors(positions, values, np.zeros_like(values), missing)
+    assert (np.diff(error[missing, 0]) >= -1e-12).all()
+    # Of the pairs that share a group the root mean square is taken: it may fall short of the farthest by a group.
+    assert (error[missing, 0] > 0.1 * beyond - 0.1).all()
+    assert (np.abs(filled - values)[missing, 0] < 2.0 * error[missing, 0]).all()
+    np.testing.assert_array_equal(filled[~missing], values[~missing])
+    assert not error[~missing].any()
+
+
+def test_error_of_what_is_filled_among_its_like_is_theirs():
+    """Where nothing varies, nothing is added to the neighbours' own error."""
+    positions = np.random.default_rng(0).uniform(size=(600, 3)).astype(np.float32)
+    values, errors = np.full((600, 3), 0.4), np.full((600, 3), 0.02)
+    filled, error = fill_from_neighbors(positions, values, errors, np.arange(600) % 7 == 0)
+    np.testing.assert_allclose(filled, 0.4)
+    np.testing.assert_allclose(error, 0.02)
+
+
+@pytest.mark.parametrize("known", [0, 1, 2])
+def test_few_neighbors(known):
+    positions = np.arange(12, dtype=np.float32).reshape(4, 3)
+    values, errors = np.full((4, 2), 0.3), np.full((4, 2), 0.1)
+    filled, error = fill_from_neighbors(positions, values, errors, np.arange(4) >= known)
+    np.testing.assert_allclose(filled, 0.3)
+    np.testing.assert_allclose(error, 0.1)

@@ -1,0 +1,106 @@
+"""One base colour for all frames unless they disagree: level, power and what errors that are stated too small do."""
+
+import numpy as np
+import pytest
+
+from beam_warp.materials.base_color import BaseColor
+from beam_warp.materials.changes import FALSE_DISCOVERIES, ChangeTest, with_changes
+from beam_warp.materials.direct import ColorEvidence
+
+COUNT, FRAMES = 4000, 8
+VIEWS = 1e6
+
+
+def evidence(colors, error, *, stated=None, unseen=None):
+    """Evidence of one frame whose least-squares solution is ``colors``, give or take ``stated``."""
+    count = len(colors)
+    ones = np.ones((count, 3))
+    zeros = np.zeros(count)
+    said = np.broadcast_to(error if stated is None else stated, (count,))
+    return ColorEvidence(
+        numerator=colors * ones,
+        denominator=ones,
+        observed=colors**2
+        + VIEWS * (said**2)[:, None],  # so many views that their scatter is known: said^2 of the mean
+        irradiance=ones,
+        openness=np.ones(count),
+        noise=zeros,
+        views=np.full(count, VIEWS),
+        facing=np.ones(count),
+        saturated=zeros,
+        unseen=zeros if unseen is None else unseen.astype(float),
+    )
+
+
+def frames_of(rng, truth, error, **said):
+    return [evidence(np.clip(t + rng.normal(0.0, error, t.shape), 0.02, 0.98), error, **said) for t in truth]
+
+
+def outcome(frames):
+    test = ChangeTest()
+    for frame in frames:
+        test.add(frame)
+    return test.result()
+
+
+def test_constant_colour_is_left_constant(rng):
+    truth = np.tile(rng.uniform(0.3, 0.7, (1, COUNT, 3)), (FRAMES, 1, 1))
+    found = outcome(frames_of(rng, truth, 0.03))
+    # no true change: any discovery is false, and there is one at all with a probability of the level
+    assert found.changing.sum() <= 1
+    # the median of COUNT chi-squared variables of 21 degrees is known to about 0.5 %
+    assert found.dispersion == pytest.approx(1.0, abs=0.03)
+
+
+def test_changes_are_found_and_followed(rng):
+    truth = np.tile(rng.uniform(0.3, 0.7, (1, COUNT, 3)), (FRAMES, 1, 1))
+    truth[:, :200] += 0.2 * np.sin(np.arange(FRAMES))[:, None, None]
+    frames = frames_of(rng, truth, 0.03)
+    found = outcome(frames)
+    assert found.changing[:200].all()
+    assert found.changing[200:].sum() <= max(3, 10 * FALSE_DISCOVERIES * 200)
+    color, error = found.frame_color(frames[2])
+    off = (color - truth[2])[:200]
+    assert np.sqrt((off**2).mean()) < 1.1 * 0.03
+    assert 0.8 < np.sqrt((off**2).mean()) / error[:200].mean() < 1.25
+    np.testing.assert_allclose(color[found.changing == 0], found.mean[found.changing == 0])
+
+
+def test_errors_stated_too_small_are_no_changes(rng):
+    truth = np.tile(rng.uniform(0.3, 0.7, (1, COUNT, 3)), (FRAMES, 1, 1))
+    found = outcome(frames_of(rng, truth, 0.03, stated=0.01))
+    assert found.dispersion == pytest.approx(9.0, rel=0.03)
+    assert found.changing.sum() <= 1
+
+
+def test_frames_that_do_not_see_a_gaussian_do_not_count(rng):
+    truth = np.tile(rng.uniform(0.3, 0.7, (1, COUNT, 3)), (FRAMES, 1, 1))
+    hidden = np.zeros(COUNT, bool)
+    hidden[:500] = True
+    frames = frames_of(rng, truth, 0.03)
+    frames[3] = evidence(np.where(hidden[:, None], 0.0, truth[3]), 0.03, unseen=hidden)
+    found = outcome(frames)
+    assert not found.changing.any()
+    np.testing.assert_allclose(found.frame_color(frames[3])[0][:500], found.mean[:500])
+
+
+def test_a_single_frame_says_nothing(rng):
+    found = outcome(frames_of(rng, rng.uniform(0.3, 0.7, (1, 50, 3)), 0.03))
+    assert not found.changing.any()
+    assert found.dispersion == 1.0
+
+
+def test_only_what_changes_gets_a_colour_of_its_own(rng):
+    truth = np.tile(rng.uniform(0.3, 0.7, (1, COUNT, 3)), (FRAMES, 1, 1))
+    truth[:, 0] = np.linspace(0.1, 0.9, FRAMES)[:, None]
+    frames = frames_of(rng, truth, 0.02)
+    found = outcome(frames)
+    constant = BaseColor(
+        np.full((COUNT, 3), 0.5, np.float32), np.full((COUNT, 3), 0.1, np.float32), np.zeros(COUNT, np.uint8), 0.0
+    )
+    first, last = (with_changes(constant, found, frames[k]) for k in (0, -1))
+    assert np.abs(first.base_color[0] - 0.1).max() < 0.1
+    assert np.abs(last.base_color[0] - 0.9).max() < 0.1
+    rest = ~found.changing
+    assert (first.base_color[rest] == 0.5).all()
+    assert (last.base_color[rest] == 0.5).all()

@@ -1,0 +1,123 @@
+"""From evidence to base colour: standard errors that few views and few frames cannot make small, and honest flags."""
+
+import numpy as np
+import pytest
+from support.shapes import cloud_of, sphere_points, tiles
+
+from beam_warp import Observability
+from beam_warp.materials.base_color import SPECULAR_PART, UNKNOWN, least_squares, solve_base_color
+from beam_warp.materials.direct import ColorEvidence
+
+IRRADIANCE = 3.0
+
+
+def bare(count):
+    points, _ = sphere_points(count)
+    cloud = cloud_of(tiles(points, points, 0.1))
+    return cloud.with_arrays(normal_confidence=np.ones(count, np.float32))
+
+
+def evidence(targets, *, noise=0.0, **changed):
+    """Of views of equal weight under light of radiance 1, whose targets are ``(V, N, 3)``."""
+    views, count = targets.shape[:2]
+    arrays = {
+        "numerator": targets.sum(0),
+        "denominator": np.full((count, 3), float(views)),
+        "observed": (targets**2).sum(0),
+        "irradiance": np.full((count, 3), IRRADIANCE),
+        "openness": np.ones(count),
+        "noise": np.full(count, noise**2),
+        "views": np.full(count, float(views)),
+        "facing": np.ones(count),
+        "saturated": np.zeros(count),
+        "unseen": np.zeros(count),
+    }
+    return ColorEvidence(**(arrays | changed))
+
+
+def hidden(count, rows):
+    """A frame in which some Gaussians are not measured, and the others are as dull as can be."""
+    zero = {name: np.zeros((count, 3)) for name in ("numerator", "denominator", "observed")}
+    whole = evidence(np.full((4, count, 3), 0.4), noise=0.1)
+    arrays = {name: getattr(whole, name).copy() for name in ColorEvidence.ARRAYS}
+    for name in (*zero, "irradiance", "openness", "noise", "views", "facing"):
+        arrays[name][rows] = 0.0
+    arrays["unseen"][rows] = 1.0
+    return ColorEvidence.from_arrays(arrays)
+
+
+class TestStandardError:
+    @pytest.mark.parametrize("views", [2, 3, 8, 32])
+    def test_it_is_that_of_a_mean_of_views(self, rng, views):
+        """Views off by 0.05 each: the mean's error is 0.05 / sqrt(views), and the stated one says so on average."""
+        targets = 0.5 + rng.normal(0.0, 0.05, (views, 4000, 3))
+        raw, error = least_squares(evidence(targets))
+        np.testing.assert_allclose(raw, targets.mean(0), atol=1e-12)
+        # 12,000 variances of one degree or more are known to sqrt(2 / 12,000); Wilson and Hilferty are 4 % off at one
+        assert np.sqrt((error**2).mean()) / (0.05 / np.sqrt(views)) == pytest.approx(1.0, abs=0.05)
+        assert ((np.abs(raw - 0.5) < 2.0 * error).mean(0) > 0.90).all()  # Student's t of 2 degrees has 82 %
+
+    def test_one_view_alone_is_as_uncertain_as_views_are_elsewhere(self, rng):
+        """A single view has no residual; its error is what views typically differ by, not 0."""
+        many = evidence(0.5 + rng.normal(0.0, 0.05, (16, 1000, 3)))
+        arrays = {name: getattr(many, name).copy() for name in ColorEvidence.ARRAYS}
+        one = 0.5 + rng.normal(0.0, 0.05, (200, 3))
+        arrays["numerator"][:200], arrays["denominator"][:200], arrays["observed"][:200] = one, 1.0, one**2
+        arrays["views"][:200] = 1.0
+        _, error = least_squares(ColorEvidence.from_arrays(arrays))
+        # the median of 800 estimates of 15 degrees each: 1.25 sqrt(2 / 15 / 800) of a variance, thrice that to be safe
+        np.testing.assert_allclose(error[:200], 0.05, rtol=0.03)
+
+    def test_light_that_is_noisy_in_every_frame_averages_out_over_those_that_are_measured(self):
+        """Nine frames, one of which shows the first half: its noise is that of one frame, not a ninth of it."""
+        frame = evidence(np.full((4, 10, 3), 0.4), noise=0.1)
+        total = frame
+        for _ in range(8):
+            total = total + hidden(10, slice(0, 5))
+        _, error = least_squares(total)
+        once = (0.4 + SPECULAR_PART) * 0.1  # of what is diffuse and of the highlight that is subtracted
+        np.testing.assert_allclose(error[:5], once, rtol=1e-6)
+        np.testing.assert_allclose(error[5:], once / 3.0, rtol=1e-6)
+
+    def test_of_black_is_that_of_the_highlight(self, rng):
+        """A light wrong by 20 %: black under a highlight of 0.05 comes out wrong by 0.01."""
+        error = rng.normal(0.0, 0.2, 4000)
+        shown = 0.05 * (1.0 + error)  # radiance, all of it specular; the model subtracts 0.05
+        raw, _ = least_squares(evidence(np.tile((shown - 0.05)[None, :, None], (4, 1, 3)), noise=0.2))
+        assert np.sqrt((raw**2).mean()) == pytest.approx(0.01, rel=0.05)  # 4000 samples: 1.1 %
+        _, stated = least_squares(evidence(np.zeros((4, 10, 3)), noise=0.2))
+        np.testing.assert_allclose(stated, 0.01, rtol=1e-6)
+
+
+class TestFlags:
+    def test_what_one_frame_of_many_shows_is_measured(self):
+        total = evidence(np.full((4, 10, 3), 0.4), noise=0.1)
+        for _ in range(150):
+            total = total + hidden(10, slice(0, 5))
+        solved = solve_base_color(bare(10), total, IRRADIANCE)
+        assert (solved.observability == 0).all()
+        np.testing.assert_allclose(solved.base_color, 0.4, rtol=1e-6)
+
+    def test_each_says_what_is_the_matter(self):
+        plain = evidence(np.full((4, 4, 3), 0.4))
+        arrays = {name: getattr(plain, name).copy() for name in ColorEvidence.ARRAYS}
+        arrays["irradiance"][0] = 0.001 * IRRADIANCE  # dark
+        arrays["unseen"][1] = 1.0  # not shown
+        for name in ("irradiance", "denominator", "numerator", "observed"):
+            arrays[name][1] = 0.0
+        arrays["facing"][2] = 0.001
+        found = solve_base_color(bare(4), ColorEvidence.from_arrays(arrays), IRRADIANCE).observability
+        filled = Observability.FILLED
+        assert [Observability(int(flags)) for flags in found] == [
+            Observability.UNLIT | filled,
+            Observability.UNSEEN | filled,
+            Observability.GRAZING,
+            Observability.OBSERVED,
+        ]
+
+    def test_where_nothing_is_known_nothing_is_claimed(self):
+        solved = solve_base_color(bare(6), hidden(6, slice(None)), IRRADIANCE)
+        np.testing.assert_array_equal(solved.base_color, np.float32(UNKNOWN[0]))
+        np.testing.assert_array_equal(solved.standard_error, np.float32(UNKNOWN[1]))
+        assert (solved.observability & np.uint8(Observability.FILLED) != 0).all()
+        assert solved.clipped_part == 0.0

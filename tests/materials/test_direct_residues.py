@@ -1,0 +1,519 @@
+"""Light at points and what it leaves in views, kernel by kernel, against float64: sums, residues, bounce, fit."""
+
+import numpy as np
+import pytest
+import warp as wp
+from support.estimates import LARGEST_Z
+from support.shapes import cloud_of, disc_points, tiles
+
+from beam_warp import Scene
+from beam_warp.kernels.materials.residues import (
+    ALBEDO_SCALING,
+    FRESNEL_HV,
+    ColorFit,
+    LightRays,
+    Observations,
+    PointLight,
+    Surface,
+    launch_fit_color,
+    launch_gather_light,
+    launch_trace_bounce,
+    launch_view_residues,
+)
+from beam_warp.kernels.trace.surface_rays import RayBatch
+from beam_warp.light.ggx import (
+    DIELECTRIC_F0,
+    ggx_distribution,
+    schlick_weight,
+    smith_lambda,
+    specular_albedo,
+)
+from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.trace.transmittance import EXACT
+from beam_warp.world.environment import EnvironmentMap, texel_directions
+
+EPS = float(np.finfo(np.float32).eps)
+TABLE_ERROR = 2e-3
+"""Of the directional albedo between the nodes of its table, see tests/light/test_ggx.py."""
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def single(array):
+    """What a kernel will read, in float64: oracles start from the same rounded numbers."""
+    return np.asarray(array, np.float32).astype(np.float64)
+
+
+def sphere_directions(count):
+    i = np.arange(count) + 0.5
+    z, phi = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
+
+
+def structured(directions):
+    """Radiance of a sky with a gradient, a warm lobe and a cool one, ``(..., 3)``."""
+    warm, cool = unit(np.array([0.4, -0.5, 0.8])), unit(np.array([-0.7, 0.2, 0.3]))
+    base = 1.0 + 0.6 * directions[..., 2]
+    return (
+        base[..., None] * np.array([0.5, 0.6, 0.8])
+        + np.exp(8.0 * (directions @ warm - 1.0))[..., None] * np.array([6.0, 4.0, 2.0])
+        + np.exp(5.0 * (directions @ cool - 1.0))[..., None] * np.array([0.5, 1.0, 3.0])
+    )
+
+
+def to_device(array, dtype, device):
+    return wp.array(np.ascontiguousarray(array, np.float32), dtype=dtype, device=device)
+
+
+class Points:
+    """Points, rays and light of a launch: NumPy in, structs out. Rays of a point follow each other, as in a batch."""
+
+    def __init__(self, normals, directions, weights, visibility, device, *, paired=False, bounce=0.0, roughness=0.5):
+        count, samples = directions.shape[:2]
+        self.device, self.count = device, count
+        self.rows = np.arange(count)[::-1].copy()  # batches come in another order than rows
+        self.batch = RayBatch()
+        self.batch.normals = to_device(normals[self.rows], wp.vec3, device)
+        self.batch.rows = wp.array(self.rows.astype(np.int32), dtype=int, device=device)
+        self.batch.sample_count = samples
+        self.rays = LightRays()
+        self.rays.directions = to_device(directions[self.rows].reshape(-1, 3), wp.vec3, device)
+        self.rays.weights = to_device(weights[self.rows].reshape(-1, 3), wp.vec3, device)
+        self.rays.visibility = to_device(visibility[self.rows].reshape(-1), float, device)
+        self.rays.paired = int(paired)
+        self.light = PointLight()
+        for name in ("unshadowed", "arriving", "bounce"):
+            setattr(self.light, name, wp.zeros(count, dtype=wp.vec3, device=device))
+        for name in ("noise", "tilt"):
+            setattr(self.light, name, wp.zeros(count, dtype=float, device=device))
+        self.light.bounce.assign(np.full((count, 3), bounce, np.float32))
+        self.surface = Surface()
+        self.surface.normals = to_device(normals, wp.vec3, device)
+        self.surface.roughness = to_device(np.full(count, roughness), float, device)
+
+    def gather(self, ratio, unshadowed):
+        self.light.unshadowed.assign(np.asarray(unshadowed, np.float32))
+        launch_gather_light(self.batch, self.rays, ratio, self.light, self.device)
+        return {name: getattr(self.light, name).numpy().copy() for name in ("arriving", "noise", "tilt")}
+
+    def residues(self, sky, views, diffuse_weight=ALBEDO_SCALING, weights=None):
+        found = Observations()
+        shape = views.shape[:2]
+        colors = np.zeros((*shape, 4), np.float32)
+        colors[..., 3] = 1.0 if weights is None else weights
+        found.colors = wp.array(colors, dtype=wp.vec4, device=self.device)
+        found.directions = wp.array(views.astype(np.float32), dtype=wp.vec3, device=self.device)
+        found.specular = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+        found.diffuse_share = wp.zeros(shape, dtype=float, device=self.device)
+        launch_view_residues(
+            self.batch, self.rays, self.light, sky.light, self.surface, int(diffuse_weight), found, self.device
+        )
+        return found.specular.numpy(), found.diffuse_share.numpy()
+
+
+def random_rays(rng, count, samples):
+    """Directions above each normal, and their weights f = L cos / (pi pdf) for any L and pdf."""
+    normals = unit(rng.normal(size=(count, 3)))
+    directions = unit(rng.normal(size=(count, samples, 3)))
+    below = np.einsum("pi,pki->pk", normals, directions) < 0.0
+    directions[below] *= -1.0
+    cosine = np.einsum("pi,pki->pk", single(normals), single(directions))
+    weights = rng.gamma(0.5, 2.0, (count, samples, 3)) * np.maximum(cosine, 0.0)[..., None]
+    visibility = np.where(rng.random((count, samples)) < 0.5, rng.uniform(0.05, 1.0, (count, samples)), 1.0)
+    return normals, directions, weights, visibility
+
+
+class TestGatheredLight:
+    @pytest.mark.parametrize("samples", [4, 7, 64])
+    @pytest.mark.parametrize("paired", [True, False])
+    def test_arriving_light_and_its_noise(self, device, rng, samples, paired):
+        rays = random_rays(rng, 70, samples)
+        points = Points(*rays, device, paired=paired)
+        unshadowed = rng.uniform(0.5, 2.0, (70, 3))
+        weights, visibility = single(rays[2]), single(rays[3])
+        seen, free = (weights * visibility[..., None]).sum(1), weights.sum(1)
+        shared = points.gather(True, unshadowed)
+        tolerance = 4 * samples * EPS  # two sums of as many positive terms, their quotient
+        np.testing.assert_allclose(shared["arriving"], single(unshadowed) * seen / free, rtol=tolerance, atol=1e-30)
+        plain = points.gather(False, unshadowed)
+        np.testing.assert_allclose(plain["arriving"], seen / samples, rtol=tolerance, atol=1e-30)
+        total = seen.sum(1)
+        for found, center in ((shared, total / free.sum(1)), (plain, np.zeros(70))):
+            terms = weights.sum(2) * (visibility - center[:, None])
+            np.testing.assert_allclose(
+                found["noise"],
+                np.sqrt(variance_of_sum(terms, paired)) / total,
+                # terms differ by cancellation: their rounding is that of what they are made of
+                rtol=50 * samples * EPS,
+                atol=10 * samples * EPS * weights.sum(2).max() / total.min(),
+            )
+
+    def test_tilt_is_what_a_turn_of_the_normal_does(self, device, rng):
+        """d ln E / d angle, by central differences of E(n) = mean of (L V / (pi pdf)) n.w over the same rays."""
+        normals, directions, weights, visibility = random_rays(rng, 40, 64)
+        points = Points(normals, directions, weights, visibility, device)
+        found = points.gather(True, np.ones((40, 3)))["tilt"]
+        normals, directions, weights, visibility = (single(a) for a in (normals, directions, weights, visibility))
+        step = 1e-5
+        expected = np.empty(40)
+        for p in range(40):
+            n, w = normals[p], directions[p]
+            per_cosine = weights[p].sum(1) * visibility[p] / (w @ n)
+            across = np.linalg.svd(n[None])[2][1:]
+
+            def light(axis, angle, n=n, w=w, per_cosine=per_cosine):
+                turned = np.cos(angle) * n + np.sin(angle) * axis
+                return float((per_cosine * (w @ turned)).sum())
+
+            slopes = [(light(axis, step) - light(axis, -step)) / (2.0 * step) for axis in across]
+            expected[p] = np.hypot(*slopes) / light(across[0], 0.0)
+        # central differences of a sine err by step^2 / 6; dividing by small cosines magnifies the rounding of n.w
+        np.testing.assert_allclose(found, expected, rtol=64 * EPS / 1e-2)
+
+    def test_points_without_light_are_stated_unknown_not_divided(self, device):
+        normals = np.tile([0.0, 0.0, 1.0], (3, 1))
+        directions = np.tile(unit(np.array([0.3, 0.1, 0.9])), (3, 8, 1))
+        weights = np.ones((3, 8, 3))
+        weights[0] = 0.0  # no ray found light
+        weights[2, :, 1] = 0.0  # none in one channel
+        visibility = np.ones((3, 8))
+        visibility[1] = 0.0  # all blocked
+        found = Points(normals, directions, weights, visibility, device).gather(True, np.full((3, 3), 2.0))
+        np.testing.assert_array_equal(found["arriving"], [[1, 1, 1], [0, 0, 0], [2, 1, 2]])
+        np.testing.assert_array_equal(found["noise"][:2], 1.0)
+        assert np.isfinite(found["tilt"]).all()
+
+
+def variance_of_sum(terms, paired):
+    """Float64 twin of `beam_warp.kernels.common.spread`."""
+    count = terms.shape[1]
+    if not paired:
+        return count * terms.var(axis=1, ddof=1)
+    even = count - count % 2
+    result = ((terms[:, 0:even:2] - terms[:, 1:even:2]) ** 2).sum(1)
+    if count % 2:
+        a, b, c = terms[:, -3], terms[:, -2], terms[:, -1]
+        result = result + 0.5 * ((a - c) ** 2 + (b - c) ** 2 - (a - b) ** 2)
+    return result
+
+
+@pytest.fixture(scope="module")
+def sky():
+    prepared = {}
+
+    def on(device):
+        if device not in prepared:
+            height = 64
+            prepared[device] = EnvironmentLighting.from_environment(
+                EnvironmentMap(structured(texel_directions(height, 2 * height)).astype(np.float32)), device=device
+            )
+        return prepared[device]
+
+    return on
+
+
+def even_rays(normals, samples, visible=None):
+    """Rays evenly over the sphere (density 1 / 4 pi) under the structured sky; half of them lie below the surface."""
+    count = len(normals)
+    directions = np.tile(sphere_directions(samples), (count, 1, 1))
+    cosine = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)
+    weights = structured(directions) * (4.0 * cosine)[..., None]
+    visibility = np.ones((count, samples)) if visible is None else visible(directions)
+    return directions, weights, visibility
+
+
+def views_of(normals, cosines, rng):
+    """Directions towards viewers at given cosines, ``(V, N, 3)``."""
+    across = np.stack([np.linalg.svd(n[None])[2][1:] for n in normals])
+    phi = rng.uniform(0.0, 2.0 * np.pi, (len(cosines), len(normals)))
+    around = np.cos(phi)[..., None] * across[:, 0] + np.sin(phi)[..., None] * across[:, 1]
+    c = np.asarray(cosines)[:, None, None]
+    return c * normals + np.sqrt(1.0 - c * c) * around
+
+
+def specular_brdf(n, v, w, roughness):
+    """GGX with height-correlated Smith and Schlick's Fresnel, float64; rows of w."""
+    alpha = roughness * roughness
+    h = unit(v + w)
+    n_l, n_v = w @ n, float(v @ n)
+    masking = 1.0 / (1.0 + smith_lambda(n_l, alpha) + smith_lambda(n_v, alpha))
+    fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight(h @ v)
+    return ggx_distribution(h @ n, alpha) * masking * fresnel / (4.0 * n_l * n_v)
+
+
+class TestResidues:
+    COSINES = (0.05, 0.3, 0.6, 0.9, 0.999)
+
+    @pytest.mark.parametrize("roughness", [0.3, 0.7])
+    def test_open_points_show_the_blurred_sky_times_the_albedo(self, device, rng, sky, roughness):
+        normals = unit(rng.normal(size=(33, 3)))
+        points = Points(normals, *even_rays(normals, 64), device, roughness=roughness, bounce=0.25)
+        points.gather(True, np.ones((33, 3)))
+        views = views_of(normals, self.COSINES, rng)
+        specular, share = points.residues(sky(device), views)
+        albedo = specular_albedo(np.array(self.COSINES), np.full(len(self.COSINES), roughness))
+        np.testing.assert_allclose(share, np.broadcast_to(1.0 - albedo[:, None], share.shape), atol=TABLE_ERROR)
+        mirrored = 2.0 * np.einsum("ni,vni->vn", normals, views)[..., None] * normals - views
+        # the blur itself, from fine even directions, with the lobe that n = v = d has: n.h against D n.l
+        fine = sphere_directions(20_000)
+        light = structured(fine)
+        for v, p in ((0, 0), (1, 5), (2, 17), (3, 29), (4, 32)):
+            d = mirrored[v, p]
+            cosine = fine @ d
+            up = cosine > 0.0
+            half = unit(fine[up] + d)
+            weight = ggx_distribution(half @ d, roughness**2) * cosine[up]
+            masked = weight / (1.0 + smith_lambda(cosine[up], roughness**2))
+            blurred = [(w[:, None] * light[up]).sum(0) / w.sum() for w in (weight, masked)]
+            expected = (np.array(blurred) + 0.25) * albedo[v]
+            spread = np.abs(expected[0] - expected[1])
+            # tree blur 2 %, linear in log roughness between levels 2 %, and what masking makes of the lobe
+            assert (np.abs(specular[v, p] - expected.mean(0)) < spread + 0.04 * expected.max() + TABLE_ERROR).all()
+
+    def test_the_rendering_equation_along_the_normal(self, device, sky):
+        """Seen along the normal the lobe does not stretch: the whole integral of specular light, by quadrature."""
+        rng = np.random.default_rng(3)
+        normals = unit(rng.normal(size=(9, 3)))
+        points = Points(normals, *even_rays(normals, 64), device, roughness=0.5)
+        points.gather(True, np.ones((9, 3)))
+        specular, _ = points.residues(sky(device), normals[None])
+        fine = sphere_directions(40_000)
+        for p, n in enumerate(normals):
+            up = fine[fine @ n > 0.0]
+            brdf = specular_brdf(n, n, up, 0.5)
+            expected = (structured(up) * (brdf * (up @ n))[:, None]).sum(0) * 4.0 * np.pi / len(fine)
+            # what the split sum leaves out: under its lobe alone, D n.l, masking and Fresnel do not vary
+            lobe = ggx_distribution(unit(up + n) @ n, 0.25) * (up @ n)
+            split = (structured(up) * lobe[:, None]).sum(0) / lobe.sum() * specular_albedo(1.0, 0.5)
+            assert (np.abs(specular[0, p] - split) < 0.04 * split.max()).all()  # blur 2 %, between levels 2 %
+            assert (np.abs(specular[0, p] - expected) < np.abs(split - expected) + 0.04 * split.max()).all()
+            assert (np.abs(split - expected) < 0.1 * expected.max()).all()
+
+    @pytest.mark.parametrize("roughness", [0.4, 0.8])
+    def test_what_is_in_the_way_takes_its_share_of_the_lobe(self, device, rng, sky, roughness):
+        normals = unit(rng.normal(size=(17, 3)))
+        wall = unit(np.array([0.2, 1.0, 0.1]))
+
+        def visible(directions):
+            return (directions @ wall < 0.1).astype(float)
+
+        rays = even_rays(normals, 512, visible)
+        free = even_rays(normals, 512)
+        views = views_of(normals, self.COSINES, rng)
+        hidden = Points(normals, *rays, device, roughness=roughness)
+        opened = Points(normals, *free, device, roughness=roughness)
+        for points in (hidden, opened):
+            points.gather(True, np.ones((17, 3)))
+        specular, _ = hidden.residues(sky(device), views)
+        whole, _ = opened.residues(sky(device), views)
+        share = specular[..., 0] / whole[..., 0]
+        directions, weights, visibility = (single(array) for array in rays)
+        for v in range(len(self.COSINES)):
+            for p in range(17):
+                w = directions[p][directions[p] @ normals[p] > 1e-6]
+                power = (weights[p].sum(1) * 1.0)[directions[p] @ normals[p] > 1e-6]
+                lobe = power * specular_brdf(normals[p], views[v, p], w, roughness)
+                seen = visibility[p][directions[p] @ normals[p] > 1e-6]
+                expected = (lobe * seen).sum() / lobe.sum()
+                # float32 of n.h at D's peak: relative error of D is at most 4 eps / alpha^2
+                assert abs(share[v, p] - expected) < 64 * EPS / roughness**4
+
+    def test_fresnel_share_by_quadrature(self, device, rng, sky):
+        normals = unit(rng.normal(size=(9, 3)))
+        views = views_of(normals, self.COSINES, rng)
+        points = Points(normals, *even_rays(normals, 4096), device)
+        points.gather(True, np.ones((9, 3)))
+        _, share = points.residues(sky(device), views, FRESNEL_HV)
+        fine = sphere_directions(40_000)
+        for v in range(len(self.COSINES)):
+            for p, n in enumerate(normals):
+                up = fine[fine @ n > 0.0]
+                power = structured(up).sum(1) * (up @ n)
+                h = unit(views[v, p] + up)
+                fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight((h * views[v, p]).sum(1))
+                expected = (power * (1.0 - fresnel)).sum() / power.sum()
+                # 2048 even directions above the surface: the integrand's edge at the horizon errs by their spacing
+                # squared times its slope, 4 pi / 4096 of at most 1
+                assert abs(share[v, p] - expected) < 4.0 * np.pi / 4096
+
+    @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
+    def test_white_furnace(self, device, rng, roughness):
+        """A white open surface under uniform light of radiance 1 sends 1 to every view: L_D share + L_S."""
+        white = EnvironmentLighting.from_environment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
+        normals = unit(rng.normal(size=(33, 3)))
+        directions, _, visibility = even_rays(normals, 256)
+        weights = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)[..., None] * 4.0 * np.ones(3)
+        points = Points(normals, directions, weights, visibility, device, roughness=roughness)
+        arriving = points.gather(True, np.ones((33, 3)))["arriving"]
+        specular, share = points.residues(white, views_of(normals, self.COSINES, rng))
+        # the same albedo on both sides, and a mean of ones: only rounding is left
+        np.testing.assert_allclose(arriving * share[..., None] + specular, 1.0, atol=64 * EPS)
+
+    def test_views_from_below_and_views_without_weight_have_no_residue(self, device, rng, sky):
+        normals = unit(rng.normal(size=(5, 3)))
+        points = Points(normals, *even_rays(normals, 64), device)
+        points.gather(True, np.ones((5, 3)))
+        for views, weights in ((views_of(normals, (-0.5, 0.01), rng), 1.0), (views_of(normals, (0.9,), rng), 0.0)):
+            specular, share = points.residues(sky(device), views, weights=weights)
+            assert (specular == 0.0).all()
+            assert (share == 0.0).all()
+
+
+def scene_of_views(rng, count, views):
+    """Observations as a model makes them: light, shares, speculars, weights; and normals that views see at angles."""
+    normals = unit(rng.normal(size=(count, 3)))
+    toward = views_of(normals, rng.uniform(0.55, 1.0, views), rng)  # all face the surface and count fully
+    arriving = rng.uniform(0.5, 2.0, (count, 3))
+    share = rng.uniform(0.7, 1.0, (views, count))
+    specular = rng.uniform(0.0, 0.2, (views, count, 3))
+    weight = rng.uniform(0.5, 20.0, (views, count))
+    return normals, toward, arriving, share, specular, weight
+
+
+def fitted(colors, weight, toward, share, specular, normals, arriving, device, *, robust=False, bounce=0.0):
+    found, light, surface, fit = Observations(), PointLight(), Surface(), ColorFit()
+    found.colors = wp.array(
+        np.concatenate([colors, weight[..., None]], -1).astype(np.float32), dtype=wp.vec4, device=device
+    )
+    found.directions = wp.array(toward.astype(np.float32), dtype=wp.vec3, device=device)
+    found.specular = wp.array(specular.astype(np.float32), dtype=wp.vec3, device=device)
+    found.diffuse_share = wp.array(share.astype(np.float32), dtype=float, device=device)
+    light.arriving = to_device(arriving, wp.vec3, device)
+    light.bounce = to_device(np.full_like(arriving, bounce), wp.vec3, device)
+    surface.normals = to_device(normals, wp.vec3, device)
+    count = len(normals)
+    for name in ("numerator", "denominator", "observed"):
+        setattr(fit, name, wp.zeros(count, dtype=wp.vec3, device=device))
+    for name in ("views", "facing"):
+        setattr(fit, name, wp.zeros(count, dtype=float, device=device))
+    launch_fit_color(found, light, surface, robust, fit, device)
+    return {name: getattr(fit, name).numpy().astype(np.float64) for name in ColorFit.vars}
+
+
+class TestFit:
+    @pytest.mark.parametrize("views", [1, 2, 33])
+    def test_plain_least_squares_is_lstsq(self, device, rng, views):
+        normals, toward, arriving, share, specular, weight = scene_of_views(rng, 70, views)
+        bounce = 0.25
+        diffuse = (arriving + bounce) * share[..., None]
+        colors = rng.uniform(0.2, 0.8, (70, 3)) * diffuse + specular + rng.normal(0.0, 0.02, (views, 70, 3))
+        fit = fitted(colors, weight, toward, share, specular, normals, arriving, device, bounce=bounce)
+        found = fit["numerator"] / fit["denominator"]
+        residual = fit["observed"] - found * fit["numerator"]
+        for p in range(70):
+            root = np.sqrt(weight[:, p])
+            for c in range(3):
+                solution, squares, *_ = np.linalg.lstsq(
+                    (root * diffuse[:, p, c])[:, None], root * (colors - specular)[:, p, c], rcond=None
+                )
+                # three sums of so many terms; the largest target is 2.3 and rounds before it is subtracted from
+                assert abs(found[p, c] - solution[0]) < 8 * (views + 4) * EPS
+                scale = fit["observed"][p, c]
+                assert abs(residual[p, c] - (squares[0] if len(squares) else 0.0)) < 8 * (views + 4) * EPS * scale
+        np.testing.assert_allclose(fit["views"], weight.sum(0) ** 2 / (weight**2).sum(0), rtol=4 * views * EPS)
+        np.testing.assert_allclose(fit["facing"], 1.0, rtol=2 * views * EPS)
+
+    def test_a_view_that_disagrees_has_little_influence(self, device, rng):
+        normals, toward, arriving, share, specular, weight = scene_of_views(rng, 70, 16)
+        weight[:] = 1.0
+        truth = rng.uniform(0.2, 0.8, (70, 3))
+        colors = truth * arriving * share[..., None] + specular
+        spoiled = colors.copy()
+        spoiled[3] += 5.0 * arriving
+        arguments = (weight, toward, share, specular, normals, arriving, device)
+        robust = fitted(spoiled, *arguments, robust=True)
+        plain = fitted(spoiled, *arguments)
+        error = np.abs(robust["numerator"] / robust["denominator"] - truth)
+        naive = np.abs(np.clip(plain["numerator"] / plain["denominator"], 0.0, 1.0) - truth)
+        # Cauchy's weight of residual r at spread s is s^2 / (s^2 + r^2): at s <= .2 and r >= 4 below 1/400 of the rest
+        assert naive.mean() > 0.15
+        assert error.max() < 0.02
+        assert (robust["views"] < 15.5).all()  # what hardly counts is not counted
+        assert (robust["views"] > 14.5).all()
+
+    def test_colours_that_no_base_colour_explains_do_not_break_the_weights(self, device, rng):
+        normals, toward, arriving, share, specular, weight = scene_of_views(rng, 40, 8)
+        for factor in (-0.5, 3.0):  # darker than the highlight alone, brighter than white
+            colors = factor * arriving * share[..., None] + specular
+            fit = fitted(colors, weight, toward, share, specular, normals, arriving, device, robust=True)
+            raw = fit["numerator"] / fit["denominator"]
+            np.testing.assert_allclose(raw, factor, atol=0.05)  # sums are those of the data: cutting is the solver's
+
+    def test_grazing_views_count_less_and_are_told(self, device, rng):
+        normals = unit(rng.normal(size=(10, 3)))
+        cosines = np.array([0.9, 0.35, 0.2, 0.1, -0.3])
+        toward = views_of(normals, cosines, rng)
+        share, specular = np.ones((5, 10)), np.zeros((5, 10, 3))
+        colors = np.broadcast_to(np.arange(5.0)[:, None, None] / 10.0, (5, 10, 3))
+        fit = fitted(colors, np.ones((5, 10)), toward, share, specular, normals, np.ones((10, 3)), device)
+        counted = np.clip((cosines - 0.2) / 0.3, 0.0, 1.0)
+        expected = (counted * np.arange(5) / 10.0).sum() / counted.sum()
+        np.testing.assert_allclose(fit["numerator"] / fit["denominator"], expected, rtol=100 * EPS, atol=1e-6)
+        np.testing.assert_allclose(fit["facing"], counted.sum() / 5.0, atol=1e-6)
+
+    def test_points_that_nothing_shows_or_lights_stay_zero(self, device, rng):
+        normals, toward, arriving, share, specular, weight = scene_of_views(rng, 4, 3)
+        weight[:, 0] = 0.0
+        arriving[1] = 0.0
+        colors = np.ones((3, 4, 3))
+        fit = fitted(colors, weight, toward, share, specular, normals, arriving, device, robust=True)
+        assert (fit["denominator"][:2] == 0.0).all()
+        assert (fit["numerator"][:2] == 0.0).all()
+        assert fit["views"][0] == 0.0
+        assert all(np.isfinite(values).all() for values in fit.values())
+
+
+class TestBounce:
+    SAMPLES = 4096
+
+    def gathered(self, points, cloud, radiance, device, seed=0):
+        scene = Scene.from_gaussians(cloud, device)
+        batch = RayBatch()
+        batch.positions = to_device(points, wp.vec3, device)
+        batch.normals = to_device(np.tile([0.0, 0.0, 1.0], (len(points), 1)), wp.vec3, device)
+        batch.offsets = to_device(np.full(len(points), 1e-4), float, device)
+        batch.rows = wp.array(np.arange(len(points), dtype=np.int32), dtype=int, device=device)
+        batch.base = scene.occluders.origin
+        batch.sample_count = self.SAMPLES
+        out = wp.zeros(len(points), dtype=wp.vec3, device=device)
+        launch_trace_bounce(
+            scene,
+            EXACT.settings(scene),
+            batch,
+            to_device(radiance, wp.vec3, device),
+            (seed, 0),
+            self.SAMPLES,
+            out,
+        )
+        return out.numpy()
+
+    def test_a_disc_overhead_sends_its_radiance_times_its_form_factor(self, device):
+        """R^2 / (R^2 + h^2) of a coaxial parallel disc; opaque tiles, several deep wherever a ray goes."""
+        spacing, radius, height = 0.02, 0.5, 0.5
+        disc = disc_points(radius, spacing) + np.array([0.0, 0.0, height])
+        up = np.tile([0.0, 0.0, 1.0], (len(disc), 1))
+        layers = [tiles(disc + np.array([0.0, 0.0, 0.002 * k]), up, spacing, opacity=0.99) for k in range(3)]
+        cloud = cloud_of(*layers)
+        radiance = np.tile([1.0, 0.5, 2.0], (len(cloud), 1))
+        found = self.gathered(np.zeros((1, 3)), cloud, radiance, device)[0]
+        # tiles reach about one spacing over the edge or fall short of it; noise of independent rays is an upper bound
+        edge = 2.0 * spacing * radius * height**2 / (radius**2 + height**2) ** 2 * 1.0
+        noise = LARGEST_Z * 0.5 / np.sqrt(self.SAMPLES)
+        np.testing.assert_allclose(found / [1.0, 0.5, 2.0], 0.5, atol=edge + noise)
+
+    def test_open_sky_bounces_nothing(self, device):
+        disc = disc_points(0.5, 0.1) - np.array([0.0, 0.0, 1.0])
+        cloud = cloud_of(tiles(disc, np.tile([0.0, 0.0, 1.0], (len(disc), 1)), 0.1))
+        assert (self.gathered(np.zeros((3, 3)), cloud, np.ones((len(cloud), 3)), device) == 0.0).all()
+
+    def test_seeds_differ_and_repeat(self, device):
+        disc = disc_points(0.5, 0.1) + np.array([0.0, 0.0, 0.5])
+        cloud = cloud_of(tiles(disc, np.tile([0.0, 0.0, 1.0], (len(disc), 1)), 0.1, opacity=0.5))
+        one, again, other = (
+            self.gathered(np.zeros((5, 3)), cloud, np.ones((len(cloud), 3)), device, s) for s in (0, 0, 1)
+        )
+        np.testing.assert_array_equal(one, again)
+        assert (one != other).any()

@@ -1,0 +1,171 @@
+"""What views show of Gaussians: closed forms on tiled spheres and planes, and what is behind a surface."""
+
+import numpy as np
+import pytest
+from support.shapes import cloud_of, disc_points, sphere_points, tiles
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
+from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.raster.gbuffer import RADIANCE, rasterize
+from beam_warp.trace.scene import Scene
+from beam_warp.world.camera import Camera
+from beam_warp.world.harmonics import SH_C0
+
+SIDE = 96
+
+
+def around(count=8, distance=4.0, side=SIDE):
+    golden = 180.0 * (3.0 - 5.0**0.5)
+    return [
+        Camera.orbit(
+            (0.0, 0.0, 0.0),
+            distance,
+            azimuth=golden * k % 360.0,
+            elevation=float(np.degrees(np.arcsin(1.0 - (2.0 * k + 1.0) / count))),
+            width=side,
+            height=side,
+            vertical_fov=35.0,
+        )
+        for k in range(count)
+    ]
+
+
+def colored(cloud, colors, color_space=LINEAR_REC709):
+    return cloud.with_arrays(
+        radiance=((np.asarray(colors) - 0.5) / SH_C0)[:, None, :].astype(np.float32), radiance_color_space=color_space
+    )
+
+
+@pytest.fixture
+def ball(rng):
+    """A unit sphere of tiles with colours at random."""
+    points, spacing = sphere_points(3000)
+    return colored(cloud_of(tiles(points, points, spacing)), rng.uniform(0.1, 0.9, (3000, 3)))
+
+
+def captured(cloud, cameras, change=lambda color: color, device="cpu"):
+    views = []
+    for k, camera in enumerate(cameras):
+        buffer = rasterize(cloud, camera, channels=(RADIANCE,), device=device)
+        color = change(buffer.channels[RADIANCE] * buffer.alpha[..., None]).astype(np.float32)
+        views.append(CapturedView(name=str(k), camera=camera, color=color, alpha=buffer.alpha))
+    return views
+
+
+class TestSurface:
+    def test_points_and_normals_of_a_sphere(self, ball, device):
+        found = view_evidence(ball, around(), device=device)
+        seen = found.seen
+        assert seen.mean() > 0.95
+        radius = np.linalg.norm(found.positions.numpy()[seen], axis=1)
+        # What is seen is a layer of overlapping flat tiles, whose means lie inside by parts of a tile's deviation.
+        deviation = float(ball.scales.max())
+        assert np.abs(np.median(radius) - 1.0) < 0.5 * deviation
+        assert radius.min() > 1.0 - 1.5 * deviation
+        cosine = (found.normals.numpy()[seen] * ball.positions[seen]).sum(axis=1)
+        assert np.degrees(np.arccos(np.median(cosine))) < 2.0
+        assert found.agreement.numpy()[seen].min() > 0.8
+
+    def test_what_is_inside_is_not_seen_and_keeps_its_place(self, device):
+        inner, _ = sphere_points(200)
+        shell, spacing = sphere_points(3000)
+        layers = cloud_of(tiles(shell, shell, spacing, opacity=0.99), tiles(0.5 * inner, inner, 0.1))
+        both = colored(layers, np.full((3200, 3), 0.5))
+        found = view_evidence(both, around(), device=device)
+        hidden = np.flatnonzero(~found.seen[3000:]) + 3000
+        assert len(hidden) > 50
+        np.testing.assert_array_equal(found.positions.numpy()[hidden], both.positions[hidden])
+        assert (found.normals.numpy()[hidden] == 0.0).all()
+
+    def test_a_layer_behind_a_plane_is_moved_onto_what_is_seen(self, device):
+        flat = disc_points(1.0, 0.05)
+        up = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+        behind = flat - [0.0, 0.0, 0.004]
+        both = colored(
+            cloud_of(tiles(flat, up, 0.05, opacity=0.6), tiles(behind, up, 0.05)), np.full((2 * len(flat), 3), 0.5)
+        )
+        cameras = [
+            Camera.look_at((0.3 * k, 0.2, 3.0), (0.0, 0.0, 0.0), width=SIDE, height=SIDE, vertical_fov=35.0)
+            for k in (-1, 0, 1)
+        ]
+        found = view_evidence(both, cameras, device=device)
+        inside = np.linalg.norm(both.positions[:, :2], axis=1) < 0.7
+        height = found.positions.numpy()[inside & found.seen, 2]
+        assert (height > -0.0041).all()
+        assert (height < 1e-4).all()
+        offsets = SurfacePoints.seen_by(both, found, Scene.from_gaussians(both, device)).offsets.numpy()
+        # thin tiles: 0.1 of 0.65 * 0.05 in deviation, and the upper layer's height above what is seen
+        assert 0.0 < np.median(offsets[inside & found.seen]) < 0.03
+
+
+class TestColors:
+    def test_a_perfect_fit_shows_its_own_colour(self, ball, device):
+        cameras = around()
+        found = view_evidence(ball, cameras, captured(ball, cameras, device=device), device=device)
+        colors = found.colors.numpy()
+        shown = colors[..., 3] > 0.1
+        truth = np.broadcast_to(0.5 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
+        # image and rendering are the same function of the same Gaussians: nothing is left to be spread back
+        np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=2e-5)
+
+    def test_what_the_fit_does_not_explain_is_added(self, ball, device):
+        cameras = around()
+        brighter = captured(ball, cameras, lambda color: color + 0.125 * (color.sum(axis=-1, keepdims=True) > 0.0))
+        found = view_evidence(ball, cameras, brighter, device=device)
+        colors = found.colors.numpy()
+        shown = colors[..., 3] > 0.1
+        truth = np.broadcast_to(0.625 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
+        np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=1e-4)
+
+    def test_display_colour_is_decoded(self, ball, device):
+        cameras = around(4)
+        linear = np.full((3000, 3), 0.3)
+        display = colored(ball, linear_to_srgb(linear), DISPLAY_SRGB)
+        views = captured(colored(ball, linear), cameras)
+        found = view_evidence(display, cameras, views, device=device)
+        colors = found.colors.numpy()
+        shown = colors[..., 3] > 0.1
+        np.testing.assert_allclose(colors[shown][:, :3], 0.3, atol=2e-3)  # pixels of alpha .95 blend unlike light
+
+    def test_pixels_at_the_ceiling_count_for_nothing_and_are_told(self, ball, device):
+        cameras = around()
+        left = ball.positions[:, 0] < 0.0
+        halves = colored(ball, np.where(left[:, None], 0.9, 0.2) * np.ones(3))
+        views = captured(halves, cameras, lambda color: np.minimum(2.0 * color, 1.0))
+        found = view_evidence(halves, cameras, views, ceiling=1.0, device=device)
+        clear = found.seen & (np.abs(ball.positions[:, 0]) > 0.2)
+        assert found.saturated[clear & left].min() > 0.5
+        assert found.saturated[clear & ~left].max() < 0.05
+        assert (found.colors.numpy()[..., :3].max() < 2.0).all()
+
+    def test_silhouettes_count_for_nothing(self, ball, device):
+        cameras = around(2)
+        views = [
+            CapturedView(name=v.name, camera=v.camera, color=v.color * 0.0, alpha=v.alpha * 0.5)
+            for v in captured(ball, cameras)
+        ]
+        found = view_evidence(ball, cameras, views, device=device)
+        assert (found.colors.numpy()[..., 3] == 0.0).all()
+        assert found.seen.any()
+
+
+def test_views_in_any_grouping_give_the_same(ball, device, monkeypatch):
+    cameras = around(6)
+    views = captured(ball, cameras)
+    whole = view_evidence(ball, cameras, views, device=device)
+    monkeypatch.setattr("beam_warp.materials.evidence.PIXELS_AT_ONCE", SIDE * SIDE)
+    single = view_evidence(ball, cameras, views, device=device)
+    for name in ("positions", "normals", "agreement", "colors", "directions"):
+        np.testing.assert_array_equal(getattr(whole, name).numpy(), getattr(single, name).numpy())
+    np.testing.assert_array_equal(whole.weight, single.weight)
+
+
+def test_what_is_refused(ball):
+    cameras = around(2)
+    with pytest.raises(InvalidArrayError, match="radiance must be given"):
+        view_evidence(cloud_of(tiles(*[sphere_points(10)[0]] * 2, 0.5)), cameras, device="cpu")
+    with pytest.raises(InvalidArrayError, match="images must be one for each of 2 cameras, got 1"):
+        view_evidence(ball, cameras, captured(ball, cameras)[:1], device="cpu")

@@ -1,0 +1,372 @@
+"""The main job, small: everything is written, a stopped job continues to the same bytes, errors leave nothing."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.figure_asset import figure_asset
+from support.shapes import cloud_of, sphere_points, tiles
+
+from beam_warp import GaussianSequence, MaterialOptions, Observability, RunOptions, read, run, validate
+from beam_warp.capture.capture import Capture
+from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.image.files import read_image, write_exr
+from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
+from beam_warp.jobs.store import frame_key, read_frame, write_frame
+from beam_warp.materials.frame import CaptureImages
+from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.job import OverviewOptions, RoughnessTexture
+from beam_warp.raster.records import RasterOptions
+from beam_warp.render.sheet import contact_sheet
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
+
+FAST = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
+SMALL = OverviewOptions(height=48)
+
+
+def frame(shift=0.0, ids=True, count=200):
+    points, spacing = sphere_points(count)
+    parts = tiles(points + np.array([shift, 0.0, 0.0]), points, spacing)
+    return cloud_of(
+        parts,
+        radiance=np.full((count, 1, 3), 0.3),
+        radiance_color_space=DISPLAY_SRGB,
+        ids=np.arange(count) if ids else None,
+    )
+
+
+@pytest.fixture
+def light():
+    return EnvironmentMap.constant((1.0, 0.9, 0.8), height=32)
+
+
+def folder_bytes(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "report.json"}
+
+
+def test_everything_is_written_valid_and_readable(tmp_path, light):
+    result = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", FAST, overview=SMALL)
+    assert validate(result.asset).is_valid
+    cloud = read(result.asset)[0]
+    assert cloud.is_relightable
+    assert cloud.axes == "rub"
+    assert cloud.base_color_error is not None
+    assert cloud.observability is not None
+    assert np.allclose(cloud.roughness, 0.5)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["materials"]["gaussians"] == 200
+    assert report["device"]["kind"] == "cpu"
+    assert read_image(result.overview).width > 48
+
+
+def test_it_is_drawn_as_its_metadata_say(tmp_path, light):
+    stated = {"raster_antialiased": "true", "raster_low_pass": "4.0", "capture_frames": "7"}
+    said = run(GaussianSequence.from_clouds([frame()], metadata=stated), light, tmp_path / "a", FAST, overview=SMALL)
+    silent = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "b", FAST, overview=SMALL)
+    assert read(said.asset).metadata.items() >= stated.items()
+    assert not [key for key in read(silent.asset).metadata if key.startswith("raster")]
+    for result, options in ((said, RasterOptions(antialiased=True, low_pass=4.0)), (silent, RasterOptions())):
+        cloud = result.sequence[0]
+        extent = np.ptp(cloud.positions, axis=0)
+        width = round(SMALL.height * float(np.hypot(extent[0], extent[1]) / extent[2]))  # panels are that wide
+        camera = Camera.frame_cloud(
+            cloud.positions, cloud.opacities, elevation=SMALL.elevation, width=width, height=SMALL.height
+        )
+        expected = contact_sheet(cloud, camera, [], options=options, device="cpu")
+        # Captured colour is the first panel, whatever follows.
+        top = MARGIN + TITLE_HEIGHT
+        panel = np.s_[top : top + SMALL.height, MARGIN : MARGIN + width]
+        drawn = np.rint(read_image(result.overview).rgb() * 255.0)
+        np.testing.assert_array_equal(drawn[panel], expected[panel])
+
+
+def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatch):
+    monkeypatch.setattr("beam_warp.trace.rays.RAYS_AT_ONCE", 8 * 50)
+    said = []
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
+    run(sequence, light, tmp_path / "out", FAST, overview=SMALL, progress=lambda *step: said.append(step))
+    for stage, total in (("normals", 400), ("materials", 400), ("decompose", 2), ("overview", 1)):
+        steps = [done for name, done, count in said if name == stage and count == total]
+        assert steps == sorted(steps)
+        assert steps[-1] == total
+    assert len([1 for name, *_ in said if name == "materials"]) > 6
+
+
+def test_stopped_job_continues_to_identical_bytes(tmp_path, light, monkeypatch):
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1), frame(0.2)])
+    run(sequence, light, tmp_path / "whole", FAST, overview=SMALL)
+
+    def stop(stage, done, total):
+        if (stage, done) == ("decompose", 2):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL, progress=stop)
+    assert not (tmp_path / "stopped" / "asset.usda").exists()
+    result = run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL)
+    assert result.report["resumed_frames"] == 2
+    whole, continued = folder_bytes(tmp_path / "whole"), folder_bytes(tmp_path / "stopped")
+    assert whole.keys() == continued.keys()
+    differing = [str(path) for path in whole if whole[path] != continued[path]]
+    assert not differing
+
+
+def test_other_input_or_options_start_over(tmp_path, light):
+    sequence = GaussianSequence.from_clouds([frame()])
+    run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    again = run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    assert again.report["resumed_frames"] == 1
+    for changed in (
+        {"sequence": GaussianSequence.from_clouds([frame(0.5)])},
+        {"environment": light.scaled(2.0)},
+        {"options": RunOptions(materials=MaterialOptions(sample_count=16), device="cpu")},
+    ):
+        arguments = {"sequence": sequence, "environment": light, "options": FAST} | changed
+        fresh = run(
+            arguments["sequence"], arguments["environment"], tmp_path / "out", arguments["options"], overview=SMALL
+        )
+        assert fresh.report["resumed_frames"] == 0
+
+
+def test_persistent_frames_share_one_base_colour(tmp_path, light):
+    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
+    joint = run(sequence, light, tmp_path / "joint", FAST, overview=SMALL).sequence
+    assert joint.topology == "constant"
+    assert "base_color" in joint.constant
+    assert np.array_equal(joint[0].base_color, joint[1].base_color)
+    assert not np.array_equal(joint[0].positions, joint[1].positions)
+    apart = GaussianSequence.from_clouds([frame(0.0, ids=False), frame(0.1, ids=False)])
+    separate = run(apart, light, tmp_path / "apart", FAST, overview=SMALL).sequence
+    assert separate.topology == "perFrame"
+    assert "base_color" not in separate.constant
+
+
+def test_radiance_is_needed(tmp_path, light):
+    bare = frame().with_arrays(radiance=None, radiance_color_space=None)
+    with pytest.raises(InvalidArrayError, match="radiance must be given to decompose materials, got none at frame 0"):
+        run(GaussianSequence.from_clouds([bare]), light, tmp_path / "out", FAST)
+    assert not (tmp_path / "out" / "asset.usda").exists()
+
+
+def test_the_image_path_needs_images(tmp_path, light):
+    with pytest.raises(InvalidOptionError, match="capture must be given for the image path, got none"):
+        run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", RunOptions(images=ImagePathOptions()))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("stops", [np.nan, 100.0])
+def test_exposures_that_no_light_has(stops):
+    with pytest.raises(InvalidOptionError, match="exposure must be"):
+        RunOptions(exposure=stops)
+
+
+def test_empty_frames_are_refused(tmp_path, light):
+    empty = GaussianSequence.from_clouds([frame().select(np.arange(0))])
+    with pytest.raises(InvalidArrayError, match="a frame must hold at least one Gaussian, got none at frame 0"):
+        run(empty, light, str(tmp_path / "out"), FAST)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, light):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="out must be a folder that can be made"):
+        run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "file", FAST)
+
+
+def test_roughness_from_a_texture(tmp_path, light):
+    """A square of two triangles whose texture is rough on the left, smooth on the right."""
+    import trimesh
+    from PIL import Image
+
+    values = np.full((8, 8), 51, np.uint8)
+    values[:, :4] = 204
+    Image.fromarray(values).save(tmp_path / "rough.png")
+    square = trimesh.Trimesh(
+        vertices=[[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        faces=[[0, 1, 2], [0, 2, 3]],
+        visual=trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]]),
+        process=False,
+    )
+    square.export(tmp_path / "square.obj")
+    options = RunOptions(
+        materials=MaterialOptions(sample_count=8),
+        roughness=RoughnessTexture(tmp_path / "rough.png", tmp_path / "square.obj"),
+        device="cpu",
+    )
+    cloud = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", options, overview=SMALL).sequence[0]
+    clear = np.abs(cloud.positions[:, 0]) > 0.2
+    expected = np.where(cloud.positions[:, 0] < 0.0, 0.8, 0.2)
+    assert np.allclose(cloud.roughness[clear], expected[clear], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def figure():
+    return figure_asset(64, 2, metadata={"capture_frames": "0 1"})
+
+
+class TestWithACapture:
+    """Discs on the demo figure, decomposed by the images of its capture."""
+
+    @pytest.fixture
+    def discs(self, figure):
+        """Every fourth disc, larger, as a reconstruction would know it: without materials."""
+        return GaussianSequence.from_clouds([self.bare(cloud) for cloud in figure], metadata=figure.metadata)
+
+    @staticmethod
+    def bare(cloud, **changed):
+        cloud = cloud.select(np.arange(0, len(cloud), 4))
+        unknown = dict.fromkeys(("base_color", "roughness", "ambient_occlusion", "normals"))
+        scales = np.tile(np.float32([0.02, 0.02, 0.002]), (len(cloud), 1))
+        return cloud.with_arrays(**unknown, scales=scales, **changed)
+
+    @pytest.fixture
+    def studio(self, tiny_capture):
+        return EnvironmentMap.read(tiny_capture.environment_path).resized(32, 64)
+
+    def run(self, sequence, light, out, capture, options=FAST):
+        return run(sequence, light, out, options, capture=capture, overview=SMALL)
+
+    def test_it_finds_the_materials(self, figure, discs, studio, tiny_capture, tmp_path):
+        result = self.run(discs, studio, tmp_path / "out", tiny_capture)
+        assert validate(result.asset).is_valid
+        back = read(result.asset)
+        assert back.metadata["capture_frames"] == "0 1"
+        assert back.metadata["roughness_source"] == "constant"
+        assert back.metadata["radiance_meaning"] == "captured"
+        assert result.report["exposure_stops"] == 0.0
+        # discs of the true surface, some left out, cover less than the figure does
+        assert all("silhouettes" in warning for warning in result.report["warnings"])
+        cloud = result.sequence[0]
+        measured = cloud.observability == 0
+        assert 0.5 < measured.mean() < 1.0  # some discs lie where no camera looks
+        filled = (cloud.observability & np.uint8(Observability.FILLED)) != 0
+        unseen = (cloud.observability & np.uint8(Observability.UNSEEN)) != 0
+        np.testing.assert_array_equal(filled, unseen)
+        error = np.abs(cloud.base_color - figure[0].base_color[::4])[measured]
+        stated = cloud.base_color_error[measured]
+        assert np.median(error) < 0.1
+        # images of 64 pixels and 8 rays: what is stated must hold, whatever it is
+        assert (error < 2.0 * stated + 0.04).mean() > 0.9
+        cosine = (cloud.normals * figure[0].normals[::4]).sum(axis=1)[measured]
+        assert np.median(cosine) > np.cos(np.radians(20.0))
+
+    def test_a_stopped_job_continues_to_identical_bytes(self, discs, studio, tiny_capture, tmp_path):
+        self.run(discs, studio, tmp_path / "whole", tiny_capture)
+
+        def stop(stage, done, total):
+            if (stage, done) == ("decompose", 1):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run(discs, studio, tmp_path / "cut", FAST, capture=tiny_capture, overview=SMALL, progress=stop)
+        assert self.run(discs, studio, tmp_path / "cut", tiny_capture).report["resumed_frames"] == 1
+        whole, continued = (
+            {name: data for name, data in folder_bytes(tmp_path / out).items() if name.parts[0] != "digests"}
+            for out in ("whole", "cut")
+        )
+        assert whole == continued
+
+    def test_threads_do_not_change_a_byte(self, discs, studio, tiny_capture, tmp_path, monkeypatch):
+        found = []
+        for threads in ("1", "3"):
+            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+            self.run(discs, studio, tmp_path / threads, tiny_capture)
+            found.append({n: d for n, d in folder_bytes(tmp_path / threads).items() if n.parts[0] != "digests"})
+        assert found[0] == found[1]
+
+    def test_what_results_depend_on_starts_over(self, discs, studio, tiny_capture, tmp_path):
+        """A frame's images, how splats are drawn, whether there are images at all."""
+        moved = tmp_path / "capture"
+        shutil.copytree(tiny_capture.folder, moved)
+        capture = Capture.read(moved)
+        self.run(discs, studio, tmp_path / "out", capture)
+        changed = next(r for r in capture.select(split="train", frames={1}))
+        image = changed.image()
+        channels = {name: values * np.float32(0.5) for name, values in image.channels.items()}
+        write_exr(changed.image_path, channels)
+        assert self.run(discs, studio, tmp_path / "out", capture).report["resumed_frames"] == 1
+        drawn = replace(discs, metadata=discs.metadata | {"raster_antialiased": "true", "raster_low_pass": "0.1"})
+        assert self.run(drawn, studio, tmp_path / "out", capture).report["resumed_frames"] == 0
+        assert self.run(drawn, studio, tmp_path / "out", None).report["resumed_frames"] == 0
+
+    def test_gaussians_of_every_frame_their_own(self, discs, studio, tiny_capture, tmp_path):
+        apart = [cloud.with_arrays(ids=None) for cloud in discs]
+        sequence = GaussianSequence.from_clouds([apart[0], apart[1].select(np.arange(1000))], metadata=discs.metadata)
+        found = self.run(sequence, studio, tmp_path / "out", tiny_capture).sequence
+        assert found.topology == "perFrame"
+        assert [len(cloud) for cloud in found] == [1500, 1000]
+
+    def test_some_frames_of_a_capture(self, discs, studio, tiny_capture, tmp_path):
+        """The frames that the sequence names are read, not those in the same place."""
+        second = GaussianSequence.from_clouds([discs[1]], metadata={"capture_frames": "1"})
+        views = CaptureImages(tiny_capture, second).views(0)
+        expected = [record.view() for record in tiny_capture.select(split="train", frames={1})]
+        assert len(views) == len(expected) == 6
+        assert all(np.array_equal(a.color, b.color) for a, b in zip(views, expected, strict=True))
+        missing = GaussianSequence.from_clouds([discs[1]], metadata={"capture_frames": "9"})
+        with pytest.raises(InvalidOptionError, match=r"got none of frame 9 .*\(frames 0, 1\)"):
+            self.run(missing, studio, tmp_path / "missing", tiny_capture)
+
+    def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, tiny_capture, tmp_path):
+        """8-bit images carry no scale: the same light twice as bright gives the same base colour."""
+        assert not CaptureImages(tiny_capture, discs).is_display_referred(0)
+        records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in tiny_capture.records)
+        display = replace(tiny_capture, records=records)
+        images = CaptureImages(display, discs)
+        assert images.ceiling(0, images.views(0)) == 1.0
+        one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
+        plain, brighter = (self.run(one, studio.scaled(scale), tmp_path / str(scale), display) for scale in (1.0, 4.0))
+        # candidates are a sixteenth of a stop apart
+        difference = plain.report["exposure_stops"] - brighter.report["exposure_stops"]
+        assert difference == pytest.approx(2.0, abs=1.5 / 16.0)
+
+    @pytest.mark.parametrize("what", ["black", "elsewhere", "transparent", "single"])
+    def test_what_cannot_be_decomposed_is_refused_at_once(self, discs, studio, tiny_capture, tmp_path, what):
+        """Without light, or where the images show something else, nothing is measured and no asset is left."""
+        cloud, light, complaint = discs[0], studio, "sequence must show what the capture shows"
+        if what == "black":
+            light, complaint = EnvironmentMap.constant((0.0, 0.0, 0.0), height=32), "environment must shed light"
+        elif what == "elsewhere":
+            cloud = cloud.with_arrays(positions=cloud.positions + np.float32([0.0, 0.0, 50.0]))
+        elif what == "transparent":
+            cloud = cloud.with_arrays(opacities=np.full(len(cloud), 0.002, np.float32))
+        else:
+            cloud = cloud.select(np.arange(1))
+        sequence = GaussianSequence.from_clouds([cloud], metadata={"capture_frames": "0"})
+        with pytest.raises(InvalidOptionError, match=complaint):
+            self.run(sequence, light, tmp_path / "out", tiny_capture)
+        assert not (tmp_path / "out" / "asset.usda").exists()
+
+    def test_the_image_path_follows_its_first_frame(self, discs, studio, tiny_capture, tmp_path):
+        """Its colours are drawn towards those of the frame before: when that changes, it is done again."""
+        options = replace(FAST, images=ImagePathOptions(occlusion_samples=4, light_samples=4))
+        self.run(discs, studio, tmp_path / "out", tiny_capture, options)
+        again = self.run(discs, studio, tmp_path / "out", tiny_capture, options)
+        assert again.report["resumed_frames"] == 2
+        other = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
+        changed = GaussianSequence.from_clouds([other, discs[1]], metadata=discs.metadata)
+        assert self.run(changed, studio, tmp_path / "out", tiny_capture, options).report["resumed_frames"] == 0
+
+
+class TestStore:
+    def test_round_trip(self, tmp_path, rng):
+        arrays = {"a": rng.normal(size=(5, 3)).astype(np.float32), "b": np.arange(4), "empty": np.zeros((0, 3))}
+        write_frame(tmp_path / "f.h5", "key", arrays)
+        back = read_frame(tmp_path / "f.h5")
+        assert set(back) == set(arrays)
+        assert all(np.array_equal(back[name], arrays[name]) for name in arrays)
+        assert frame_key(tmp_path / "f.h5") == "key"
+
+    def test_missing_and_cut_files_have_no_key(self, tmp_path):
+        assert frame_key(tmp_path / "none.h5") is None
+        write_frame(tmp_path / "f.h5", "key", {"a": np.zeros(1000)})
+        (tmp_path / "f.h5").write_bytes((tmp_path / "f.h5").read_bytes()[:300])
+        assert frame_key(tmp_path / "f.h5") is None
+
+    def test_nothing_is_left_of_a_failed_write(self, tmp_path):
+        with pytest.raises(OutputError, match="must be writable"):
+            write_frame(tmp_path / "missing" / "f.h5", "key", {"a": np.zeros(3)})
+        assert not list(tmp_path.iterdir())

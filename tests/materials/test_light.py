@@ -1,0 +1,261 @@
+"""Whether an environment is told from its turns, mirror images and other lights, on surfaces whose light is known.
+
+What the points show is computed here, in float64 over every texel of the light, by formulas written anew.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from beam_warp.demo.lights import demo_environments
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.image.color import linear_to_srgb, srgb_to_linear
+from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.light import (
+    CLEARLY_BETTER,
+    LEAST_POINTS,
+    LIGHT_COLUMNS,
+    LIGHT_ROWS,
+    LightEvidence,
+    check_light,
+    judge_light,
+    looks_like_ldr,
+)
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.stability.material_cases import MaterialStudio
+from beam_warp.trace.scene import Scene
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.shapes import sphere_zone
+
+LIGHTS = {name: light.resized(32, 64) for name, light in demo_environments().items()}
+CELL = 360.0 / LIGHT_COLUMNS
+
+
+def shaded(normals, views, base_color, roughness, light):
+    """Radiance of points of a convex body towards views, ``(V, M, 3)``: Lambert and GGX with F0 = 0.04."""
+    texels = light.directions().reshape(-1, 3)
+    power = light.radiance.reshape(-1, 3) * light.solid_angles().reshape(-1, 1)
+    cosine = np.maximum(normals @ texels.T, 0.0)
+    seen = np.zeros((len(views), len(normals), 3))
+    diffuse = base_color * (cosine @ power) / np.pi
+    alpha2 = roughness**4
+    for k, view in enumerate(views):
+        facing = normals @ view
+        half = texels + view
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        n_h = normals @ half.T
+        fresnel = 0.04 + 0.96 * (1.0 - half @ view) ** 5
+        spread = alpha2 / (np.pi * (n_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
+        out = np.maximum(facing, 1e-3)[:, None]
+        masking = 0.5 / np.maximum(
+            cosine * np.sqrt(out**2 * (1 - alpha2) + alpha2) + out * np.sqrt(cosine**2 * (1 - alpha2) + alpha2), 1e-9
+        )
+        seen[k] = 0.94 * diffuse + (spread * masking * fresnel * cosine) @ power
+    return seen
+
+
+@dataclass
+class Ball:
+    """A ball of patches of several colours, seen from around."""
+
+    normals: np.ndarray
+    views: np.ndarray
+    base_color: np.ndarray
+    roughness: float = 0.5
+
+    @classmethod
+    def of(cls, count=400, roughness=0.5, seed=3):
+        normals = sphere_zone(np.zeros(3), 1.0, -1.0, 1.0, np.sqrt(4.0 * np.pi / count)).normals
+        rng = np.random.default_rng(seed)
+        centers = rng.normal(size=(24, 3))
+        patch = np.argmax(normals @ (centers / np.linalg.norm(centers, axis=1, keepdims=True)).T, axis=1)
+        colors = rng.uniform(0.1, 0.8, (24, 3))
+        around, above = np.radians(60.0) * np.arange(6), np.radians(20.0) * (-1.0) ** np.arange(6)
+        views = np.stack([np.cos(above) * np.cos(around), np.cos(above) * np.sin(around), np.sin(above)], axis=1)
+        return cls(normals, views, colors[patch], roughness)
+
+    def evidence(self, light):
+        """What it shows under a light."""
+        cells = EnvironmentMap.constant((1, 1, 1), height=LIGHT_ROWS).directions().reshape(-1, 3)
+        facing = (self.views @ self.normals.T > 0.1).astype(np.float32)
+        return LightEvidence(
+            normals=self.normals.astype(np.float32),
+            openness=(self.normals @ cells.T > 0.0).astype(np.float32),
+            colors=shaded(self.normals, self.views, self.base_color, self.roughness, light).astype(np.float32),
+            weights=facing,
+            directions=np.broadcast_to(self.views[:, None], (*facing.shape, 3)).astype(np.float32),
+        )
+
+
+def mirror(light):
+    return EnvironmentMap(light.radiance[:, ::-1])
+
+
+def codes(check):
+    return [finding.code for finding in check.findings]
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return Ball.of()
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_the_right_light_is_not_blamed(ball, name):
+    check = judge_light(ball.evidence(LIGHTS[name]), LIGHTS[name])
+    assert check.findings == ()
+    assert abs(check.best_rotation_degrees) <= CELL / 2
+    assert not check.is_mirrored
+    assert check.exposure_stops == 0.0
+    assert check.spread_best < check.spread_undivided
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.parametrize("degrees", [30.0, -50.0, 90.0, 180.0])
+def test_a_turned_light_is_told_with_its_turn(ball, name, degrees):
+    """The turn that undoes it is found to within half a cell, which the cells resolve."""
+    check = judge_light(ball.evidence(LIGHTS[name]), LIGHTS[name].rotated(degrees))
+    assert codes(check) == ["environment-turned"]
+    assert check.misfit_as_given > CLEARLY_BETTER
+    off = (check.best_rotation_degrees + degrees + 180.0) % 360.0 - 180.0
+    assert check.is_mirrored or abs(off) <= CELL / 2
+    assert "degrees about the up axis" in str(check.findings[0])
+
+
+@pytest.mark.parametrize("name", ["studio", "stage"])
+@pytest.mark.parametrize("degrees", [0.0, 120.0])
+def test_a_mirrored_light_is_told(ball, name, degrees):
+    """Lights of several sources: a lone sun is its own mirror image."""
+    light = LIGHTS[name]
+    check = judge_light(ball.evidence(light), mirror(light.rotated(degrees)))
+    assert codes(check) == ["environment-turned"]
+    assert check.is_mirrored
+    assert "mirrored" in str(check.findings[0])
+    undone = mirror(mirror(light.rotated(degrees))).rotated(check.best_rotation_degrees).resized(16, 32).radiance
+    assert np.abs(undone - light.resized(16, 32).radiance).mean() < 0.1 * light.radiance.mean() * 2.0
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.8])
+def test_other_roughness_does_not_matter(roughness):
+    evidence = Ball.of(roughness=roughness).evidence(LIGHTS["studio"])
+    assert judge_light(evidence, LIGHTS["studio"]).findings == ()
+    assert codes(judge_light(evidence, LIGHTS["studio"].rotated(90.0))) == ["environment-turned"]
+
+
+def test_without_gloss_shading_alone_tells(ball):
+    """Colours without change from view to view, as Gaussians of degree 0 have them."""
+    evidence = ball.evidence(LIGHTS["sunset"])
+    flat = replace(evidence, colors=np.broadcast_to(evidence.colors.mean(axis=0), evidence.colors.shape))
+    right, turned = (judge_light(flat, LIGHTS["sunset"].rotated(degrees)) for degrees in (0.0, 90.0))
+    assert right.findings == ()
+    assert right.gloss_best == 0.0
+    assert codes(turned) == ["environment-turned"]
+
+
+@pytest.mark.parametrize("stated", ["sunset", "stage"])
+def test_another_light_is_told(ball, stated):
+    check = judge_light(ball.evidence(LIGHTS["studio"]), LIGHTS[stated])
+    assert check.findings
+    assert check.findings[0].code in ("environment-unexplained", "environment-turned")
+
+
+def test_scale_of_the_light(ball):
+    """Stops are proposed that bring base colours back; the turn is found whatever the scale."""
+    light = LIGHTS["studio"]
+    evidence = ball.evidence(light)
+    dim = judge_light(evidence, light.exposed(-3.0))
+    assert codes(dim) == ["environment-exposure"]
+    assert abs(dim.exposure_stops - 3.0) < 1.0
+    assert "too dim" in str(dim.findings[0])
+    bright = judge_light(evidence, light.exposed(5.0))
+    assert codes(bright) == ["environment-exposure"]
+    assert abs(bright.exposure_stops + 5.0) < 1.0
+    assert "too bright" in str(bright.findings[0])
+    turned = judge_light(evidence, light.exposed(-3.0).rotated(90.0))
+    assert codes(turned) == ["environment-turned", "environment-exposure"]
+
+
+def test_uniform_light_has_no_turn(ball):
+    """All turns are alike, up to what float32 makes of them."""
+    light = EnvironmentMap.constant((0.7, 0.7, 0.7))
+    check = judge_light(ball.evidence(light), light)
+    assert check.findings == ()
+    assert check.misfit_as_given < 1e-3
+
+
+def test_few_points_say_so():
+    check = judge_light(Ball.of(LEAST_POINTS // 2).evidence(LIGHTS["studio"]), LIGHTS["studio"])
+    assert codes(check) == ["light-unchecked"]
+    assert check.point_count < LEAST_POINTS
+
+
+def test_a_black_light_is_told(ball):
+    black = EnvironmentMap(np.zeros((16, 32, 3)))
+    assert codes(judge_light(ball.evidence(LIGHTS["studio"]), black)) == ["environment-black"]
+
+
+def photographed(device, images=True):
+    """A path traced ball as Gaussians on a device, and what photographs show of them."""
+    stress = MaterialStudio(device, camera_count=6, size=40, samples=16, subdivisions=3).plain
+    cameras = [view.camera for view in stress.views]
+    views = view_evidence(stress.cloud, cameras, stress.views if images else None, device=device)
+    scene = Scene.from_gaussians(stress.cloud, device)
+    return scene, SurfacePoints.seen_by(stress.cloud, views, scene), views, stress.environment
+
+
+def test_gaussians_and_photographs_tell(device):
+    """Visibility is traced, colours are those of images with noise; the light is the path tracer's."""
+    scene, points, views, light = photographed(device)
+    right = check_light(scene, points, views, light, subset=256)
+    assert right.findings == ()
+    assert LEAST_POINTS <= right.point_count <= 256
+    assert abs(right.best_rotation_degrees) <= CELL / 2
+    assert codes(check_light(scene, points, views, light.rotated(90.0), subset=256)) == ["environment-turned"]
+    assert check_light(scene, points, views, light, subset=256) == right
+
+
+def test_images_are_needed(device):
+    scene, points, views, light = photographed(device, images=False)
+    with pytest.raises(InvalidArrayError, match="views must have images"):
+        check_light(scene, points, views, light)
+    with pytest.raises(InvalidOptionError, match="subset must be an integer"):
+        check_light(scene, points, views, light, subset=0)
+
+
+def test_few_views_say_so(ball):
+    """From one side many lights look alike."""
+    whole = ball.evidence(LIGHTS["studio"])
+    few = replace(whole, colors=whole.colors[:3], weights=whole.weights[:3], directions=whole.directions[:3])
+    check = judge_light(few, LIGHTS["studio"].rotated(90.0))
+    assert codes(check) == ["light-unchecked"]
+    assert "3 views" in str(check.findings[0])
+
+
+def encoded(light, levels):
+    """A light as an 8-bit sRGB picture shows it, decoded again."""
+    mean = light.mean_radiance().mean()
+    clipped = np.clip(light.radiance * (0.4 / mean), 0.0, 1.0)
+    return srgb_to_linear(np.round(linear_to_srgb(clipped) * levels) / levels).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_pictures_are_told_from_light(name):
+    light = LIGHTS[name]
+    assert looks_like_ldr(light) is None
+    cut = np.clip(light.radiance * (0.4 / light.mean_radiance().mean()), 0.0, 1.0)
+    finding = looks_like_ldr(EnvironmentMap(cut))
+    assert finding is not None
+    assert finding.code == "ldr-environment"
+    assert "cut at white" in str(finding)
+    # Scaled, or through half floats: the steps remain
+    for picture in (3.0 * encoded(light, 255), encoded(light, 255).astype(np.float16)):
+        finding = looks_like_ldr(EnvironmentMap(picture))
+        assert finding is not None
+
+
+def test_drawings_are_light():
+    assert looks_like_ldr(EnvironmentMap.constant((1, 1, 1))) is None
+    half = np.zeros((32, 64, 3), np.float32)
+    half[:16] = 1.0
+    assert looks_like_ldr(EnvironmentMap(half)) is None

@@ -1,0 +1,99 @@
+"""Texture coordinates: what unwrapping keeps, and the whole way from a painted texture to Gaussians."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingPackageError
+from beam_warp.materials.roughness_source import texel_positions, textured_roughness
+from beam_warp.mesh.files import write_mesh
+from beam_warp.mesh.unwrap import unwrapped
+from beam_warp.world.gaussians import GaussianCloud
+
+RESOLUTION = 256
+
+
+def ball(radius=0.5):
+    return trimesh.creation.icosphere(subdivisions=3, radius=radius)
+
+
+def double_areas(mesh):
+    corners = np.asarray(mesh.visual.uv)[mesh.faces]
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+
+
+def test_surface_is_kept():
+    mesh = ball()
+    flat = unwrapped(mesh, resolution=RESOLUTION)
+    assert np.array_equal(flat.triangles, mesh.triangles)
+    assert np.array_equal(flat.vertex_normals[flat.faces], mesh.vertex_normals[mesh.faces])
+    assert flat.visual.uv.min() >= 0.0
+    assert flat.visual.uv.max() <= 1.0
+    assert len(flat.vertices) > len(mesh.vertices)
+
+
+def test_charts_do_not_overlap():
+    """No texel's centre is in two triangles, but for those on edges, which neighbours share."""
+    flat = unwrapped(ball(), resolution=RESOLUTION)
+    _, texels = texel_positions(flat, RESOLUTION, RESOLUTION)
+    _, uses = np.unique(texels, return_counts=True)
+    assert len(texels) > 0.4 * RESOLUTION**2
+    assert (uses > 1).mean() < 1e-3
+    assert (double_areas(flat) > 0.0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_scale_and_place_do_not_matter(scale):
+    mesh = ball()
+    far = trimesh.Trimesh(mesh.vertices * scale + 100.0 * scale, mesh.faces, process=False)
+    flat = unwrapped(far, resolution=RESOLUTION)
+    assert len(flat.faces) == len(mesh.faces)
+    # Charts cover about as much of the square whatever the mesh's size.
+    assert 0.5 * double_areas(flat).sum() > 0.4
+
+
+def stripes(points):
+    """A roughness that depends on the place: bands a fifth of a metre wide."""
+    return np.where(np.floor(points[:, 2] / 0.2) % 2 == 0, 51, 204)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_painted_roughness_reaches_every_gaussian(suffix, tmp_path, rng):
+    """Paint the texels of an unwrapped mesh by place; each Gaussian near the surface gets its own place's value.
+
+    A texel's spacing on the ball is its share of the charts' area; the nearest valid texel is at most about one of
+    them away, or one of the mesh's sagitta: Gaussians so near to a band's edge are left out.
+    """
+    flat = unwrapped(ball(), resolution=RESOLUTION)
+    positions, texels = texel_positions(flat, RESOLUTION, RESOLUTION)
+    image = np.full(RESOLUTION * RESOLUTION, 255, np.uint8)  # what no triangle covers is never read
+    image[texels] = stripes(positions)
+    Image.fromarray(image.reshape(RESOLUTION, RESOLUTION)).save(tmp_path / "roughness.png")
+    write_mesh(flat, tmp_path / f"canonical.{suffix}")
+
+    directions = rng.normal(size=(2000, 3))
+    points = 0.5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    spacing = np.sqrt(np.pi / len(texels))
+    clear = np.abs(points[:, 2] / 0.2 - np.rint(points[:, 2] / 0.2)) * 0.2 > 3.0 * spacing
+    points = points[clear]
+    cloud = GaussianCloud(
+        positions=points,
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)),
+        scales=np.full((len(points), 3), 0.01),
+        opacities=np.ones(len(points)),
+    )
+    found = textured_roughness(cloud, tmp_path / "roughness.png", tmp_path / f"canonical.{suffix}")
+    assert len(points) > 1000
+    assert np.array_equal(np.rint(found * 255.0), stripes(points))
+
+
+def test_bad_input(monkeypatch):
+    with pytest.raises(InvalidArrayError, match="mesh must hold 1 to 2097152 triangles, got 0"):
+        unwrapped(trimesh.Trimesh())
+    with pytest.raises(InvalidOptionError, match="resolution must be an integer"):
+        unwrapped(ball(), resolution=0)
+    monkeypatch.setitem(__import__("sys").modules, "xatlas", None)
+    with pytest.raises(MissingPackageError, match=r"pip install beam-warp\[unwrap\]"):
+        unwrapped(ball())

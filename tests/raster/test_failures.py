@@ -1,0 +1,296 @@
+"""What breaks rasterisers: every hazard is finite, and exact for inputs that differ from those given by roundings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from reference.raster_differences import gradients, random_upstream
+from reference.raster_splats import see
+from reference.rasterizing import RasterImage, decide, replay
+from reference.single_precision import ROUNDING, rounded
+from support.raster_hazards import HAZARDS, ahead, make
+
+from beam_warp.device.arrays import upload
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.records import GaussianArrays, RasterOptions
+
+STABILITY = 10.0
+"""How many times the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""
+
+EXPONENTIAL_ULPS = 9.0
+"""Of `kernels.splat_rows.quick_exp` on CUDA: 2 + |1.16 x| (CUDA C++ Programming Guide), with alpha at least 1/255."""
+
+OUTPUTS = ("alpha", "depth", "median_depth", "channels", "normals")
+
+INVISIBLE = ("behind_the_camera", "far_outside_the_image", "a_tiny_world", "nothing")
+
+
+class Drawn:
+    """A scene drawn by the code under test: values, and the normals of its geometry."""
+
+    def __init__(self, scene, device):
+        self.scene = scene
+        self.rasterizer = Rasterizer(
+            len(scene.positions),
+            [scene.camera],
+            value_count=scene.values.shape[1],
+            normals=True,
+            options=RasterOptions(
+                antialiased=scene.antialiased, low_pass=scene.low_pass, near=scene.near, depth=scene.depth_mode
+            ),
+            device=device,
+        )
+        kinds = {"positions": wp.vec3, "orientations": wp.quat, "scales": wp.vec3, "opacities": float, "values": float}
+        arrays = {name: array.astype(np.float32) for name, array in scene.arrays().items()}
+        self.images = self.rasterizer.draw(
+            GaussianArrays(*(upload(arrays[name], kind, device) for name, kind in kinds.items()))
+        )
+
+    def image(self):
+        shape = (self.scene.camera.height, self.scene.camera.width)
+        rows = np.concatenate([array.numpy() for array in self.images.channels], axis=1).reshape(*shape, -1)
+        return RasterImage(
+            alpha=self.images.alpha.numpy().reshape(shape),
+            depth=self.images.depth.numpy().reshape(shape),
+            median_depth=self.images.median_depth.numpy().reshape(shape),
+            channels=rows[..., list(self.rasterizer.value_channels)],
+            normals=rows[..., list(self.rasterizer.normal_channels)],
+            last=self.rasterizer.gaussian_ids.numpy().reshape(shape),
+        )
+
+    def gradients(self, upstream):
+        adjoints = self.rasterizer.adjoints()
+        for name in ("alpha", "depth", "median_depth"):
+            getattr(adjoints, name).assign(getattr(upstream, name).astype(np.float32).ravel())
+        start = 0
+        for rows in adjoints.channels:
+            columns = np.zeros((rows.shape[0], start + rows.shape[1]), np.float32)
+            for places, array in (
+                (self.rasterizer.value_channels, upstream.channels),
+                (self.rasterizer.normal_channels, upstream.normals),
+            ):
+                columns[:, list(places)] = array.reshape(rows.shape[0], -1)
+            rows.assign(np.ascontiguousarray(columns[:, start:]))
+            start += rows.shape[1]
+        found = self.rasterizer.backward()
+        return {name: getattr(found, name).numpy() for name in self.scene.arrays()}
+
+
+def draw(scene, device):
+    return Drawn(scene, device).image()
+
+
+def remoteness(scene, decisions):
+    """How many images the farthest centre that counts is away: responses and depths are forms about it.
+
+    What a pixel sees is then a small difference of large numbers, and so are its derivatives.
+    """
+    if not len(decisions.splat):
+        return 1.0
+    centers = see(scene, decisions.splats).center[np.unique(decisions.splat)]
+    sides = np.array([scene.camera.width, scene.camera.height])
+    return max(1.0, float((np.abs(centers - 0.5 * sides) / sides).max()))
+
+
+@pytest.mark.parametrize("depth_mode", ["plane", "exact"])
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", HAZARDS)
+def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
+    """Images and gradients."""
+    scene = replace(HAZARDS[name](rng), antialiased=antialiased, depth_mode=depth_mode)
+    decisions = decide(scene)
+    clear = ~decisions.near_jump
+    assert clear.mean() > 0.9
+    upstream = random_upstream(rng, scene, decisions)
+    image, wanted = replay(scene, decisions), gradients(scene, upstream, decisions)
+    wanted |= {name: getattr(image, name)[clear] for name in OUTPUTS}
+    spread = dict.fromkeys(wanted, 0.0)
+    for _ in range(3):
+        other = rounded(rng, scene)
+        image, found = replay(other, decisions), gradients(other, upstream, decisions)
+        found |= {name: getattr(image, name)[clear] for name in OUTPUTS}
+        spread = {key: max(spread[key], np.linalg.norm(found[key] - wanted[key])) for key in wanted}
+    drawn = Drawn(scene, device)
+    image, got = drawn.image(), drawn.gradients(upstream)
+    got |= {name: getattr(image, name)[clear] for name in OUTPUTS}
+    factor = STABILITY * remoteness(scene, decisions)
+    rounding = ROUNDING * (EXPONENTIAL_ULPS if wp.get_device(device).is_cuda else 1.0)
+    for key, array in wanted.items():
+        assert np.isfinite(got[key]).all(), key
+        limit = factor * (spread[key] + rounding * np.linalg.norm(array))
+        assert np.linalg.norm(got[key] - array) <= limit, key
+    np.testing.assert_array_equal(image.last[clear], replay(scene, decisions).last[clear])
+
+
+@pytest.mark.parametrize("name", INVISIBLE)
+def test_what_is_nowhere_leaves_no_trace(device, rng, name):
+    scene = HAZARDS[name](rng)
+    drawn = Drawn(scene, device)
+    image = drawn.image()
+    for output in OUTPUTS:
+        assert not getattr(image, output).any()
+    assert (image.last == -1).all()
+    ones = RasterImage(*(np.ones_like(getattr(image, output)) for output in OUTPUTS))
+    for array in drawn.gradients(ones).values():
+        assert not array.any()
+
+
+@pytest.mark.parametrize("name", ["at_one_depth", "copies"])
+def test_one_depth_is_drawn_in_the_order_of_rows(device, rng, name):
+    scene = HAZARDS[name](rng)
+    order = rng.permutation(len(scene.positions))
+    other = replace(scene, **{key: array[order] for key, array in scene.arrays().items()})
+    first, second = draw(scene, device).channels, draw(other, device).channels
+    assert np.abs(first - second).max() > 0.01
+    decisions = decide(other)
+    clear = ~decisions.near_jump
+    # A weight of at most one, of values of at most one, rounded at each of forty splats.
+    np.testing.assert_allclose(second[clear], replay(other, decisions).channels[clear], atol=40 * 2 * ROUNDING)
+
+
+@pytest.mark.parametrize("name", HAZARDS)
+def test_every_hazard_has_the_same_bits_again(device, rng, name, monkeypatch):
+    scene = HAZARDS[name](rng)
+    upstream = random_upstream(rng, scene, decide(scene))
+    found = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+        drawn = Drawn(scene, device)
+        image = drawn.image()
+        found.append({**drawn.gradients(upstream), **{output: getattr(image, output) for output in OUTPUTS}})
+    for key, array in found[0].items():
+        np.testing.assert_array_equal(array, found[1][key])
+
+
+def test_capped_splats_pass_nothing_to_their_opacity(device, rng):
+    """A wall of them on one pixel: its alpha does not change with anything."""
+    scene = make(rng, [[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]], [9.0, 10.0, 11.0], opacities=1.0, camera=ahead(1, 1))
+    drawn = Drawn(scene, device)
+    one = np.ones((1, 1))
+    found = drawn.gradients(RasterImage(one, 0 * one, 0 * one, np.ones((1, 1, 3)), np.zeros((1, 1, 3))))
+    for name in ("positions", "orientations", "scales", "opacities"):
+        assert not found[name].any()
+    np.testing.assert_allclose(found["values"], [[0.99] * 3, [0.0099] * 3], rtol=100 * 4 * ROUNDING)  # 1 - 0.99
+
+
+def test_a_hundred_thousand_splats_on_one_tile(device, rng):
+    """Each wider than the tile and barely above the cut: the pixel stops after the first 2,345 of them."""
+    count = 100_000
+    depth = np.sort(rng.uniform(1.0, 3.0, count))
+    positions = np.stack([0 * depth, 0 * depth, depth], axis=-1)[rng.permutation(count)]
+    scene = make(rng, positions, 1e3, opacities=1.0 / 254.9, camera=ahead(8, 8))
+    drawn = Drawn(scene, device)
+    image = drawn.image()
+    passed = 1.0 - float(scene.opacities[0])
+    seen = int(np.ceil(np.log(1e-4) / np.log(passed)))
+    weights = (1.0 - passed) * passed ** np.arange(seen)
+    order = np.argsort(positions.astype(np.float32)[:, 2], kind="stable")
+    front = order[:seen]
+    # The product of 2,345 factors, each rounded by half a unit, and as many sums.
+    tolerance = 2 * seen * ROUNDING
+    np.testing.assert_allclose(image.alpha, weights.sum(), rtol=tolerance)
+    depths = weights @ scene.positions[front, 2] / weights.sum()
+    np.testing.assert_allclose(image.depth, depths, rtol=tolerance)
+    values = np.broadcast_to(weights @ scene.values[front], (8, 8, 3))
+    np.testing.assert_allclose(image.channels, values, rtol=tolerance)
+    assert (image.last == front[-1]).all()
+    found = drawn.gradients(RasterImage(*(np.ones_like(getattr(image, output)) for output in OUTPUTS)))
+    np.testing.assert_allclose(found["values"][front], np.tile(64 * weights[:, None], (1, 3)), rtol=tolerance)
+    for array in found.values():
+        assert np.isfinite(array).all()
+        assert not array[order[seen:]].any()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 70), (70, 1), (7, 9), (16, 8), (17, 16), (65, 3)])
+def test_images_of_every_shape(device, rng, width, height):
+    """Splats around every pixel, edge and corner."""
+    x, y = (rng.uniform(-4.0, side + 4.0, 80) for side in (width, height))
+    z = rng.uniform(1.0, 3.0, 80)
+    camera = ahead(width, height)
+    positions = np.stack([(x - 0.5 * width) / 30.0 * z, (y - 0.5 * height) / 30.0 * z, z], axis=-1)
+    scene = make(rng, positions, np.exp(rng.normal(-2.5, 0.5, (80, 3))), camera=camera)
+    decisions = decide(scene)
+    clear = ~decisions.near_jump
+    got, want = draw(scene, device), replay(scene, decisions)
+    for output in ("alpha", "channels"):
+        # A pixel coordinate below 80 is rounded by 4e-6 twice, and a response changes by at most 1.1 per pixel.
+        np.testing.assert_allclose(getattr(got, output)[clear], getattr(want, output)[clear], atol=1e-5)
+    np.testing.assert_array_equal(got.last[clear], want.last[clear])
+
+
+def test_every_camera_of_a_batch_sees_what_it_sees_alone(device, rng):
+    """Of four sizes and lenses, every output, bit for bit; and gradients are the sum."""
+    scene = HAZARDS["balls"](rng)
+    cameras = [ahead(13, 9), ahead(1, 1), ahead(40, 17, 55.0), ahead(8, 8, 20.0)]
+    arrays = [scene.arrays()[name].astype(np.float32) for name in ("positions", "orientations", "scales", "opacities")]
+    gaussians = GaussianArrays(
+        *(upload(a, kind, device) for a, kind in zip(arrays, (wp.vec3, wp.quat, wp.vec3, float), strict=True)),
+        upload(scene.values.astype(np.float32), float, device),
+    )
+    together = Rasterizer(len(arrays[0]), cameras, value_count=3, normals=True, device=device)
+    images = together.draw(gaussians)
+    adjoints = together.adjoints()
+    upstream = {
+        "alpha": rng.normal(size=together.first_pixels[-1]).astype(np.float32),
+        "channels": rng.normal(size=images.channels[0].shape).astype(np.float32),
+    }
+    adjoints.alpha.assign(upstream["alpha"])
+    adjoints.channels[0].assign(upstream["channels"])
+    total = {name: getattr(together.backward(), name).numpy().astype(np.float64) for name in scene.arrays()}
+    size = dict.fromkeys(total, 0.0)
+    for i, camera in enumerate(cameras):
+        part = slice(*together.first_pixels[i : i + 2])
+        alone = Rasterizer(len(arrays[0]), [camera], value_count=3, normals=True, device=device)
+        image = alone.draw(gaussians)
+        for name in ("alpha", "depth", "median_depth"):
+            np.testing.assert_array_equal(getattr(images, name).numpy()[part], getattr(image, name).numpy())
+        np.testing.assert_array_equal(images.channels[0].numpy()[part], image.channels[0].numpy())
+        np.testing.assert_array_equal(together.gaussian_ids.numpy()[part], alone.gaussian_ids.numpy())
+        adjoints = alone.adjoints()
+        adjoints.alpha.assign(upstream["alpha"][part])
+        adjoints.channels[0].assign(upstream["channels"][part])
+        found = alone.backward()
+        for name in total:
+            array = getattr(found, name).numpy().astype(np.float64)
+            total[name] -= array
+            size[name] += np.abs(array).max()
+    for name, rest in total.items():
+        assert np.abs(rest).max() <= 8 * ROUNDING * size[name], name  # four sums
+
+
+@pytest.mark.parametrize("length", [1e-3, 2.0, 1e3])
+def test_the_length_of_a_quaternion_does_not_matter(device, rng, length):
+    """Images are the same, and the gradient falls as the length grows."""
+    scene = HAZARDS["discs_without_thickness"](rng)
+    other = replace(scene, orientations=(length * scene.orientations).astype(np.float32))
+    decisions = decide(scene)
+    upstream = random_upstream(rng, scene, decisions)
+    first, second = Drawn(scene, device), Drawn(other, device)
+    clear = ~decisions.near_jump
+    np.testing.assert_allclose(second.image().alpha[clear], first.image().alpha[clear], atol=1e-5)
+    one, two = first.gradients(upstream)["orientations"], second.gradients(upstream)["orientations"]
+    assert np.linalg.norm(length * two - one) <= 1e-5 * np.linalg.norm(one)
+    assert np.abs((two * other.orientations).sum(axis=1)).max() <= 1e-5 * np.linalg.norm(one)
+
+
+def test_broken_rows_leave_the_others_alone(device, rng):
+    """NaN, infinity and zero quaternions, in arrays that nobody checks: those rows are as good as absent."""
+    scene = HAZARDS["balls"](rng)
+    broken = {name: array.astype(np.float32) for name, array in scene.arrays().items()}
+    broken["positions"][0] = np.nan
+    broken["positions"][1, 0] = np.inf
+    broken["orientations"][2, 1] = np.nan
+    broken["orientations"][5] = 0.0
+    broken["scales"][3, 1] = np.nan
+    broken["opacities"][4] = np.nan
+    rows = np.arange(6)
+    absent = scene.opacities.copy()
+    absent[rows] = 0.0
+    upstream = random_upstream(rng, scene, decide(scene))
+    bad, good = Drawn(replace(scene, **broken), device), Drawn(replace(scene, opacities=absent), device)
+    for output in OUTPUTS:
+        np.testing.assert_array_equal(getattr(bad.image(), output), getattr(good.image(), output))
+    found, wanted = bad.gradients(upstream), good.gradients(upstream)
+    for name, array in wanted.items():
+        np.testing.assert_array_equal(found[name][6:], array[6:])

@@ -1,0 +1,301 @@
+"""The rasteriser: closed forms, a float64 brute force without tiles, invariances, and every awkward input."""
+
+import numpy as np
+import pytest
+from reference import rasterizing as reference
+
+from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
+from beam_warp.raster import gbuffer, rasterizer
+from beam_warp.raster.gbuffer import rasterize, rasterize_values
+from beam_warp.raster.records import RasterOptions
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import sh_color
+
+WEIGHT_ROUNDING = 1e-5
+"""A pixel coordinate below 64 is rounded by up to 4e-6 twice (centre, offset), and a response changes by at most
+exp(-1/2) / sqrt(0.3) = 1.1 per pixel, since no splat is narrower than the low-pass; the rest is far smaller."""
+
+DEPTH_ROUNDING = 1e-6
+"""Relative: eight single-precision operations on a depth, 6e-8 each."""
+
+
+def make_cloud(rng, count, **changes):
+    orientations = rng.normal(size=(count, 4))
+    orientations /= np.linalg.norm(orientations, axis=1, keepdims=True) if count else 1.0
+    fields = {
+        "positions": rng.uniform(-1, 1, (count, 3)),
+        "orientations": orientations,
+        "scales": np.exp(rng.normal(-3, 1, (count, 3))),
+        "opacities": rng.uniform(0, 1, count),
+    }
+    return GaussianCloud(**{**fields, **changes})
+
+
+def still(positions, scales, opacities, **more):
+    """Gaussians whose axes are the world's."""
+    count = len(positions)
+    return GaussianCloud(
+        positions=positions,
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        scales=np.broadcast_to(scales, (count, 3)),
+        opacities=np.broadcast_to(opacities, (count,)),
+        **more,
+    )
+
+
+def sums(images):
+    """Alpha, and the sums of depth and values, as the reference gives them."""
+    return images.alpha, images.depth * images.alpha, images.values
+
+
+def front(width=40, height=40):
+    """At (0, -2, 0), looking along +y."""
+    return Camera.orbit((0, 0, 0), 2.0, 0.0, 0.0, width=width, height=height, vertical_fov=50.0)
+
+
+def around(width=40, height=40):
+    return Camera.orbit((0, 0, 0), 2.5, 20.0, 10.0, width=width, height=height, vertical_fov=50.0)
+
+
+def test_one_gaussian_is_its_closed_form(device):
+    camera = front()
+    cloud = still([[0.0, 0.0, 0.0]], 0.1, 0.8)
+    alpha, depth, value = sums(rasterize_values(cloud, camera, [[3.0]], device=device))
+    y, x = np.mgrid[:40, :40] + 0.5
+    variance = (camera.focal_x * 0.1 / 2.0) ** 2 + 0.3
+    expected = 0.8 * np.exp(-((x - 20) ** 2 + (y - 20) ** 2) / (2 * variance))
+    expected[expected < 1 / 255] = 0.0
+    np.testing.assert_allclose(alpha, expected, atol=WEIGHT_ROUNDING)
+    np.testing.assert_allclose(value[..., 0], 3 * expected, atol=3 * WEIGHT_ROUNDING)
+    np.testing.assert_allclose(depth, 2 * expected, atol=2 * WEIGHT_ROUNDING)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_against_brute_force(device, rng, antialiased):
+    cloud, camera = make_cloud(rng, 300), around()
+    values = rng.uniform(0, 1, (300, 5)).astype(np.float32)
+    options = RasterOptions(antialiased=antialiased)
+    got = sums(rasterize_values(cloud, camera, values, device=device, options=options))
+    expected = reference.rasterize(cloud, camera, values, antialiased=antialiased)
+    assert expected[0].mean() > 0.5
+    for actual, wanted, magnitude in zip(got, expected, (1.0, 4.0, 1.0), strict=True):
+        np.testing.assert_allclose(actual, wanted, atol=WEIGHT_ROUNDING * magnitude)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (50, 1), (7, 9), (8, 16), (17, 41)])
+def test_sizes_that_are_no_multiple_of_the_tile(device, rng, width, height):
+    cloud, camera = make_cloud(rng, 40), around(width, height)
+    values = rng.uniform(0, 1, (40, 1)).astype(np.float32)
+    got = sums(rasterize_values(cloud, camera, values, device=device))
+    expected = reference.rasterize(cloud, camera, values)
+    assert got[0].shape == (height, width)
+    for actual, wanted, magnitude in zip(got, expected, (1.0, 4.0, 1.0), strict=True):
+        np.testing.assert_allclose(actual, wanted, atol=WEIGHT_ROUNDING * magnitude)
+
+
+def test_order_of_the_gaussians_does_not_matter(device, rng):
+    cloud, values = make_cloud(rng, 300), rng.uniform(0, 1, (300, 3)).astype(np.float32)
+    shuffled = rng.permutation(300)
+    first = rasterize_values(cloud, around(), values, device=device)
+    second = rasterize_values(cloud.select(shuffled), around(), values[shuffled], device=device)
+    np.testing.assert_array_equal(first.gaussian_ids, shuffled[second.gaussian_ids])
+    for a, b in zip(sums(first), sums(second), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_same_bits_every_run_thread_count_and_band(device, rng, monkeypatch):
+    cloud, values = make_cloud(rng, 500), rng.uniform(0, 1, (500, 3)).astype(np.float32)
+    camera = around(100, 60)
+    first = rasterize_values(cloud, camera, values, device=device)
+    for setting in ("1", "2", "7"):
+        monkeypatch.setenv("BEAM_WARP_THREADS", setting)
+        for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
+            np.testing.assert_array_equal(a, b)
+    for limit in (1, 2000):
+        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+        for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
+def test_flat_gaussian_has_the_exact_depth_of_its_plane(device, tilt):
+    camera = front(64, 64)
+    half = 0.5 * tilt
+    cloud = GaussianCloud(
+        positions=[[0.05, 0.1, -0.02]],
+        orientations=[[np.sin(half), 0.0, 0.0, np.cos(half)]],
+        scales=[[0.2, 0.0, 0.2]],  # a disc with normal y, then tilted about x
+        opacities=[1.0],
+    )
+    buffer = rasterize(cloud, camera, channels=(), device=device)
+    normal = np.array([0.0, np.cos(tilt), np.sin(tilt)])
+    rays = camera.directions()
+    distance = ((cloud.positions[0] - camera.position) @ normal) / (rays @ normal)
+    depth = distance * (rays @ camera.forward)
+    covered = (buffer.alpha > 0) & (np.abs(depth - 2.1) < 3 * 0.2)
+    assert covered.sum() > 100
+    np.testing.assert_allclose(buffer.depth[covered], depth[covered], rtol=DEPTH_ROUNDING)
+
+
+def test_opaque_plane_has_its_exact_depth_everywhere(device, rng):
+    x, z = rng.uniform(-1.5, 1.5, (2, 3000))
+    cloud = GaussianCloud(
+        positions=np.stack([x, 0.3 * x, z], axis=-1),
+        orientations=np.tile([0.0, 0.0, np.sin(0.5 * np.arctan(0.3)), np.cos(0.5 * np.arctan(0.3))], (3000, 1)),
+        scales=np.tile([0.06, 1e-4, 0.06], (3000, 1)),
+        opacities=np.full(3000, 0.9),
+    )
+    camera = front()
+    buffer = rasterize(cloud, camera, channels=(), device=device)
+    rays = camera.directions()
+    depth = 2.0 / (rays[..., 1] - 0.3 * rays[..., 0]) * rays[..., 1]
+    assert buffer.alpha.min() > 0.9
+    # Three dozen layers each contribute a rounded weight and depth.
+    np.testing.assert_allclose(buffer.depth, depth, rtol=36 * DEPTH_ROUNDING)
+
+
+def test_opacity_one_is_capped_and_two_layers_saturate(device):
+    camera = front(1, 1)
+    one = sums(rasterize_values(still([[0, 0, 0]], 1.0, 1.0), camera, [[1.0]], device=device))
+    assert one[0][0, 0] == np.float32(0.99)
+    two = sums(rasterize_values(still([[0, 0, 0], [0, 1, 0]], 1.0, 1.0), camera, [[1.0], [0.0]], device=device))
+    np.testing.assert_allclose(two[0], 0.9999, atol=WEIGHT_ROUNDING)
+    np.testing.assert_allclose(two[2], 0.99, atol=WEIGHT_ROUNDING)
+
+
+def test_a_point_is_a_splat_of_the_low_pass_and_vanishes_antialiased(device):
+    camera = front(41, 41)
+    cloud = still([[0.0, 0.0, 0.0]], 0.0, 1.0)
+    buffer = rasterize(cloud, camera, channels=(), device=device)
+    y, x = np.mgrid[-20:21, -20:21]
+    expected = np.minimum(np.exp(-(x**2 + y**2) / 0.6), 0.99)
+    expected[expected < 1 / 255] = 0.0
+    np.testing.assert_allclose(buffer.alpha, expected, atol=WEIGHT_ROUNDING)
+    np.testing.assert_allclose(buffer.depth[buffer.alpha > 0], 2.0, rtol=DEPTH_ROUNDING)
+    assert not rasterize(cloud, camera, channels=(), options=RasterOptions(antialiased=True), device=device).alpha.any()
+
+
+def test_ten_thousand_splats_on_one_tile(device, rng):
+    depth = rng.uniform(-1, 1, 10_000)
+    cloud = still(np.stack([0 * depth, depth, 0 * depth], axis=-1), 50.0, 2.0 / 255.0)
+    alpha, _, value = sums(rasterize_values(cloud, front(8, 8), np.ones((10_000, 1)), device=device))
+    # The wide splats differ from their peak by less than their extent in pixels squared over twice their variance.
+    remaining = (1 - 2 / 255) ** np.ceil(np.log(1e-4) / np.log(1 - 2 / 255))
+    np.testing.assert_allclose(alpha, 1 - remaining, atol=WEIGHT_ROUNDING)
+    np.testing.assert_array_equal(alpha, value[..., 0])
+
+
+def test_what_is_not_in_view_is_not_drawn(device, rng):
+    camera = front()
+    empty = make_cloud(rng, 0, base_color=np.zeros((0, 3)))
+    buffer = rasterize(empty, camera, channels=("base_color",), device=device)
+    assert not buffer.alpha.any()
+    assert not buffer.depth.any()
+    assert buffer.channels["base_color"].shape == (40, 40, 3)
+    for position in ([0, -3, 0], [0, -2, 0], [0, -1.995, 0], [50, 0, 0], [0, 0, -50]):
+        assert not rasterize(still([position], 0.1, 1.0), camera, channels=(), device=device).alpha.any(), position
+    assert not rasterize(still([[0, 0, 0]], 0.1, 0.003), camera, channels=(), device=device).alpha.any()
+
+
+def test_extreme_gaussians_stay_finite(device, rng):
+    positions = [[0, 0, 0], [1e30, 1e30, 1e30], [0, -1.98, 0], [0, 1e6, 0], [0.0, 0.5, 0.0], [3, -1.98, 0.0]]
+    scales = [[1e-30, 1e-30, 1e-30], [1e20, 1e20, 1e20], [5, 5, 5], [1e15, 1, 1e15], [1e4, 0, 0], [10, 1e-6, 1]]
+    cloud = still(np.asarray(positions, float), np.asarray(scales, float), 0.9)
+    for antialiased in (False, True):
+        options = RasterOptions(antialiased=antialiased)
+        for array in rasterize_values(cloud, front(), np.ones((6, 2)), device=device, options=options):
+            assert np.isfinite(array).all()
+
+
+def test_a_needle_keeps_its_width(device):
+    """A thousand pixels long and less than one wide: the determinant of its covariance cancels in single precision."""
+    camera = front(64, 64)
+    half = 0.5 * 0.7
+    cloud = GaussianCloud(
+        positions=[[0, 0, 0]],
+        orientations=[[0.0, np.sin(half), 0.0, np.cos(half)]],
+        scales=[[100.0, 1e-4, 1e-4]],
+        opacities=[0.9],
+    )
+    values = np.ones((1, 1), np.float32)
+    got, expected = rasterize_values(cloud, camera, values, device=device), reference.rasterize(cloud, camera, values)
+    np.testing.assert_allclose(got[0], expected[0], atol=WEIGHT_ROUNDING)
+
+
+def test_channels_are_means_whatever_the_coverage(device, rng):
+    count = 200
+    cloud = make_cloud(
+        rng,
+        count,
+        base_color=np.tile([0.2, 0.4, 0.8], (count, 1)),
+        roughness=np.full(count, 0.3),
+        ambient_occlusion=rng.uniform(0, 1, count),
+        normals=np.tile([0.6, 0.0, 0.8], (count, 1)),
+    )
+    buffer = rasterize(cloud, around(), device=device)
+    assert list(buffer.channels) == list(gbuffer.MATERIAL_CHANNELS)
+    covered = buffer.alpha > 0
+    for name, expected in (("base_color", [0.2, 0.4, 0.8]), ("roughness", 0.3), ("normals", [0.6, 0.0, 0.8])):
+        np.testing.assert_allclose(buffer.channels[name][covered] - expected, 0.0, atol=WEIGHT_ROUNDING)
+        assert not buffer.channels[name][~covered].any()
+    assert buffer.channels["roughness"].shape == (40, 40)
+    layers = buffer.layers()
+    assert sorted(layers) == sorted(
+        [
+            "A",
+            "depth",
+            "roughness",
+            "ambient_occlusion",
+            "base_color.R",
+            "base_color.G",
+            "base_color.B",
+            "normal.X",
+            "normal.Y",
+            "normal.Z",
+        ]
+    )
+    np.testing.assert_array_equal(layers["normal.Z"], buffer.channels["normals"][..., 2])
+    occlusion = buffer.channels["ambient_occlusion"][covered]
+    assert occlusion.min() >= 0.0
+    assert occlusion.max() <= 1.0
+
+
+def test_more_channels_than_one_pass(device, rng):
+    cloud, values = make_cloud(rng, 50), rng.uniform(0, 1, (50, 37)).astype(np.float32)
+    together = rasterize_values(cloud, around(), values, device=device).values
+    for start in (0, 16, 36):
+        alone = rasterize_values(cloud, around(), values[:, start : start + 1], device=device).values
+        np.testing.assert_array_equal(together[..., start], alone[..., 0])
+
+
+def test_radiance_is_seen_from_the_camera(device, rng):
+    camera = around()
+    radiance = rng.normal(0, 0.3, (1, 16, 3))
+    cloud = still([[0.1, 0.0, 0.1]], 0.2, 0.9, radiance=radiance, radiance_color_space="srgb_rec709_display")
+    direction = cloud.positions - camera.position
+    expected = sh_color(radiance, direction / np.linalg.norm(direction))[0]
+    buffer = rasterize(cloud, camera, channels=("radiance",), device=device)
+    np.testing.assert_allclose(buffer.channels["radiance"][20, 20], expected, atol=WEIGHT_ROUNDING)
+
+
+def test_errors_name_the_contract(rng):
+    cloud = make_cloud(rng, 3)
+    with pytest.raises(InvalidArrayError, match="cloud holds, got 'base_color', which it lacks"):
+        rasterize(cloud, front())
+    with pytest.raises(
+        InvalidOptionError, match=r"channels must be one of radiance, surface_normals, base_color, .* got 'colour'"
+    ):
+        rasterize(cloud, front(), channels=("colour",))
+    with pytest.raises(InvalidOptionError, match="cloud must be in the axes 'rfu', got 'rub'"):
+        rasterize(cloud.with_arrays(axes="rub"), front(), channels=())
+    with pytest.raises(DeviceError, match=r"device must be one of cpu.* got 'cuda:77'"):
+        rasterize(cloud, front(), channels=(), device="cuda:77")
+    with pytest.raises(InvalidArrayError, match="values must have as many rows as positions"):
+        rasterize_values(cloud, front(), np.zeros((2, 1)))
+
+
+def test_a_row_of_tiles_that_cannot_be_listed_is_refused(rng, monkeypatch):
+    monkeypatch.setattr(rasterizer, "MAX_ROW_PAIRS", 10)
+    with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 10 times, got"):
+        rasterize(make_cloud(rng, 300), front(), channels=(), device="cpu")

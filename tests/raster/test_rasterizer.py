@@ -1,0 +1,613 @@
+"""The rasteriser on a device: every number of channels, its gradients, and what it keeps from frame to frame."""
+
+import numpy as np
+import pytest
+import warp as wp
+from reference.raster_differences import gradients, random_upstream
+from reference.raster_splats import RasterScene
+from reference.rasterizing import decide, replay
+
+from beam_warp import Camera, GaussianCloud, Scene, rasterize, rasterize_backward
+from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.raster import rasterizer
+from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.world.harmonics import sh_color
+
+GRADIENT_ERROR = 1e-5
+"""Relative L2 of every gradient against float64 frozen-decision differences."""
+
+DEPTH_ERROR = 1e-4
+"""Relative, against the largest response along the ray."""
+
+
+def around(width=40, height=36, azimuth=20.0):
+    return Camera.orbit((0, 0, 0), 2.5, azimuth, 10.0, width=width, height=height, vertical_fov=50.0)
+
+
+def cloud(rng, count=200, **more):
+    orientations = rng.normal(size=(count, 4))
+    return GaussianCloud(
+        positions=rng.uniform(-1, 1, (count, 3)),
+        orientations=orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
+        scales=np.exp(rng.normal(-2.5, 0.6, (count, 3))),
+        opacities=rng.uniform(0.05, 0.95, count),
+        **more,
+    )
+
+
+def reference_scene(made, camera, **more):
+    """The same in float64."""
+    return RasterScene(made.positions, made.orientations, made.scales, made.opacities, camera, **more)
+
+
+def set_upstream(drawer, upstream, radiance=False):
+    """Write the oracle's upstream derivatives where the rasteriser reads them; their channels are in its order."""
+    adjoints = drawer.adjoints()
+    for name in ("alpha", "depth", "median_depth"):
+        getattr(adjoints, name).assign(getattr(upstream, name).astype(np.float32).ravel())
+    columns = np.zeros((len(drawer.images.alpha), 16 * len(adjoints.channels)), np.float32)
+    shown = drawer.color_channels if radiance else drawer.value_channels
+    columns[:, list(shown)] = upstream.channels.reshape(len(columns), -1)
+    if drawer.normal_channels:
+        columns[:, list(drawer.normal_channels)] = upstream.normals.reshape(len(columns), -1)
+    for i, rows in enumerate(adjoints.channels):
+        rows.assign(np.ascontiguousarray(columns[:, 16 * i : 16 * i + rows.shape[1]]))
+
+
+@pytest.mark.parametrize("options", [RasterOptions(), RasterOptions(antialiased=True), RasterOptions(depth="exact")])
+@pytest.mark.parametrize("count", [1, 3, 5, 9, 13, 17, 35])
+def test_gradients_of_any_number_of_channels(device, rng, count, options):
+    made, camera = cloud(rng, 60), around(33, 25)
+    values = rng.uniform(0, 1, (60, count)).astype(np.float32)
+    scene = reference_scene(made, camera, values=values, antialiased=options.antialiased, depth_mode=options.depth)
+    decisions = decide(scene)
+    upstream = random_upstream(rng, scene, decisions)
+    wanted, image = gradients(scene, upstream, decisions), replay(scene, decisions)
+    drawer = Rasterizer(60, [camera], value_count=count, normals=True, options=options, device=device)
+    images = drawer.draw(upload_gaussians(made, drawer.device, values=values))
+    assert sum(rows.shape[1] for rows in images.channels) >= count + 3
+    clear = ~decisions.near_jump.ravel()
+    assert clear.mean() > 0.95
+    np.testing.assert_allclose(images.alpha.numpy()[clear], image.alpha.ravel()[clear], atol=1e-5)
+    for name in ("depth", "median_depth"):
+        got, want = getattr(images, name).numpy()[clear], getattr(image, name).ravel()[clear]
+        np.testing.assert_allclose(got, want, rtol=DEPTH_ERROR)
+    set_upstream(drawer, upstream)
+    found = drawer.backward()
+    for name, array in wanted.items():
+        error = np.linalg.norm(getattr(found, name).numpy() - array) / np.linalg.norm(array)
+        assert error <= GRADIENT_ERROR, name
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_gradients_of_captured_colour(device, rng, bands):
+    """To the coefficients, and to positions through the direction."""
+    radiance = rng.normal(0.0, 0.4, (50, bands, 3)).astype(np.float32)
+    made, camera = cloud(rng, 50), around(31, 27)
+    scene = reference_scene(made, camera, radiance=radiance)
+    decisions = decide(scene)
+    upstream = random_upstream(rng, scene, decisions)
+    wanted = gradients(scene, upstream, decisions)
+    drawer = Rasterizer(50, [camera], radiance=True, normals=True, device=device)
+    drawer.draw(upload_gaussians(made, drawer.device, radiance=radiance))
+    set_upstream(drawer, upstream, radiance=True)
+    found = drawer.backward()
+    assert found.values is None
+    for name, array in wanted.items():
+        error = np.linalg.norm(getattr(found, name).numpy() - array) / np.linalg.norm(array)
+        assert error <= GRADIENT_ERROR, name
+
+
+def test_every_draw_may_have_another_number_of_coefficients(device, rng):
+    """The way back makes room for what was drawn last, more or fewer."""
+    made = cloud(rng)
+    drawer = Rasterizer(200, [around()], radiance=True, device=device)
+    for coefficients in (4, 9, 1, 25, 4):
+        fresh = Rasterizer(200, [around()], radiance=True, device=device)
+        radiance = rng.normal(0, 0.5, (200, coefficients, 3)).astype(np.float32)
+        found = []
+        for one in (drawer, fresh):
+            one.draw(upload_gaussians(made, one.device, radiance=radiance))
+            filled(np.random.default_rng(1), one)
+            gradients_found = one.backward()
+            found.append([gradients_found.positions.numpy(), gradients_found.radiance.numpy()])
+        assert found[0][1].shape == radiance.shape
+        assert np.abs(found[0][1]).max() > 0
+        for kept, new in zip(*found, strict=True):
+            np.testing.assert_array_equal(kept, new)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_one_pixel_and_both_ways_twice(device, rng, count):
+    """No Gaussian is no special case: arrays without rows, images without anything; the way back repeats its bits."""
+    made = cloud(rng, count)
+    cameras = [around(), around(1, 1, 90.0)]
+    drawer = Rasterizer(count, cameras, value_count=2, radiance=True, normals=True, device=device)
+    radiance, values = rng.normal(size=(count, 4, 3)).astype(np.float32), np.ones((count, 2), np.float32)
+    filled(np.random.default_rng(1), drawer)  # before anything is drawn
+    drawer.draw(upload_gaussians(made, drawer.device, values=values, radiance=radiance))
+    assert drawer.first_pixels == (0, 40 * 36, 40 * 36 + 1)
+    first = state(drawer)
+    assert bool(drawer.images.alpha.numpy().any()) == bool(drawer.pair_count()) == (count > 0)
+    drawer.redraw()
+    for one, other in zip(first, state(drawer), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert drawer.backward().radiance.shape == (count, 4)
+
+
+def test_arrays_may_be_strided(device, rng):
+    """Every second row, some columns: the same bits as of compact copies."""
+    made = cloud(rng)
+    wide = rng.uniform(0, 1, (200, 8)).astype(np.float32)
+    drawer = Rasterizer(200, [around()], value_count=3, device=device)
+    compact = upload_gaussians(made, drawer.device, values=np.ascontiguousarray(wide[:, 2:5]))
+    strided = compact._replace(
+        positions=upload(np.repeat(made.positions, 2, axis=0), wp.vec3, drawer.device)[::2],
+        values=upload(wide, float, drawer.device)[:, 2:5],
+    )
+    assert not strided.positions.is_contiguous
+    assert not strided.values.is_contiguous
+    filled(rng, drawer)
+    found = []
+    for arrays in (compact, strided):
+        drawer.draw(arrays)
+        found.append(state(drawer))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_frame_that_is_refused_cannot_be_drawn_again(rng, monkeypatch):
+    drawer = Rasterizer(200, [around()], device="cpu")
+    arrays = upload_gaussians(cloud(rng), drawer.device)
+    drawer.draw(arrays)
+    with monkeypatch.context() as limits:
+        limits.setattr(rasterizer, "MAX_ROW_PAIRS", 1)
+        limits.setattr(rasterizer, "MAX_BAND_PAIRS", 1)
+        with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 1 times, got"):
+            drawer.draw(arrays)
+    for call in (drawer.redraw, drawer.redraw_values, drawer.backward):
+        with pytest.raises(InvalidOptionError, match="must follow draw"):
+            call()
+    drawer.draw(arrays)
+    drawer.redraw()
+
+
+def state(drawer):
+    """Everything drawn and every gradient of it, on the host."""
+    found = drawer.backward()
+    arrays = [*drawer.images.channels, drawer.images.alpha, drawer.images.depth, drawer.images.median_depth]
+    arrays += [drawer.gaussian_ids, found.positions, found.orientations, found.scales, found.opacities, found.values]
+    return [array.numpy().copy() for array in arrays]
+
+
+def filled(rng, drawer):
+    """Set random derivatives."""
+    adjoints = drawer.adjoints()
+    for array in (*adjoints.channels, adjoints.alpha, adjoints.depth, adjoints.median_depth):
+        array.assign(rng.normal(size=array.shape).astype(np.float32))
+
+
+@pytest.mark.parametrize("options", [RasterOptions(), RasterOptions(depth="exact")])
+@pytest.mark.parametrize(("width", "height"), [(40, 36), (16, 16), (17, 15), (129, 3), (1, 1)])
+def test_readable_and_fast_composites_give_the_same_bits(device, rng, options, width, height):
+    made = cloud(rng, 400)
+    values = rng.uniform(0, 1, (400, 7)).astype(np.float32)
+    found = []
+    for readable in (True, False):
+        drawer = Rasterizer(
+            400, [around(width, height)], value_count=7, options=options, device=device, readable=readable
+        )
+        drawer.draw(upload_gaussians(made, drawer.device, values=values))
+        images = drawer.images
+        arrays = [*images.channels, images.alpha, images.depth, images.median_depth, drawer.gaussian_ids]
+        found.append([array.numpy() for array in arrays])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_bands_change_no_image_and_hardly_a_gradient(device, rng, monkeypatch):
+    """Sums over a splat's pairs are cut at the bands, so gradients differ by roundings of them."""
+    made, values = cloud(rng), rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    cameras = [around(50, 70), around(20, 40, 80.0)]
+    found = []
+    for limit in (2**24, 300):
+        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+        drawer = Rasterizer(200, cameras, value_count=3, device=device)
+        drawer.draw(upload_gaussians(made, drawer.device, values=values))
+        filled(np.random.default_rng(1), drawer)
+        found.append(state(drawer))
+        assert (len(drawer._bands) > 2) == (limit == 300)
+    for one, other in zip(found[0][:5], found[1][:5], strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(found[0][5:], found[1][5:], strict=True):
+        assert np.linalg.norm(one - other) <= 1e-6 * np.linalg.norm(one)
+
+
+def test_redraw_follows_contents_and_cameras(device, rng):
+    made, moved = cloud(rng), cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    drawer = Rasterizer(200, [around()], value_count=3, device=device)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    drawer.draw(arrays)
+    room = drawer.pair_capacity
+    for name in ("positions", "orientations", "scales", "opacities"):
+        getattr(arrays, name).assign(getattr(moved, name))
+    drawer.set_cameras([around(azimuth=110.0)])
+    drawer.redraw()
+    assert drawer.pair_capacity == room
+    assert drawer.pair_count() <= room
+    filled(np.random.default_rng(1), drawer)
+    fresh = Rasterizer(200, [around(azimuth=110.0)], value_count=3, device=device)
+    fresh.draw(upload_gaussians(moved, fresh.device, values=values))
+    filled(np.random.default_rng(1), fresh)
+    for one, other in zip(state(drawer), state(fresh), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("limit", [2**24, 300])
+def test_values_are_redrawn_alone(device, rng, monkeypatch, limit):
+    """The bits of a frame drawn anew, and the gradients of what is shown now; also where there are bands."""
+    monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+    made = cloud(rng)
+    values, others = rng.uniform(0, 1, (2, 200, 3)).astype(np.float32)
+    cameras = [around(50, 40), around(20, 40, 80.0)]
+    drawer = Rasterizer(200, cameras, value_count=3, normals=True, device=device)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    drawer.draw(arrays)
+    arrays.values.assign(others)
+    drawer.redraw_values()
+    filled(np.random.default_rng(1), drawer)
+    fresh = Rasterizer(200, cameras, value_count=3, normals=True, device=device)
+    fresh.draw(upload_gaussians(made, fresh.device, values=others))
+    filled(np.random.default_rng(1), fresh)
+    for one, other in zip(state(drawer), state(fresh), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_prepared_cameras_are_the_cameras(device, rng):
+    """One view after the other with cameras that were brought before: the bits of rasterisers of their own."""
+    made = cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    cameras = [around(), around(azimuth=110.0), around(azimuth=200.0)]
+    drawer = Rasterizer(200, cameras[:1], value_count=3, device=device)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    prepared = [drawer.prepare_cameras([camera]) for camera in cameras]
+    for camera, brought in [*zip(cameras, prepared, strict=True), (cameras[0], prepared[0])]:
+        drawer.set_cameras(brought)
+        assert drawer.cameras == (camera,)
+        drawer.draw(arrays)
+        filled(np.random.default_rng(1), drawer)
+        fresh = Rasterizer(200, [camera], value_count=3, device=device)
+        fresh.draw(upload_gaussians(made, fresh.device, values=values))
+        filled(np.random.default_rng(1), fresh)
+        for one, other in zip(state(drawer), state(fresh), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_rasterisers_share_their_images(device, rng):
+    """Two that draw into one's images, by turns: the bits of rasterisers of their own, back-projected ones too."""
+    made = cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    pixels = rng.uniform(0, 1, (50 * 40 + 7 * 33, 4)).astype(np.float32)
+    views = [[around(50, 40), around(7, 33)], [around(40, 36, 80.0)], [around(1, 1, 150.0)]]
+    owner = Rasterizer(200, views[0], value_count=3, device=device)
+    arrays = upload_gaussians(made, owner.device, values=values)
+    drawers = [owner, *(Rasterizer(200, v, value_count=3, device=device, images_of=owner) for v in views[1:])]
+    fresh = [Rasterizer(200, v, value_count=3, device=device) for v in views]
+    for drawer in (*drawers, *fresh):
+        drawer.draw(arrays)
+    for drawer, alone in zip(drawers, fresh, strict=True):
+        count = drawer.first_pixels[-1]
+        held = upload(pixels[:count], float, drawer.device)
+        sums = []
+        for one in (drawer, alone):
+            one.redraw_values()
+            room = wp.zeros((200 * len(one.cameras), 4), dtype=float, device=one.device)
+            one.back_project(held, room)
+            sums.append(room.numpy())
+        np.testing.assert_array_equal(*sums)
+        for one, other in zip(images(drawer), images(alone), strict=True):
+            assert len(one) == count
+            np.testing.assert_array_equal(one, other)
+    assert owner.images.alpha.ptr == drawers[1].images.alpha.ptr
+    for other in ({"cameras": [around(60, 50)], "value_count": 3}, {"cameras": views[1], "value_count": 5}):
+        with pytest.raises(InvalidOptionError, match="images_of must have at least"):
+            Rasterizer(200, **other, device=device, images_of=owner)
+
+
+def images(drawer):
+    """What was drawn, as NumPy."""
+    found = drawer.images
+    arrays = [*found.channels, found.alpha, found.depth, found.median_depth, drawer.gaussian_ids]
+    return [array.numpy() for array in arrays]
+
+
+def test_prepared_cameras_of_other_sizes_are_refused(device, rng):
+    drawer, other = Rasterizer(1, [around(33, 17)], device=device), Rasterizer(1, [around(17, 33)], device=device)
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.prepare_cameras([around(17, 33)])
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.prepare_cameras([around(33, 17)] * 2)
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.set_cameras(other.prepare_cameras([around(17, 33)]))
+    assert drawer.cameras[0].width == 33
+
+
+def test_redraw_without_room_says_so_and_draw_makes_it(device, rng):
+    """Few splats first, then ten times as many pairs; nothing crashes in between."""
+    small = cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    drawer = Rasterizer(200, [around(100, 90)], value_count=3, device=device)
+    arrays = upload_gaussians(small.with_arrays(scales=0.02 * small.scales), drawer.device, values=values)
+    drawer.draw(arrays)
+    filled(np.random.default_rng(1), drawer)
+    kept = drawer.adjoints()
+    arrays.scales.assign(small.scales)
+    drawer.redraw()
+    assert drawer.pair_count() > drawer.pair_capacity
+    assert all(np.isfinite(array).all() for array in state(drawer))
+    drawer.draw(arrays)
+    assert drawer.pair_count() <= drawer.pair_capacity
+    assert drawer.adjoints() is kept
+    fresh = Rasterizer(200, [around(100, 90)], value_count=3, device=device)
+    fresh.draw(upload_gaussians(small, fresh.device, values=values))
+    filled(np.random.default_rng(1), fresh)
+    for one, other in zip(state(drawer), state(fresh), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_frame_and_its_gradients_are_one_graph(rng):
+    if not wp.is_cuda_available():
+        pytest.skip("needs a CUDA device")
+    made, moved = cloud(rng), cloud(rng)
+    values = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    drawer = Rasterizer(200, [around()], value_count=3, device="cuda:0")
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    drawer.draw(arrays)
+    filled(np.random.default_rng(1), drawer)
+    drawer.backward()
+    with wp.ScopedCapture(drawer.device) as capture:
+        drawer.redraw()
+        found = drawer.backward()
+    arrays.positions.assign(moved.positions)
+    drawer.set_cameras([around(azimuth=200.0)])
+    wp.capture_launch(capture.graph)
+    got = [drawer.images.alpha.numpy(), found.positions.numpy(), found.values.numpy()]
+    drawer.draw(arrays)
+    found = drawer.backward()
+    for one, other in zip(got, [drawer.images.alpha, found.positions, found.values], strict=True):
+        np.testing.assert_array_equal(one, other.numpy())
+
+
+def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
+    """The same whether they are drawn together or one at a time."""
+    made = cloud(rng, base_color=rng.uniform(0, 1, (200, 3)))
+    cameras = [around(10, 20), around(33, 5, 70.0), around(16, 16, 140.0)]
+    together = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
+    monkeypatch.setattr("beam_warp.raster.gbuffer.GROUP_PIXELS", 1)
+    apart = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
+    assert rasterize(made, [], channels=(), device=device) == []
+    for camera, one, other in zip(cameras, together, apart, strict=True):
+        assert one.camera is camera
+        assert one.alpha.shape == (camera.height, camera.width)
+        for name in ("alpha", "depth", "median_depth", "gaussian_ids"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        for name in one.channels:
+            np.testing.assert_array_equal(one.channels[name], other.channels[name])
+
+
+def test_surface_normals_of_a_disc_face_the_camera(device):
+    """A disc with normal (0, cos t, sin t), seen from -y."""
+    camera = Camera.orbit((0, 0, 0), 2.0, 0.0, 0.0, width=20, height=20, vertical_fov=40.0)
+    for tilt in (-0.5, 0.0, 0.8):
+        disc = GaussianCloud(
+            positions=[[0, 0, 0]],
+            orientations=[[np.sin(0.5 * tilt), 0, 0, np.cos(0.5 * tilt)]],
+            scales=[[0.3, 0.0, 0.3]],
+            opacities=[0.9],
+        )
+        buffer = rasterize(disc, camera, channels=("surface_normals",), device=device)
+        seen = buffer.channels["surface_normals"][buffer.alpha > 0]
+        assert len(seen) > 50
+        np.testing.assert_allclose(seen, np.tile([0, -np.cos(tilt), -np.sin(tilt)], (len(seen), 1)), atol=1e-6)
+
+
+def test_exact_depth_is_where_the_response_is_largest(device, rng):
+    """A thick Gaussian alone in the image, against a search along every ray in float64."""
+    made = GaussianCloud(
+        positions=[[0.1, 0.2, -0.1]],
+        orientations=[[0.2, 0.4, 0.1, 0.88]] / np.linalg.norm([0.2, 0.4, 0.1, 0.88]),
+        scales=[[0.35, 0.12, 0.2]],
+        opacities=[0.9],
+    )
+    camera = around(30, 30)
+    buffer = rasterize(made, camera, channels=(), options=RasterOptions(depth="exact"), device=device)
+    x, y, z, w = made.orientations[0].astype(np.float64)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    whiten = np.diag(1.0 / made.scales[0].astype(np.float64)) @ rotation.T
+    o = whiten @ (camera.position - made.positions[0].astype(np.float64))
+    d = camera.directions() @ whiten.T
+    low, high = np.zeros(d.shape[:2]), np.full(d.shape[:2], 6.0)
+    for _ in range(200):  # golden sections: the squared distance is convex
+        a, b = low + 0.382 * (high - low), low + 0.618 * (high - low)
+        nearer = ((o + a[..., None] * d) ** 2).sum(-1) < ((o + b[..., None] * d) ** 2).sum(-1)
+        low, high = np.where(nearer, low, a), np.where(nearer, b, high)
+    depth = 0.5 * (low + high) * (camera.directions() @ camera.forward)
+    covered = buffer.alpha > 0
+    assert covered.sum() > 200
+    np.testing.assert_allclose(buffer.depth[covered], depth[covered], rtol=DEPTH_ERROR)
+    np.testing.assert_allclose(buffer.median_depth[covered], depth[covered], rtol=DEPTH_ERROR)
+    plane = rasterize(made, camera, channels=(), device=device).depth
+    assert np.abs(plane - depth)[covered].max() > 0.05  # what the mode is for
+
+
+def test_a_scene_is_drawn_where_it_is(device, rng):
+    normals = rng.normal(size=(200, 3))
+    made = cloud(rng, normals=normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    scene, moved = Scene.from_gaussians(made, device), cloud(rng)
+    for source in (made, made.with_arrays(**{k: getattr(moved, k) for k in ("positions", "orientations", "scales")})):
+        want = rasterize(source, around(), channels=("normals", "surface_normals"), device=device)
+        got = rasterize(scene, around(), channels=("normals", "surface_normals"))
+        np.testing.assert_array_equal(got.alpha, want.alpha)
+        np.testing.assert_array_equal(got.depth, want.depth)
+        for name in want.channels:
+            np.testing.assert_array_equal(got.channels[name], want.channels[name])
+        scene.move(moved.positions, moved.orientations, moved.scales)
+    with pytest.raises(InvalidArrayError, match="channels of a scene must be of surface_normals"):
+        rasterize(scene, around(), channels=("base_color",))
+    empty = rasterize(Scene.from_gaussians(cloud(rng, 0), device), around(), channels=("surface_normals",))
+    assert not empty.alpha.any()
+
+
+def loss_of(made, cameras, adjoints, channels, device):
+    """The loss whose derivatives to the buffers are the adjoints, in float64."""
+    total = 0.0
+    for buffer, given in zip(rasterize(made, cameras, channels=channels, device=device), adjoints, strict=True):
+        for name, array in given.items():
+            image = buffer.channels[name] if name in buffer.channels else getattr(buffer, name)
+            total += float((image.astype(np.float64) * array).sum())
+    return total
+
+
+def test_backward_of_means_and_unit_normals(device, rng):
+    """Channels are linear in what they average, so that differences of any size are exact but for roundings."""
+    channels = ("base_color", "roughness", "radiance")
+    made = cloud(
+        rng,
+        base_color=rng.uniform(0.2, 0.8, (200, 3)),
+        roughness=rng.uniform(0.2, 0.8, 200),
+        radiance=rng.normal(0, 0.05, (200, 4, 3)),
+        radiance_color_space="srgb_rec709_display",
+    )
+    cameras = [around(), around(30, 20, 120.0)]
+    adjoints = [
+        {
+            "base_color": rng.normal(size=(c.height, c.width, 3)),
+            "roughness": rng.normal(size=(c.height, c.width)),
+            "radiance": rng.normal(size=(c.height, c.width, 3)),
+        }
+        for c in cameras
+    ]
+    found = rasterize_backward(made, cameras, adjoints, channels=channels, device=device)
+    for name, step in (("base_color", 0.1), ("roughness", 0.1), ("radiance", 0.05)):
+        way = rng.uniform(-1, 1, getattr(made, name).shape)
+        ahead, behind = (made.with_arrays(**{name: getattr(made, name) + s * step * way}) for s in (1, -1))
+        difference = loss_of(ahead, cameras, adjoints, channels, device)
+        difference = (difference - loss_of(behind, cameras, adjoints, channels, device)) / (2 * step)
+        slope = float((found.channels[name].astype(np.float64) * way).sum())
+        # Sums of some 2,000 products, rounded to 6e-8 of at most about 3 each, over the step.
+        assert abs(slope - difference) <= 2000 * 3 * 6e-8 / step + 1e-5 * abs(difference), name
+    assert found.positions.shape == (200, 3)
+
+
+def test_backward_of_a_mean_knows_that_it_is_one(device, rng):
+    """Where all Gaussians have one value the mean is that value, whatever the geometry."""
+    made = cloud(rng, roughness=np.full(200, 0.4))
+    adjoint = rng.normal(size=(36, 40))
+    found = rasterize_backward(made, around(), {"roughness": adjoint}, channels=("roughness",), device=device)
+    scale = np.abs(found.channels["roughness"]).max()
+    assert scale > 0.1
+    for name in ("positions", "scales", "opacities", "orientations"):
+        assert np.abs(getattr(found, name)).max() <= 1e-3 * scale, name
+    depth = rasterize_backward(made, around(), {"depth": adjoint}, channels=("roughness",), device=device)
+    assert np.abs(depth.positions).max() > 0.1
+    assert not depth.channels["roughness"].any()
+
+
+def test_backward_of_surface_normals(device, rng):
+    """Turning all of the world turns normals: the derivative along a turn is in closed form."""
+    made, camera = cloud(rng, 1), around(60, 60)
+    made = made.with_arrays(positions=[[0.0, 0.0, 0.0]], scales=[[0.4, 0.3, 1e-3]], opacities=[0.9])
+    buffer = rasterize(made, camera, channels=("surface_normals",), device=device)
+    seen = buffer.alpha > 0
+    adjoint = np.where(seen[..., None], rng.normal(size=(60, 60, 3)), 0.0)
+    found = rasterize_backward(made, camera, {"surface_normals": adjoint}, channels=("surface_normals",), device=device)
+    normal = buffer.channels["surface_normals"][seen][0]
+    axis = rng.normal(size=3)
+    # q' = (axis, 0) q / 2 turns the disc at one radian a second, and its normal with it.
+    v, w = made.orientations[0, :3].astype(np.float64), float(made.orientations[0, 3])
+    rate = 0.5 * np.array([*(np.cross(axis, v) + w * axis), -axis @ v])
+    wanted = adjoint.sum(axis=(0, 1)) @ np.cross(axis, normal)
+    np.testing.assert_allclose(found.orientations[0] @ rate, wanted, rtol=1e-3)
+
+
+def test_errors_name_the_contract(rng):
+    made = cloud(rng, roughness=np.full(200, 0.5))
+    with pytest.raises(InvalidOptionError, match="cameras must hold at least one camera"):
+        Rasterizer(3, [], device="cpu")
+    for count in (-1, 2.5, rasterizer.MAX_SPLATS // 2 + 1):
+        with pytest.raises(InvalidOptionError, match="gaussian_count must be an integer in"):
+            Rasterizer(count, [around()] * 2, device="cpu")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidOptionError, match="value_count must be an integer in"):
+        Rasterizer(3, [around()], value_count=-1, device="cpu")
+    with pytest.raises(InvalidOptionError, match="cameras must be a sequence of cameras, got Camera"):
+        Rasterizer(3, around(), device="cpu")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidOptionError, match="cameras must hold cameras, got int at place 1"):
+        rasterize(made, [around(), 7], channels=(), device="cpu")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidOptionError, match="low_pass must"):
+        RasterOptions(low_pass=float("nan"))
+    with pytest.raises(InvalidOptionError, match="depth must be one of plane, exact"):
+        RasterOptions(depth="median")  # pyright: ignore[reportArgumentType]
+    drawer = Rasterizer(200, [around()], value_count=2, device="cpu")
+    for call in (drawer.redraw, drawer.redraw_values, drawer.backward):
+        with pytest.raises(InvalidOptionError, match="must follow draw, got no draw before it"):
+            call()
+    arrays = upload_gaussians(made, drawer.device, values=np.zeros((200, 2), np.float32))
+    with pytest.raises(InvalidArrayError, match=r"values must be a warp array of float32, 200 x 2, on cpu, got none"):
+        drawer.draw(arrays._replace(values=None))
+    with pytest.raises(
+        InvalidArrayError, match=r"positions must be a warp array of vec3f?, 200, on cpu, got vec3f? \(3"
+    ):
+        drawer.draw(arrays._replace(positions=wp.zeros(3, dtype=wp.vec3, device="cpu")))
+    with pytest.raises(InvalidArrayError, match="positions must be a warp array of vec3f, 200, on cpu, got ndarray"):
+        drawer.draw(arrays._replace(positions=made.positions))  # pyright: ignore[reportArgumentType]
+    colored = Rasterizer(200, [around()], radiance=True, device="cpu")
+    for coefficients in (0, 3, 36):  # kernels read as many as the next degree has
+        radiance = np.zeros((200, coefficients, 3), np.float32)
+        with pytest.raises(InvalidArrayError, match="radiance must be a warp array of vec3f, 200 x 1 or 4 or 9 or 16"):
+            colored.draw(upload_gaussians(made, colored.device, radiance=radiance))
+    with pytest.raises(InvalidOptionError, match="cameras must have the sizes"):
+        drawer.set_cameras([around(41)])
+    with pytest.raises(InvalidOptionError, match="adjoints must be one of alpha, depth, median_depth, roughness"):
+        rasterize_backward(made, around(), {"rough": 0.0}, channels=("roughness",), device="cpu")
+    with pytest.raises(InvalidOptionError, match="adjoints must hold one mapping for each of 2 cameras, got 1"):
+        rasterize_backward(made, [around()] * 2, [{}], channels=("roughness",), device="cpu")
+    with pytest.raises(InvalidArrayError, match="roughness must"):
+        rasterize_backward(made, around(), {"roughness": np.zeros((3, 3))}, channels=("roughness",), device="cpu")
+
+
+def test_colour_towards_a_camera_that_is_in_a_gaussian(device):
+    """No direction, no NaN: it is not drawn."""
+    made = GaussianCloud(
+        positions=[around().position],
+        orientations=[[0, 0, 0, 1]],
+        scales=[[0.1] * 3],
+        opacities=[0.9],
+        radiance=np.ones((1, 4, 3)),
+        radiance_color_space="srgb_rec709_display",
+    )
+    buffer = rasterize(made, around(), channels=("radiance",), device=device)
+    assert not buffer.alpha.any()
+    assert np.isfinite(buffer.channels["radiance"]).all()
+    assert np.isfinite(sh_color(made.radiance, np.zeros((1, 3)))).all()
+
+
+def test_arrays_are_read_where_they_are(device, rng):
+    """Nothing is copied: a value changed in place is the next frame's."""
+    made = cloud(rng, 1).with_arrays(positions=[[0.0, 0.0, 0.0]], opacities=[0.9])
+    drawer = Rasterizer(1, [around()], value_count=1, device=device)
+    values = upload(np.ones((1, 1), np.float32), float, drawer.device)
+    first = upload_gaussians(made, drawer.device)
+    arrays = GaussianArrays(first.positions, first.orientations, first.scales, first.opacities, values)
+    one = drawer.draw(arrays).channels[0].numpy().copy()
+    values.fill_(2.0)
+    np.testing.assert_array_equal(drawer.redraw().channels[0].numpy(), 2.0 * one)

@@ -1,0 +1,124 @@
+"""Drift: nothing for what moves with the surface, the slip for what slips, whatever the order of the rows."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from beam_warp.errors import InvalidArrayError
+from beam_warp.reconstruction.drift import tracking_drift
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+FLOAT32_STEP = 2.0**-23
+
+ROUNDING_MM = 1e3 * 20.0 * FLOAT32_STEP * 2.0
+"""Some twenty roundings of float32 coordinates and quaternions of at most 2 m."""
+
+SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+
+
+def cloud(positions, turn=None, ids=None, **changes):
+    count = len(positions)
+    quaternion = (turn or Rotation.identity()).as_quat()
+    fields = {
+        "positions": positions,
+        "orientations": np.tile(quaternion, (count, 1)),
+        "scales": np.full((count, 3), 0.02),
+        "opacities": np.full(count, 0.9),
+        "ids": np.arange(count) if ids is None else ids,
+    }
+    return GaussianCloud(**(fields | changes))
+
+
+@pytest.fixture
+def points(rng):
+    """Points up to 5 mm above or below the sphere's facets."""
+    corners = SPHERE.triangles[rng.integers(len(SPHERE.faces), size=500)]
+    on = np.einsum("nk,nkc->nc", rng.dirichlet([1, 1, 1], 500), corners)
+    return on + 0.005 * rng.uniform(-1, 1, (500, 1)) * on / np.linalg.norm(on, axis=1, keepdims=True)
+
+
+class TestDrift:
+    def test_what_moves_rigidly_with_the_surface_does_not_drift(self, device, points):
+        turn = Rotation.from_euler("xyz", (20, -35, 50), degrees=True)
+        move = np.array([0.3, -0.1, 0.2])
+        meshes = [SPHERE.vertices, turn.apply(SPHERE.vertices) + move]
+        found = tracking_drift(
+            [cloud(points), cloud(turn.apply(points) + move, turn)], meshes, SPHERE.faces, device=device
+        )
+        for frame in found:
+            assert frame.followed == 1.0
+            assert frame.gaussians.p95_mm < ROUNDING_MM
+            assert frame.vertices.p95_mm < ROUNDING_MM
+        assert found[0].gaussians.count == 500
+        assert found[0].vertices.count == len(SPHERE.vertices)
+
+    def test_a_slip_is_found_as_it_is(self, device, points):
+        turn = Rotation.from_euler("z", 0.02)  # a slide over the surface, 0.02 times the distance to the axis
+        found = tracking_drift(
+            [cloud(points), cloud(turn.apply(points), turn)], [SPHERE.vertices] * 2, SPHERE.faces, device=device
+        )[1]
+        slip = 1e3 * 2.0 * np.sin(0.01) * np.linalg.norm(points[:, :2], axis=1)
+        assert found.gaussians.mean_mm == pytest.approx(slip.mean(), abs=ROUNDING_MM)
+        assert found.gaussians.median_mm == pytest.approx(np.median(slip), abs=ROUNDING_MM)
+        assert found.gaussians.p95_mm == pytest.approx(np.quantile(slip, 0.95), abs=ROUNDING_MM)
+        at_vertices = 1e3 * 2.0 * np.sin(0.01) * np.linalg.norm(SPHERE.vertices[:, :2], axis=1)
+        assert found.vertices.mean_mm == pytest.approx(at_vertices.mean(), abs=ROUNDING_MM)
+
+    def test_points_of_a_stretched_surface_do_not_drift(self, device):
+        stretched = SPHERE.vertices * (1.1, 1.0, 0.9)
+        on = SPHERE.triangles.mean(axis=1)
+        after = stretched[SPHERE.faces].mean(axis=1)
+        found = tracking_drift([cloud(on), cloud(after)], [SPHERE.vertices, stretched], SPHERE.faces, device=device)[1]
+        assert found.gaussians.p95_mm < ROUNDING_MM
+
+    def test_rows_are_matched_by_identity(self, points, rng):
+        order = rng.permutation(500)
+        ids = 7 * np.arange(500) + 3
+        later = cloud(points[order], ids=ids[order])
+        found = tracking_drift([cloud(points, ids=ids), later], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        assert found.gaussians.p95_mm < ROUNDING_MM
+
+    def test_what_is_gone_is_not_followed(self, points):
+        later = cloud(np.concatenate([points[:400], points[:50]]), ids=np.r_[0:400, 1000:1050])
+        found = tracking_drift([cloud(points), later], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        assert found.followed == 0.8
+        assert found.gaussians.count == 400
+
+    def test_far_and_faint_gaussians_do_not_count(self, points):
+        away = points.copy()
+        away[:100] *= 2.0
+        opacities = np.full(500, 0.9)
+        opacities[-50:] = 0.01
+        start = cloud(away, opacities=opacities)
+        found = tracking_drift([start, start], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        assert found.gaussians.count == 350
+
+    def test_only_vertices_that_a_camera_sees_count(self, points):
+        camera = Camera.orbit((0, 0, 0), 4.0, 90.0, 0.0, width=64, height=64, vertical_fov=40.0)
+        found = tracking_drift([cloud(points)], [SPHERE.vertices], SPHERE.faces, cameras=[camera], device="cpu")[0]
+        assert 0.3 < found.vertices.count / len(SPHERE.vertices) < 0.55
+
+
+class TestErrors:
+    def test_clouds_without_ids_are_refused(self, points):
+        with pytest.raises(InvalidArrayError, match="clouds must have ids, got none in frame 0"):
+            tracking_drift([cloud(points).with_arrays(ids=None)], [SPHERE.vertices], SPHERE.faces, device="cpu")
+
+    def test_new_identities_are_refused(self, points):
+        with pytest.raises(InvalidArrayError, match="clouds must keep ids of the first frame, got none in frame 1"):
+            tracking_drift(
+                [cloud(points), cloud(points, ids=np.arange(500) + 500)],
+                [SPHERE.vertices] * 2,
+                SPHERE.faces,
+                device="cpu",
+            )
+
+    def test_clouds_elsewhere_are_refused(self, points):
+        with pytest.raises(InvalidArrayError, match="clouds must start within"):
+            tracking_drift([cloud(points + 9.0)], [SPHERE.vertices], SPHERE.faces, device="cpu")
+
+    def test_another_topology_is_refused(self, points):
+        with pytest.raises(InvalidArrayError, match="vertices must have"):
+            tracking_drift([cloud(points)] * 2, [SPHERE.vertices, SPHERE.vertices[:-1]], SPHERE.faces, device="cpu")

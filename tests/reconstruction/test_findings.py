@@ -1,0 +1,91 @@
+"""What the steps of a reconstruction say of a frame: each finding is met and missed once, tracking made up."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from beam_warp.reconstruction import steps
+from beam_warp.reconstruction.fit import FitOptions
+from beam_warp.reconstruction.initial import initial_gaussians
+from beam_warp.reconstruction.steps import MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
+
+STEPS = FitAndTrack(fitting=FitOptions(gaussian_count=200, color_iterations=1, normal_iterations=0), device="cpu")
+
+
+def nobody(done, total, facts=None):
+    """Hear nothing."""
+
+
+@pytest.fixture(scope="module")
+def views(tiny_capture):
+    return [record.view() for record in tiny_capture.select(split="train", frames=[0])]
+
+
+def advanced(monkeypatch, views, *, before, after, gap=0.0, lost=""):
+    """Return the report of a frame that tracking makes this of."""
+    cloud = initial_gaussians(views, 200, device="cpu")
+    joints = cloud.positions[:3]
+    track = SimpleNamespace(
+        cloud=cloud,
+        joints=joints,
+        previous_joints=joints - before,
+        baseline=np.array([30.0, 0.01]),
+        normals=lambda: np.zeros((len(cloud), 3)),
+    )
+    following = SimpleNamespace(cloud=cloud, joints=joints + after)
+    report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
+    monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
+    return STEPS.advance(track, views, nobody)[1]
+
+
+class TestTrackedFrames:
+    def test_nothing_is_said_of_a_sound_one(self, monkeypatch, views):
+        report = advanced(monkeypatch, views, before=0.0, after=0.0)
+        assert report["findings"] == []
+        assert report["motion"] == {"median": 0.0, "largest": 0.0}
+        assert report["surprise"] == 0.0
+        assert report["exposure_spread"] < 0.3
+
+    def test_motion_that_goes_on_is_no_surprise(self, monkeypatch, views):
+        step = np.float32([0.0, 0.0, 1.0])  # a metre a frame: a third of the image
+        report = advanced(monkeypatch, views, before=step, after=step)
+        assert report["motion"]["median"] > 15.0
+        assert report["surprise"] < 1e-3  # rounding of positions to float32, of some metres
+        assert report["findings"] == []
+
+    @pytest.mark.parametrize(("part", "said"), [(0.9, False), (1.1, True)])
+    def test_motion_beyond_the_reach_of_tracking_is_said(self, monkeypatch, views, part, said):
+        """Reach: some pixels of the most reduced images."""
+        reach = STRUCTURE_REACH * max(STEPS.tracking.joints.levels)
+        step = np.float32([0.0, 0.0, 0.1])
+        pixels = advanced(monkeypatch, views, before=0.0, after=step)["surprise"]
+        report = advanced(monkeypatch, views, before=0.0, after=step * (reach * part / pixels))
+        assert [finding["code"] for finding in report["findings"]] == (["fast-motion"] if said else [])
+
+    def test_a_loss_is_of_new_surface_or_of_track(self, monkeypatch, views):
+        """The key frame's gap was 0.01, and 0.03 more may be."""
+        for gap, code in ((0.039, "tracking-lost"), (0.041, "new-surface"), (np.nan, "new-surface")):
+            report = advanced(monkeypatch, views, before=0.0, after=0.0, gap=gap, lost="so")
+            assert [(f["code"], f["what"]) for f in report["findings"]] == [(code, "tracking is lost: so")]
+
+
+class TestKeyFrames:
+    def test_cameras_too_few_for_the_surface_are_said(self, views):
+        _, report = STEPS.begin(views, nobody)
+        assert report["findings"] == []
+        assert report["unpaired"] <= MOST_UNPAIRED
+        _, report = STEPS.begin(views[::3], nobody)  # two, on opposite sides
+        assert [finding["code"] for finding in report["findings"]] == ["few-cameras"]
+        assert report["unpaired"] > 0.9
+
+    def test_a_fit_with_a_matched_view_is_nearer_to_the_sound_one(self, monkeypatch, views):
+        wrong = list(views)
+        wrong[2] = replace(wrong[2], color=wrong[2].color * np.float32(2.0))
+        (sound, _), (mended, report) = STEPS.begin(views, nobody), STEPS.begin(wrong, nobody)
+        assert [(f["code"], f["where"]) for f in report["findings"]] == [("camera-exposure", views[2].name)]
+        monkeypatch.setattr(steps, "matched", lambda views, gains: list(views))
+        naive, _ = STEPS.begin(wrong, nobody)
+        apart, naively = (np.abs(t.cloud.radiance - sound.cloud.radiance)[:, 0].mean() for t in (mended, naive))
+        assert apart < naively

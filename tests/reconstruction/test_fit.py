@@ -1,0 +1,346 @@
+"""Fits: margins over the start, budgets, targets, rows without a Gaussian, bits, captures of every kind, refusals."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import warp as wp
+from support.moving_ball import ball_cloud, ball_view, ball_views, rig
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.reconstruction import fit as fit_module
+from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, fit_gaussians
+from beam_warp.reconstruction.initial import initial_gaussians
+from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
+
+
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch):
+    """Images here are so small that threads only wait for one another."""
+    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
+
+
+@pytest.fixture(scope="module")
+def views():
+    return ball_views(rig())
+
+
+def few_steps(**changes):
+    """Without refinements unless they are asked for."""
+    kept = {"color_iterations": 0, "normal_iterations": 12, "refine_every": 0, "samples": 1, "gaussian_count": 300}
+    return FitOptions(**{**kept, **changes})
+
+
+def fitter_of(views, cloud, options, device):
+    return Fitter(views, cloud, options, wp.get_device(device))
+
+
+class TestProgress:
+    def test_a_grey_ball_takes_on_its_paint(self, device, views):
+        """8 dB is two and a half times closer; 6 dB, twice, in views that no step saw."""
+        fitter = fitter_of(
+            views, ball_cloud(300, painted=False), few_steps(color_iterations=30, normal_iterations=50), device
+        )
+        before = fitter.psnr()
+        fitter.run()
+        assert (fitter.psnr() > before + 8.0).all()
+        assert (fitter.gaps() == 0.0).all()
+        between = [ball_view(camera) for camera in rig(6, size=44, vertical_fov=35.0)]
+        unseen = [
+            fitter_of(between, cloud, few_steps(), device).psnr()
+            for cloud in (ball_cloud(300, painted=False), fitter.parameters.cloud())
+        ]
+        assert (unseen[1] > unseen[0] + 6.0).all()
+
+    def test_the_hull_is_where_it_begins(self, device, tiny_capture):
+        """The demo figure: 60 steps make of its hull's discs what is a third closer to the photographs, 3.5 dB."""
+        views = [
+            CapturedView(name=record.name, camera=record.camera, color=image[..., :3], alpha=image[..., 3])
+            for record in tiny_capture.select(split="train")
+            if record.frame == tiny_capture.frames[0]
+            for image in [record.image().linear_rgba()]
+        ]
+        start = initial_gaussians(views, 400, device=device)
+        before = fitter_of(views, start, few_steps(), device).psnr()
+        options = few_steps(gaussian_count=400, color_iterations=30, normal_iterations=30, refine_every=20)
+        fit = fit_gaussians(views, start, options, device=device)
+        assert fit.report["psnr"] > before.mean() + 3.5
+        assert fit.report["view_psnr"] > before.min() + 3.5
+
+    def test_everybody_hears_of_it(self, device, views):
+        heard = []
+        fit_gaussians(
+            views,
+            ball_cloud(60),
+            few_steps(normal_iterations=60, refine_every=20),
+            device=device,
+            progress=lambda done, total, facts: heard.append((done, total, dict(facts))),
+        )
+        assert [done for done, _, _ in heard] == [0, 50, 60]
+        assert {total for _, total, _ in heard} == {60}
+        assert heard[0][2] == {"gaussians": 60.0}
+        assert set(heard[-1][2]) == {"gaussians", "psnr"}
+
+    def test_without_steps_nothing_moves(self, device, views):
+        start = ball_cloud(60)
+        fit = fit_gaussians(views, start, few_steps(normal_iterations=0, sampling_filter=False), device=device)
+        np.testing.assert_array_equal(fit.cloud.positions, start.positions)
+        assert fit.report["iterations"] == 0
+
+    def test_positions_come_to_rest(self, device, views):
+        """With a last rate far below the first, late steps move them far less than early ones."""
+        rates = LearningRates(1e-3, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0)
+        options = few_steps(normal_iterations=200, rates=rates, sampling_filter=False)
+        fitter = fitter_of(views, ball_cloud(40), options, device)
+        places = []
+        fitter.run(lambda done, total, facts: places.append(fitter.parameters.positions.numpy().copy()))
+        moved = [np.abs(b - a).max() for a, b in pairwise(places)]
+        assert len(moved) == 4
+        assert moved[-1] < 0.02 * moved[0]
+
+
+class TestBudget:
+    def test_it_is_filled_and_never_exceeded(self, device, views):
+        """Splits of 20 % a time: 60 Gaussians become 90 and no more."""
+        counts = []
+        fit = fit_gaussians(
+            views,
+            ball_cloud(60),
+            few_steps(gaussian_count=90, normal_iterations=60, refine_every=6, refine_until=1.0, hidden_share=0.0),
+            device=device,
+            progress=lambda done, total, facts: counts.append(facts["gaussians"]),
+        )
+        assert fit.report["gaussians"] == len(fit.cloud) == 90
+        assert max(counts) <= 90
+
+    def test_a_start_that_is_too_large_is_thinned_evenly(self, device, views):
+        fit = fit_gaussians(views, ball_cloud(200), few_steps(gaussian_count=50, normal_iterations=0), device=device)
+        assert len(fit.cloud) == 50
+        np.testing.assert_array_equal(fit.cloud.positions[[0, -1]], ball_cloud(200).positions[[0, -1]])
+
+    def test_what_nobody_sees_is_dropped(self, device, views):
+        """High above every image; its row is then free for a split."""
+        start = ball_cloud(60)
+        start = start.with_arrays(positions=np.where(np.arange(60)[:, None] < 5, (0.0, 0.0, 50.0), start.positions))
+        options = few_steps(gaussian_count=60, refine_every=6, refine_until=1.0, split_fraction=0.0, hidden_share=1e-9)
+        assert len(fit_gaussians(views, start, options, device=device).cloud) == 55
+        options = replace(options, split_fraction=1.0)
+        fit = fit_gaussians(views, start, options, device=device)
+        assert len(fit.cloud) == 60
+        assert np.abs(fit.cloud.positions).max() < 1.0
+
+    def test_what_is_faint_is_dropped(self, device, views):
+        opacities = np.where(np.arange(60) < 5, 0.005, 0.8)
+        options = few_steps(
+            gaussian_count=60, normal_iterations=6, refine_every=6, refine_until=1.0, split_fraction=0.0
+        )
+        options = replace(options, hidden_share=0.0, rates=LearningRates(opacities=0.0))
+        assert (
+            len(fit_gaussians(views, ball_cloud(60).with_arrays(opacities=opacities), options, device=device).cloud)
+            == 55
+        )
+
+    def test_nobody_is_dropped_if_all_would_be(self, device, views):
+        options = few_steps(gaussian_count=60, refine_every=6, refine_until=1.0, dead_opacity=1.0, split_fraction=0.0)
+        assert len(fit_gaussians(views, ball_cloud(60), options, device=device).cloud) == 60
+
+    def test_ids_are_rows(self, device, views):
+        options = few_steps(gaussian_count=80, refine_every=4, refine_until=1.0, hidden_share=0.2)
+        ids = fit_gaussians(views, ball_cloud(60), options, device=device).cloud.ids
+        assert (np.diff(ids) > 0).all()
+        assert 0 <= ids.min() <= ids.max() < 80
+
+
+class TestRowsWithoutAGaussian:
+    @pytest.mark.parametrize("terms", [{}, {"anisotropy": 0.1}])
+    def test_they_never_move_and_never_count(self, device, views, terms):
+        options = few_steps(gaussian_count=90, normal_iterations=20, refine_every=1000, **terms)
+        fitter = fitter_of(views, ball_cloud(60), options, device)
+        before = {name: array[60:].copy() for name, array in fitter.parameters.rows().items()}
+        fitter.run()
+        for name, array in fitter.parameters.rows().items():
+            np.testing.assert_array_equal(array[60:], before[name])
+        assert fitter.report()["gaussians"] == len(fitter.parameters.cloud()) == 60
+
+    def test_the_start_does_not_call_them_back(self, device, views):
+        """What was dropped is held to the start no more, nor is the half that took its row."""
+        options = few_steps(
+            gaussian_count=150,
+            normal_iterations=60,
+            refine_every=10,
+            refine_until=0.5,
+            split_fraction=0.02,
+            hidden_share=0.3,
+            temporal=0.1,
+            rates=LearningRates(opacities=1.0),
+        )
+        fitter = fitter_of(views, ball_cloud(120), options, device)
+        fitter.run()
+        logits = fitter.parameters.logits.numpy()
+        dead = ~fitter.parameters.alive()
+        assert dead.any()
+        assert (logits[dead] == logits[dead][0]).all()
+        assert len(fitter.parameters.cloud()) == 150 - dead.sum()
+
+
+def fitted_bits(views, options, device):
+    cloud = fit_gaussians(views, ball_cloud(60, painted=False), options, device=device).cloud
+    return b"".join(array.tobytes() for array in cloud.arrays().values())
+
+
+class TestBits:
+    def test_same_bits_every_time_for_every_number_of_threads(self, device, monkeypatch):
+        views = ball_views(rig(2, 48))  # 9,216 samples, 1,100 rows: several chunks of every kernel
+        options = few_steps(gaussian_count=1100, normal_iterations=4, refine_every=2, refine_until=1.0, samples=2)
+        expected = fitted_bits(views, options, device)
+        for threads in ("1", "3"):
+            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+            assert fitted_bits(views, options, device) == expected
+
+    def test_another_seed_is_another_order(self, device, views):
+        assert fitted_bits(views, few_steps(), device) != fitted_bits(views, few_steps(seed=1), device)
+
+
+class TestTarget:
+    @pytest.fixture(autouse=True)
+    def begin_with_few(self, monkeypatch):
+        monkeypatch.setattr(fit_module, "FEWEST_GAUSSIANS", 40)
+
+    def test_it_is_met_at_once(self, device, views):
+        report = fit_gaussians(
+            views, ball_cloud(160), few_steps(target_psnr=5.0, gaussian_count=160), device=device
+        ).report
+        assert [entry["gaussians"] for entry in report["growth"]] == [40]
+        assert report["psnr"] >= 5.0
+
+    def test_the_budget_ends_it(self, device, views, monkeypatch):
+        monkeypatch.setattr(fit_module, "LEAST_GAIN", -100.0)
+        options = few_steps(target_psnr=100.0, gaussian_count=150)
+        fit = fit_gaussians(views, ball_cloud(150, painted=False), options, device=device)
+        assert [entry["gaussians"] for entry in fit.report["growth"]] == [40, 80, 150]
+        assert len(fit.cloud) == fit.report["gaussians"] == 150
+        # all steps for the first, half of them for what is split from there
+        assert fit.report["iterations"] == 12 + 6 + 6
+
+    def test_what_does_not_pay_is_not_gone_on_with(self, device, views, monkeypatch):
+        monkeypatch.setattr(fit_module, "LEAST_GAIN", 100.0)
+        options = few_steps(target_psnr=100.0, gaussian_count=300)
+        report = fit_gaussians(views, ball_cloud(300), options, device=device).report
+        assert [entry["gaussians"] for entry in report["growth"]] == [40, 80]
+
+    def test_fewer_at_the_start_than_it_begins_with(self, device, views):
+        report = fit_gaussians(views, ball_cloud(20), few_steps(target_psnr=5.0), device=device).report
+        assert [entry["gaussians"] for entry in report["growth"]] == [20]
+
+
+CAPTURES = {
+    "one view": lambda: ball_views(rig(1)),
+    "without alpha": lambda: ball_views(rig(3), with_alpha=False),
+    "some without alpha": lambda: [*ball_views(rig(2)), *ball_views(rig(1), with_alpha=False)],
+    "of two sizes": lambda: [*ball_views(rig(2)), *ball_views(rig(1, 56))],
+    "of a pixel": lambda: ball_views(rig(2, 1)),
+    "the ball beside the image": lambda: ball_views(rig(3), (30.0, 0.0, 0.0)),
+}
+
+
+class TestCaptures:
+    @pytest.mark.parametrize("name", CAPTURES)
+    @pytest.mark.parametrize("count", [1, 40])
+    def test_nothing_but_finite_comes_out(self, device, name, count):
+        """`GaussianCloud` refuses what is not; the report is finite too."""
+        options = few_steps(gaussian_count=count + 10, refine_every=5, refine_until=1.0, samples="auto")
+        fit = fit_gaussians(CAPTURES[name](), ball_cloud(count), options, device=device)
+        assert 1 <= len(fit.cloud) <= count + 10
+        assert np.isfinite([fit.report["psnr"], fit.report["view_psnr"]]).all()
+
+    def test_a_start_without_extent(self, device, views):
+        """Gaussians that are points: samples as fine as there are."""
+        start = ball_cloud(20).with_arrays(scales=np.zeros((20, 3)))
+        fit = fit_gaussians(views, start, few_steps(samples="auto", normal_iterations=2), device=device)
+        assert fit.report["samples"] == MOST_SAMPLES
+
+    def test_black_photographs_make_black_gaussians(self, device, views):
+        """Or none that show: an empty mask is met by what does not cover."""
+        black = [replace(view, color=0.0 * view.color, alpha=0.0 * view.alpha) for view in views]
+        options = few_steps(normal_iterations=60, refine_every=10, rates=LearningRates(opacities=0.5))
+        fit = fit_gaussians(black, ball_cloud(60), options, device=device)
+        assert len(fit.cloud) >= 1
+        assert fit.report["psnr"] > 40.0
+
+    def test_one_view_is_fitted(self, device):
+        views = ball_views(rig(1))
+        fitter = fitter_of(views, ball_cloud(150, painted=False), few_steps(normal_iterations=40), device)
+        before = fitter.psnr()
+        fitter.run()
+        assert (fitter.psnr() > before + 5.0).all()
+
+
+OUT_OF_RANGE = {
+    "gaussian_count": (0, 2**24 + 1, 1.5, None),
+    "target_psnr": (0.5, 121.0, np.nan, "high"),
+    "color_iterations": (-1, 0.5),
+    "normal_iterations": (-1, True),
+    "refine_every": (-1,),
+    "seed": (-1, 0.5),
+    "sh_degree": (-1, 5),
+    "samples": (0, 9, "many", None),
+    "refine_until": (-0.1, 1.1, np.nan),
+    "split_fraction": (-0.1, 1.1, np.nan),
+    "hidden_share": (-0.1, 1.1, np.nan),
+    "dead_opacity": (-0.1, 1.1, np.nan),
+    "anisotropy": (-0.1, np.nan),
+    "opacity": (-0.1, np.nan),
+    "temporal": (-0.1, np.nan),
+}
+
+
+class TestOptions:
+    @pytest.mark.parametrize(
+        ("name", "value"), [(name, value) for name, values in OUT_OF_RANGE.items() for value in values]
+    )
+    def test_what_is_out_of_range_is_refused(self, name, value):
+        with pytest.raises(InvalidOptionError, match=f"{name} must be"):
+            FitOptions(**{name: value})
+
+    @pytest.mark.parametrize("name", ["positions", "final_positions", "orientations", "scales", "color", "bands"])
+    @pytest.mark.parametrize("value", [-0.1, np.nan, "fast"])
+    def test_rates_out_of_range_are_refused(self, name, value):
+        with pytest.raises(InvalidOptionError, match=f"{name} must be a number in"):
+            LearningRates(**{name: value})
+
+    @pytest.mark.parametrize("name", ["l1", "ssim", "alpha", "normal"])
+    @pytest.mark.parametrize("value", [-0.1, np.nan, "much"])
+    def test_weights_out_of_range_are_refused(self, name, value):
+        with pytest.raises(InvalidOptionError, match=f"{name} must be a number in"):
+            LossWeights(**{name: value})
+
+    @pytest.mark.parametrize("preset", PRESETS)
+    def test_presets_and_what_is_changed_of_them(self, preset):
+        options = FitOptions.of_preset(preset, gaussian_count=7, seed=3)
+        assert (options.gaussian_count, options.seed) == (7, 3)
+        expected = {"fast": (1_000, 2_000), "draft": (150, 300), "paper": (7_000, 5_000), "rade": (6_000, 6_000)}[
+            preset
+        ]
+        assert (options.color_iterations, options.normal_iterations) == expected
+        assert FitOptions.of_preset("fast") == FitOptions()
+
+    def test_an_unknown_preset(self):
+        with pytest.raises(InvalidOptionError, match="preset must be one of fast, draft, paper, rade, got 'best'"):
+            FitOptions.of_preset("best")
+
+
+class TestRefusals:
+    def test_nothing_to_fit(self, device, views):
+        with pytest.raises(InvalidArrayError, match="got 0 views and 60 Gaussians"):
+            fit_gaussians([], ball_cloud(60), few_steps(), device=device)
+        with pytest.raises(InvalidArrayError, match="got 6 views and 0 Gaussians"):
+            fit_gaussians(views, ball_cloud(60).select(np.zeros(0, int)), few_steps(), device=device)
+
+    def test_a_start_without_light(self, device, views):
+        """Display colours and none at all are refused, not converted."""
+        for changes in ({"radiance_color_space": DISPLAY_SRGB}, {"radiance": None, "radiance_color_space": None}):
+            with pytest.raises(InvalidArrayError, match="start must have radiance in lin_rec709_scene"):
+                fit_gaussians(views, ball_cloud(60).with_arrays(**changes), few_steps(), device=device)

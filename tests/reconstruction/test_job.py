@@ -1,0 +1,389 @@
+"""Reconstruction around the optimiser: what is stored, when it is taken again, and that no kill changes a byte."""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import time
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.fake_steps import FakeSteps, write_capture
+
+from beam_warp import read, validate
+from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
+from beam_warp.image.files import read_image, write_exr
+from beam_warp.jobs.store import read_frame
+from beam_warp.reconstruction.job import (
+    ID_BITS,
+    Part,
+    ReconstructOptions,
+    plan_segments,
+    reconstruct,
+    reconstruct_part,
+    stored_cloud,
+)
+
+FRAMES = (0, 1, 2, 3)
+PAIRS = ReconstructOptions(segment_length=2)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_capture(tmp_path_factory.mktemp("captures") / "ball", FRAMES)
+
+
+@pytest.fixture
+def capture(folder):
+    return Capture.read(folder)
+
+
+def results(out):
+    """Every byte that a run promises, by file: all but times and what is remembered of the images."""
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path.suffix != ".json" and path.parent.name != "digests"
+    }
+
+
+def differing(first, second):
+    assert first.keys() == second.keys()
+    return [name for name in first if first[name] != second[name]]
+
+
+class TestSegments:
+    def test_plan(self):
+        assert plan_segments((3, 4, 6, 9, 10), 2) == ((3, 4), (6, 9), (10,))
+        assert plan_segments((3, 4, 6), 3) == plan_segments((3, 4, 6), 0) == ((3, 4, 6),)
+
+    def test_one_segment_keeps_identities(self, capture, tmp_path):
+        steps = FakeSteps()
+        found = reconstruct(capture, tmp_path / "out", steps)
+        assert steps.calls == ["begin", "advance", "advance", "advance"]
+        assert found.sequence.topology == "constant"
+        assert found.sequence.frames_per_second == 12.0
+        assert [entry["kind"] for entry in found.report["frames"]] == ["key", "tracked", "tracked", "tracked"]
+        assert found.report["segments"] == [0]
+        moved = [np.abs(found.sequence[i].positions - found.sequence[0].positions).max() for i in FRAMES]
+        assert moved == sorted(moved)
+        assert moved[1] > 0.0
+
+    def test_segments_share_no_identity(self, capture, tmp_path):
+        steps = FakeSteps()
+        found = reconstruct(capture, tmp_path / "out", steps, PAIRS)
+        assert steps.calls == ["begin", "advance", "begin", "advance"]
+        assert found.sequence.topology == "perFrame"
+        assert found.report["segments"] == [0, 2]
+        ids = [cloud.ids for cloud in found.sequence]
+        assert np.array_equal(ids[0], ids[1])
+        assert np.array_equal(ids[2], ids[3])
+        assert np.array_equal(ids[2], ids[0] + (2 << ID_BITS))
+
+    def test_a_lost_frame_is_a_key_frame_and_said_so(self, tmp_path):
+        capture = Capture.read(write_capture(tmp_path / "capture", range(5), levels={2: 0.95}))
+        steps, said = FakeSteps(), []
+        found = reconstruct(capture, tmp_path / "out", steps, progress=lambda *step: said.append(step))
+        assert steps.calls == ["begin", "advance", "advance", "begin", "advance", "advance"]
+        assert found.report["segments"] == [0, 2]
+        assert [entry["segment"] for entry in found.report["frames"]] == [0, 0, 2, 2, 2]
+        assert found.report["frames"][2]["lost"] == "too bright"
+        assert found.report["frames"][2]["kind"] == "key"
+        assert found.sequence.topology == "perFrame"
+        assert np.array_equal(found.sequence[1].ids, np.arange(60))
+        assert np.array_equal(found.sequence[4].ids, np.arange(65) + (2 << ID_BITS))
+        assert validate(found.asset).is_valid
+        assert np.array_equal(read(found.asset)[4].ids, found.sequence[4].ids)
+        (warning,) = [text for text in found.report["warnings"] if "lost" in text]
+        assert "at frame 2 (too bright)" in warning
+        assert any("frame 2: lost (too bright), fitted anew" in step[3] for step in said if len(step) > 3)
+
+    def test_frames_of_a_range_keep_their_numbers(self, capture, tmp_path):
+        found = reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(frames=(1, 3)))
+        assert sorted(path.name for path in (tmp_path / "out" / "frames").glob("*.h5")) == [
+            "frame_000001.h5",
+            "frame_000003.h5",
+        ]
+        assert [entry["frame"] for entry in found.report["frames"]] == [1, 3]
+
+
+class TestOutputs:
+    def test_all_is_written_and_valid(self, capture, tmp_path):
+        out = tmp_path / "out"
+        found = reconstruct(capture, out, FakeSteps(), PAIRS)
+        assert validate(found.asset).is_valid
+        back = read(found.asset)
+        assert len(back) == 4
+        np.testing.assert_allclose(back[3].opacities, found.sequence[3].opacities, atol=2.0**-11)  # written in half
+        report = json.loads((out / "report.json").read_text())
+        assert report["mean_psnr"] == pytest.approx((30.0 + 28.8) / 2)
+        assert report["lowest_psnr"]["psnr"] == pytest.approx(28.8)
+        assert report["input"]["cameras"] == 3
+        assert report["frames"][0]["iterations"] == 7
+        assert report["frames"][0]["loss"] == [1.0, None]
+        assert all(entry["seconds"] > 0.0 and entry["gaussians"] == 60 for entry in report["frames"])
+        for frame in FRAMES:
+            assert read_image(out / "previews" / f"frame_{frame:06d}.png").width > 300
+        assert not [path for path in out.rglob("*") if path.name.startswith(".")]
+
+    def test_how_it_was_drawn_and_which_frames_it_shows_are_stated(self, capture, tmp_path):
+        stated = {"raster_antialiased": "true", "raster_low_pass": "0.3", "capture_frames": "1 3"}
+        found = reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(frames=(1, 3)))
+        assert found.sequence.metadata.items() >= stated.items()
+        assert read(found.asset).metadata.items() >= stated.items()
+
+    def test_drift_is_said(self, tmp_path):
+        capture = Capture.read(write_capture(tmp_path / "capture", range(4)))
+        warnings = reconstruct(capture, tmp_path / "out", FakeSteps()).report["warnings"]
+        assert next(text for text in warnings if "dB" in text).startswith("frame 3 is 3.6 dB below its key frame")
+
+    def test_progress_ends_full(self, capture, tmp_path):
+        said = []
+        reconstruct(capture, tmp_path / "out", FakeSteps(), progress=lambda *step: said.append(step))
+        assert [step[1:3] for step in said if step[0] == "frames"] == [(done, 4) for done in range(5)]
+        assert ("fit", 1, 1, "frame 0, 30.00 dB, 60 Gaussians") in said
+        assert ("track", 1, 1, "frame 1, 29.00 dB") in said
+
+    def test_what_the_track_shares_with_the_cloud_is_stored_once(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "out", FakeSteps(), PAIRS)
+        first, third = (set(read_frame(tmp_path / "out" / "frames" / f"frame_{n:06d}.h5")) for n in (0, 2))
+        assert {name for name in first if name.startswith("track_")} == {"track_velocity", "track_age"}
+        assert third - first == {"track_ids"}  # local in the track, unique in the cloud
+        cloud = stored_cloud(tmp_path / "out" / "frames" / "frame_000002.h5")
+        assert cloud.ids.min() == 2 << ID_BITS
+
+
+class TestMemory:
+    def test_images_of_two_frames_at_most(self, tmp_path, monkeypatch):
+        """The frame that is worked on, and the one that is read ahead."""
+        capture = Capture.read(write_capture(tmp_path / "capture", range(8)))
+        alive, most = weakref.WeakSet(), []
+        original = CaptureRecord.view
+
+        def counted(record):
+            view = original(record)
+            alive.add(view)
+            most.append(len(alive))
+            return view
+
+        monkeypatch.setattr(CaptureRecord, "view", counted)
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        assert len(most) == 2 * 3 * 8  # once to inspect the capture, once for fit, tracking and previews
+        gc.collect()
+        assert max(most) <= 2 * 3
+        assert not alive
+
+
+class Stop(BaseException):
+    """A kill."""
+
+
+def killed_at(monkeypatch, event, *, after):
+    """Make the event-th write of a run raise, before or after it is done; return how many there were."""
+    import beam_warp.reconstruction.job as module
+
+    seen = []
+
+    def watched(function):
+        def write(*arguments, **options):
+            seen.append(function)
+            if len(seen) == event and not after:
+                raise Stop
+            result = function(*arguments, **options)
+            if len(seen) == event:
+                raise Stop
+            return result
+
+        return write
+
+    for name in ("write_frame", "write_png", "write_json", "write_report"):
+        monkeypatch.setattr(module, name, watched(getattr(module, name)))
+    return seen
+
+
+class TestResuming:
+    @pytest.mark.parametrize("after", [False, True])
+    def test_a_kill_at_any_write_changes_no_byte(self, capture, tmp_path, monkeypatch, after):
+        options = ReconstructOptions(segment_length=2, frames=(0, 1, 2))
+        with monkeypatch.context() as patch:
+            writes = killed_at(patch, 0, after=after)
+            reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
+        whole = results(tmp_path / "whole")
+        assert len(writes) == 3 * 3 + 1  # Gaussians, preview and note of each frame, and the report
+        for event in range(1, len(writes) + 1):
+            out = tmp_path / f"killed_{event}"
+            with monkeypatch.context() as patch:
+                killed_at(patch, event, after=after)
+                with pytest.raises(Stop):
+                    reconstruct(capture, out, FakeSteps(), options)
+            steps = FakeSteps()
+            found = reconstruct(capture, out, steps, options)
+            assert len(steps.calls) == 3 - found.report["resumed_frames"]
+            assert found.report["resumed_frames"] == min((event + (1 if after else 0) + 1) // 3, 3)
+            assert not differing(whole, results(out))
+
+    def test_sigkill(self, folder, capture, tmp_path):
+        """A process killed while it works, with a frame half written."""
+        script = (
+            "import sys, time\n"
+            "import beam_warp.reconstruction.job as module\n"
+            "from beam_warp.capture.capture import Capture\n"
+            "from support.fake_steps import FakeSteps\n"
+            "class Slow(FakeSteps):\n"
+            "    def advance(self, track, views, progress):\n"
+            "        from pathlib import Path\n"
+            f"        Path({str(tmp_path / 'out/frames/.frame_000001.h5.1.tmp')!r}).write_bytes(b'half')\n"
+            "        print('working', flush=True)\n"
+            "        time.sleep(600)\n"
+            f"module.reconstruct(Capture.read({str(folder)!r}), {str(tmp_path / 'out')!r}, Slow())\n"
+        )
+        paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": paths}
+        )
+        try:
+            assert process.stdout.readline() == b"working\n"
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+        assert not (tmp_path / "out" / "gaussians.usda").exists()
+        (tmp_path / "out" / ".gaussians.abc").mkdir()  # as a kill within the asset's writer leaves
+        (tmp_path / "out" / ".gaussians.abc" / "half.usdc").write_bytes(b"half")
+        found = reconstruct(capture, tmp_path / "out", FakeSteps())
+        assert found.report["resumed_frames"] == 1
+        reconstruct(capture, tmp_path / "whole", FakeSteps())
+        assert not differing(results(tmp_path / "whole"), results(tmp_path / "out"))
+
+    def test_parts_and_a_final_call_are_the_whole(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "whole", FakeSteps(), PAIRS)
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(2, 2), PAIRS) == (2, 3)
+        assert not (tmp_path / "out" / "gaussians.usda").exists()
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2), PAIRS) == (0, 1)
+        steps = FakeSteps()
+        reconstruct(capture, tmp_path / "out", steps, PAIRS)
+        assert steps.calls == []
+        assert not differing(results(tmp_path / "whole"), results(tmp_path / "out"))
+
+    def test_more_parts_than_segments(self, capture, tmp_path):
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(3, 3), PAIRS) == ()
+
+    def test_a_damaged_frame_is_made_again(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        whole = results(tmp_path / "out")
+        path = tmp_path / "out" / "frames" / "frame_000001.h5"
+        path.write_bytes(path.read_bytes()[:400])
+        steps = FakeSteps()
+        reconstruct(capture, tmp_path / "out", steps)
+        assert steps.calls == ["advance"]
+        assert not differing(whole, results(tmp_path / "out"))
+
+    def test_a_missing_preview_is_drawn_again(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        whole = results(tmp_path / "out")
+        (tmp_path / "out" / "previews" / "frame_000002.png").unlink()
+        steps = FakeSteps()
+        reconstruct(capture, tmp_path / "out", steps)
+        assert steps.calls == []
+        assert not differing(whole, results(tmp_path / "out"))
+
+
+class TestStaleness:
+    """Nothing that was made from something else is taken, and nothing is made twice from the same."""
+
+    def test_other_options_start_over(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        assert reconstruct(capture, tmp_path / "out", FakeSteps(seed=1)).report["resumed_frames"] == 0
+        assert reconstruct(capture, tmp_path / "out", FakeSteps(count=50), PAIRS).report["resumed_frames"] == 0
+
+    def test_other_segments_keep_what_they_may(self, capture, tmp_path):
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        steps = FakeSteps()
+        reconstruct(capture, tmp_path / "out", steps, PAIRS)
+        assert steps.calls == ["begin", "advance"]  # 0 and 1 are as they were; 2 is a key frame now, and 3 follows it
+
+    def test_an_image_that_changes_costs_its_frame_and_those_after_it(self, tmp_path):
+        folder = write_capture(tmp_path / "capture", FRAMES)
+        capture = Capture.read(folder)
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        changed = folder / "images" / "c1" / "0002.exr"
+        image = read_image(changed)
+        before = changed.stat()
+        write_exr(changed, {**image.channels, "G": image.channels["G"] * np.float32(3.0)})
+        os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))  # whatever its time says
+        steps = FakeSteps()
+        found = reconstruct(capture, tmp_path / "out", steps)
+        assert steps.calls == ["advance", "advance"]
+        reconstruct(capture, tmp_path / "fresh", FakeSteps())
+        assert not differing(results(tmp_path / "fresh"), results(tmp_path / "out"))
+        assert found.report["resumed_frames"] == 2
+
+    def test_a_camera_that_changes(self, tmp_path):
+        folder = write_capture(tmp_path / "capture", FRAMES)
+        reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps())
+        content = json.loads((folder / "transforms.json").read_text())
+        content["fl_x"] = 24.5
+        (folder / "transforms.json").write_text(json.dumps(content))
+        assert reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps()).report["resumed_frames"] == 0
+
+    def test_a_moved_capture_is_the_same(self, tmp_path):
+        first, second = (write_capture(tmp_path / name, FRAMES) for name in ("first", "second"))
+        reconstruct(Capture.read(first), tmp_path / "out", FakeSteps())
+        assert reconstruct(Capture.read(second), tmp_path / "out", FakeSteps()).report["resumed_frames"] == 4
+
+    def test_settled_images_are_read_once_for_their_digest(self, tmp_path, monkeypatch):
+        folder = write_capture(tmp_path / "capture", (0, 1))
+        capture = Capture.read(folder)
+        later = time.time() + 100.0
+        monkeypatch.setattr("beam_warp.digests.time.time", lambda: later)
+        reconstruct(capture, tmp_path / "out", FakeSteps())
+        opened = []
+        original = Path.open
+        monkeypatch.setattr(Path, "open", lambda path, *a, **k: (opened.append(path), original(path, *a, **k))[1])
+        assert reconstruct(capture, tmp_path / "out", FakeSteps()).report["resumed_frames"] == 2
+        assert not [path for path in opened if path.suffix == ".exr"]
+
+
+class TestMistakes:
+    def test_missing_images_are_said_before_anything_is_made(self, tmp_path):
+        folder = write_capture(tmp_path / "capture", (0, 1))
+        (folder / "images" / "c0" / "0001.exr").unlink()
+        (folder / "images" / "c2" / "0001.exr").unlink()
+        with pytest.raises(MissingFileError, match="1 frame of 2 is left with under 2 images at frames 1"):
+            reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps())
+        assert not (tmp_path / "out").exists()
+
+    def test_one_missing_image_is_done_without(self, tmp_path):
+        folder = write_capture(tmp_path / "capture", (0, 1))
+        (folder / "images" / "c0" / "0001.exr").unlink()
+        found = reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps())
+        assert len(found.sequence) == 2
+        assert any("missing" in text for text in found.report["warnings"])
+
+    @pytest.mark.parametrize(
+        ("options", "says"),
+        [
+            ({"frames": (2, 7)}, "frames must be some of the capture's 4 from 0 to 3, got 7"),
+            ({"frames": ()}, "frames must be some of the capture's 4 from 0 to 3, got none"),
+            ({"frames": (2, 1)}, "frames must be ascending"),
+            ({"segment_length": -1}, "segment_length must be"),
+        ],
+    )
+    def test_options(self, capture, tmp_path, options, says):
+        with pytest.raises(InvalidOptionError, match=says):
+            reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(**options))
+        assert not (tmp_path / "out").exists()
+
+    def test_parts(self, capture, tmp_path):
+        with pytest.raises(InvalidOptionError, match="part must be I/N"):
+            Part(0, 2)
+        with pytest.raises(InvalidOptionError, match="segment_length must be at least 1 to work in parts"):
+            reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2))
+
+    def test_a_folder_that_cannot_be_made(self, capture, tmp_path):
+        with pytest.raises(OutputError, match="out must be a folder that can be made"):
+            reconstruct(capture, tmp_path / "missing" / "out", FakeSteps())

@@ -1,0 +1,111 @@
+"""Previews: which cameras, what a panel shows, and pictures of any size."""
+
+import numpy as np
+import pytest
+from support.shapes import cloud_of, sphere_points, tiles
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.image.panels import BACKGROUND, MARGIN, TITLE_HEIGHT
+from beam_warp.raster.gbuffer import rasterize
+from beam_warp.reconstruction.preview import (
+    AMPLIFICATION,
+    FEWEST_ROWS,
+    MOST_ROWS,
+    opposite_cameras,
+    reconstruction_preview,
+)
+from beam_warp.world.camera import Camera
+
+GRAY = round(255 * BACKGROUND)
+
+
+def camera(azimuth=0.0, size=40):
+    return Camera.orbit(
+        (0.0, 0.0, 0.0), 4.0, azimuth=azimuth, elevation=0.0, vertical_fov=40.0, width=size + size // 2, height=size
+    )
+
+
+@pytest.fixture(scope="module")
+def ball():
+    points, spacing = sphere_points(400)
+    return cloud_of(
+        tiles(points, points, spacing),
+        radiance=np.full((400, 1, 3), -0.5),
+        radiance_color_space=LINEAR_REC709,
+    )
+
+
+def photograph(ball, where, *, factor=1.0, alpha=True):
+    """What the ball looks like, times a factor."""
+    buffer = rasterize(ball, where, channels=("radiance",), device="cpu")
+    color = buffer.channels["radiance"] * buffer.alpha[..., None] * np.float32(factor)
+    covered = np.clip(buffer.alpha, 0.0, 1.0)
+    return CapturedView(name="view", camera=where, color=color, alpha=covered if alpha else None)
+
+
+def panels(picture, rows, columns):
+    """Cut a picture into its panels."""
+    height, width = ((side - MARGIN) // count for side, count in zip(picture.shape, (rows, columns), strict=False))
+    return [
+        [
+            picture[
+                row * height + MARGIN + TITLE_HEIGHT : (row + 1) * height,
+                column * width + MARGIN : (column + 1) * width,
+            ]
+            for column in range(columns)
+        ]
+        for row in range(rows)
+    ]
+
+
+def test_cameras_are_far_apart():
+    cameras = [camera(azimuth) for azimuth in (0.0, 60.0, 170.0, 240.0)]
+    assert opposite_cameras(cameras) == [0, 2]
+    assert opposite_cameras(cameras[:1]) == [0]
+    assert opposite_cameras([]) == []
+
+
+def test_a_perfect_render_differs_nowhere(ball):
+    views = [photograph(ball, camera(azimuth)) for azimuth in (0.0, 180.0)]
+    for row in panels(reconstruction_preview(ball, views, device="cpu"), 2, 4):
+        shown, render, difference, normals = row
+        assert np.abs(shown.astype(int) - render).max() <= 1  # divided by alpha and multiplied again: one rounding
+        assert difference.max() <= AMPLIFICATION
+        assert (shown[0, 0] == GRAY).all()
+        middle = normals[normals.shape[0] // 2, normals.shape[1] // 2]
+        assert middle.min() < 160
+    front, back = (row[3] for row in panels(reconstruction_preview(ball, views, device="cpu"), 2, 4))
+    y = [int(side[side.shape[0] // 2, side.shape[1] // 2, 1]) for side in (front, back)]
+    assert abs(y[0] - y[1]) > 230  # the surfaces that are seen face away from each other
+
+
+def test_differences_are_brightened(ball):
+    view = photograph(ball, camera(), factor=1.1)
+    shown, render, difference, _ = panels(reconstruction_preview(ball, [view], device="cpu"), 1, 4)[0]
+    middle = (slice(shown.shape[0] // 2, shown.shape[0] // 2 + 1), shown.shape[1] // 2)
+    expected = np.abs(shown[middle].astype(int) - render[middle]) * AMPLIFICATION
+    assert (difference[middle] == np.minimum(expected, 255)).all()
+    assert difference[middle].min() > 0
+
+
+def test_without_coverage_only_the_subject_is_compared(ball):
+    view = photograph(ball, camera(), alpha=False)
+    shown, _, difference, _ = panels(reconstruction_preview(ball, [view], device="cpu"), 1, 4)[0]
+    assert (shown[0, 0] == 0).all()  # the photograph as it is
+    assert (difference[0, 0] == 0).all()
+
+
+def test_a_mesh_is_one_more_column(ball):
+    view = photograph(ball, camera())
+    shading = np.full((40, 60, 3), 77, np.uint8)
+    picture = reconstruction_preview(ball, [view], shadings=[shading], device="cpu")
+    assert (panels(picture, 1, 5)[0][4] == 77).all()
+
+
+@pytest.mark.parametrize("size", [40, 300, 1100])
+def test_panels_fit_any_size(ball, size):
+    height = panels(reconstruction_preview(ball, [photograph(ball, camera(size=size))], device="cpu"), 1, 4)[0][
+        0
+    ].shape[0]
+    assert FEWEST_ROWS <= height <= max(MOST_ROWS, 2 * FEWEST_ROWS)

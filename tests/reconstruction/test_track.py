@@ -1,0 +1,266 @@
+"""Tracking: a turning ball is followed and keeps its ids, lost ones are found out, tracks come back bit by bit."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.moving_ball import ball_cloud, ball_views, rig
+
+from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.reconstruction.fit import FitOptions, LearningRates, fit_gaussians
+from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
+from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+
+CAMERAS = rig()
+
+PIXEL = 2.5 / CAMERAS[0].focal_x
+"""What a pixel is wide at the ball [m]."""
+
+REFINEMENT = replace(TrackOptions().refinement, normal_iterations=40, samples=1)
+
+OPTIONS = TrackOptions(
+    joint_count=40, joints=JointOptions(levels=(4, 2, 1), iterations=(20, 20, 30)), refinement=REFINEMENT
+)
+
+BRIEF = replace(
+    OPTIONS,
+    joints=JointOptions(levels=(2, 1), iterations=(3, 3)),
+    refinement=replace(REFINEMENT, normal_iterations=4),
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch):
+    """Images here are so small that threads only wait for one another."""
+    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
+
+
+@cache
+def key_track(device):
+    """A ball of 400 Gaussians, well fitted."""
+    options = FitOptions(gaussian_count=400, color_iterations=0, normal_iterations=80, refine_every=0, samples=1)
+    views = ball_views(CAMERAS)
+    return begin_track(
+        fit_gaussians(views, ball_cloud(400), options, device=device).cloud, views, OPTIONS, device=device
+    )
+
+
+def turned(degrees):
+    return Rotation.from_rotvec(np.radians(degrees) * np.array([0.3, 0.2, 0.93]))
+
+
+def rough_track(device, count=60, views=None, options=BRIEF):
+    """Gaussians that were not fitted at all."""
+    views = ball_views(CAMERAS[:3]) if views is None else views
+    return begin_track(ball_cloud(count), views, options, device=device)
+
+
+class TestASoundMotion:
+    def test_a_turning_ball_is_followed_to_less_than_a_pixel(self, device):
+        """Two frames of 2 pixels and 5 degrees each: every Gaussian where the motion takes it, under its id."""
+        key = track = key_track(device)
+        for frame in (1, 2):
+            center, turn = frame * np.array([0.06, 0.03, 0.02]), turned(5.0 * frame)
+            track, report = advance_track(track, ball_views(CAMERAS, center, turn), OPTIONS, device=device)
+            error = track.cloud.positions - (turn.apply(key.cloud.positions) + center)
+            assert report["lost"] == ""
+            assert np.sqrt((error**2).sum(axis=1).mean()) < PIXEL
+            assert report["psnr"] > key.baseline[0] - 3.0
+            assert report["torn"] == 0.0
+            np.testing.assert_array_equal(track.cloud.ids, key.cloud.ids)
+            # Joints are carried on: the rest of the motion is theirs, too.
+            error = track.joints - (turn.apply(key.key_joints) + center)
+            assert np.sqrt((error**2).sum(axis=1).mean()) < PIXEL
+        np.testing.assert_array_equal(track.key_joints, key.key_joints)
+        np.testing.assert_array_equal(track.baseline, key.baseline)
+
+    def test_what_stands_still_stays(self, device):
+        key = key_track(device)
+        track, report = advance_track(key, ball_views(CAMERAS), OPTIONS, device=device)
+        assert report["lost"] == ""
+        assert np.median(np.linalg.norm(track.cloud.positions - key.cloud.positions, axis=1)) < 0.25 * PIXEL
+
+    def test_other_cameras_than_in_the_key_frame(self, device):
+        """Fewer, of another size, elsewhere."""
+        views = ball_views(rig(5, 56, vertical_fov=30.0), (0.03, 0.0, 0.0))
+        track, report = advance_track(key_track(device), views, OPTIONS, device=device)
+        assert report["lost"] == ""
+        assert len(track.cloud) == 400
+
+
+class TestLost:
+    """Each of the three reasons, and what causes it."""
+
+    def test_scrambled_photographs(self, device):
+        rng = np.random.default_rng(0)
+        views = [
+            replace(view, color=rng.permutation(view.color.reshape(-1, 3)).reshape(view.color.shape))
+            for view in ball_views(CAMERAS)
+        ]
+        _, report = advance_track(key_track(device), views, OPTIONS, device=device)
+        assert report["lost"].startswith("PSNR fell from")
+
+    def test_another_ball_appears(self, device):
+        views = []
+        for one, other in zip(ball_views(CAMERAS), ball_views(CAMERAS, (0.1, 0.1, 0.55)), strict=True):
+            hides = other.alpha > one.alpha
+            color = np.where(hides[..., None], other.color, one.color)
+            views.append(replace(one, color=color, alpha=np.maximum(one.alpha, other.alpha)))
+        _, report = advance_track(key_track(device), views, OPTIONS, device=device)
+        assert "PSNR fell from" in report["lost"]
+
+    def test_a_jump_beyond_reach(self, device):
+        """Nearly a diameter: some of the subject is not covered, and views are named in which."""
+        _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), OPTIONS, device=device)
+        assert "of the subject are not covered in view" in report["lost"]
+
+    def test_nothing_is_lost_where_everything_is_allowed(self, device):
+        options = replace(BRIEF, largest_drop=1000.0, largest_gap=1.0, largest_tear=1.0)
+        views = ball_views(CAMERAS[:3], (0.0, 0.0, 0.9))
+        _, report = advance_track(rough_track(device), views, options, device=device)
+        assert report["lost"] == ""
+
+
+class TestArrays:
+    def test_a_track_comes_back_bit_by_bit(self, device):
+        track, _ = advance_track(rough_track(device), ball_views(CAMERAS[:3], turn=turned(3)), BRIEF, device=device)
+        arrays = track.arrays()
+        again = Track.from_arrays(arrays).arrays()
+        assert list(again) == list(arrays)
+        for name, array in arrays.items():
+            assert again[name].dtype == array.dtype
+            np.testing.assert_array_equal(again[name], array)
+
+    def test_tracking_goes_on_from_it_bit_by_bit(self, device):
+        track, views = rough_track(device), ball_views(CAMERAS[:3], turn=turned(3))
+        stored = {name: array.copy() for name, array in track.arrays().items()}
+        ends = [
+            advance_track(advance_track(begin, views, BRIEF, device=device)[0], views, BRIEF, device=device)[0]
+            for begin in (track, Track.from_arrays(stored))
+        ]
+        for one, other in zip(*(end.arrays().values() for end in ends), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_same_bits_for_every_number_of_threads(self, device, monkeypatch):
+        views, found = ball_views(rig(2, 48)), []
+        for threads in ("1", "3"):
+            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+            track = rough_track(device, 1100, views)
+            track, _ = advance_track(track, views, BRIEF, device=device)
+            found.append(b"".join(array.tobytes() for array in track.arrays().values()))
+        assert found[0] == found[1]
+
+
+class TestCaptures:
+    @pytest.mark.parametrize("count", [1, 2, 30])
+    def test_fewer_gaussians_than_joints(self, device, count):
+        track, report = advance_track(rough_track(device, count), ball_views(CAMERAS[:3]), BRIEF, device=device)
+        assert len(track.cloud) == len(track.joints) == count
+        assert np.isfinite([report[name] for name in ("psnr", "gap", "torn")]).all()
+
+    @pytest.mark.parametrize("size", [1, 3, 40])
+    def test_images_that_cannot_be_reduced_so_far(self, device, size):
+        """Levels stop at a pixel."""
+        views = ball_views(rig(1, size))
+        options = replace(BRIEF, joints=JointOptions(levels=(4, 1), iterations=(2, 2)))
+        track, _ = advance_track(rough_track(device, views=views), views, options, device=device)
+        assert len(track.cloud) == 60
+
+    def test_without_alpha(self, device):
+        views = ball_views(CAMERAS[:2], with_alpha=False)
+        _, report = advance_track(rough_track(device, views=views), views, BRIEF, device=device)
+        assert report["gap"] == 0.0
+
+    @pytest.mark.parametrize("degree", [0, 3])
+    def test_the_radiance_has_the_degree_of_the_key_frame(self, device, degree):
+        cloud = ball_cloud(60).with_arrays(radiance=np.zeros((60, (degree + 1) ** 2, 3)))
+        views = ball_views(CAMERAS[:2])
+        track, _ = advance_track(begin_track(cloud, views, BRIEF, device=device), views, BRIEF, device=device)
+        assert track.cloud.radiance.shape == cloud.radiance.shape
+
+
+class TestNormals:
+    def test_discs_face_to_their_side(self):
+        cloud = ball_cloud(50)
+        expected = cloud.positions / np.linalg.norm(cloud.positions, axis=1, keepdims=True)
+        np.testing.assert_allclose(outward_normals(cloud, expected + 0.3), expected, atol=1e-6)
+        np.testing.assert_allclose(outward_normals(cloud, -2.0 * expected), -expected, atol=1e-6)
+
+    def test_balls_and_needles_and_what_nobody_sees_face_nowhere(self):
+        scales = [[0.1, 0.1, 0.08], [0.1, 0.1, 0.1], [0.1, 0.09, 0.05]]
+        cloud = ball_cloud(3)
+        assert not outward_normals(cloud.with_arrays(scales=scales), cloud.positions).any()
+        assert not outward_normals(cloud, np.zeros((3, 3))).any()
+
+    def test_a_key_frame_is_turned_towards_its_cameras(self, device):
+        """Whichever way local z points: outside is where it is seen from."""
+        track = key_track(device)
+        faces = track.normals().any(axis=1)
+        outward = track.cloud.positions[faces] / np.linalg.norm(track.cloud.positions[faces], axis=1, keepdims=True)
+        assert faces.mean() > 0.5
+        assert ((track.normals()[faces] * outward).sum(axis=1) > 0.0).mean() > 0.95
+
+
+def test_a_pose_stays_what_it_was_when_the_next_is_found(device):
+    track, views = rough_track(device), ball_views(CAMERAS[:2], (0.05, 0.0, 0.0))
+    target = resolve_device(device)
+    tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, BRIEF.joints, BRIEF.raster, target)
+    start = JointPose(track.turns, track.joints)
+    pose = tracker.find(views, start, 1, 0)
+    carried = tracker.carried(track.cloud)
+    kept = pose.positions.copy(), carried.positions.copy()
+    tracker.find(ball_views(CAMERAS[:2], (-0.05, 0.0, 0.0)), start, 1, 0)
+    tracker.carried(track.cloud)
+    np.testing.assert_array_equal(pose.positions, kept[0])
+    np.testing.assert_array_equal(carried.positions, kept[1])
+
+
+class TestRefusals:
+    def test_nothing_to_track(self, device):
+        views = ball_views(CAMERAS[:2])
+        with pytest.raises(InvalidArrayError, match="got 0 views and 60 Gaussians"):
+            begin_track(ball_cloud(60), [], BRIEF, device=device)
+        with pytest.raises(InvalidArrayError, match="got 2 views and 0 Gaussians"):
+            begin_track(ball_cloud(60).select(np.zeros(0, int)), views, BRIEF, device=device)
+        with pytest.raises(InvalidArrayError, match="got 0 views and 60 Gaussians"):
+            advance_track(rough_track(device), [], BRIEF, device=device)
+
+    def test_a_cloud_without_light(self, device):
+        views = ball_views(CAMERAS[:2])
+        for changes in ({"radiance_color_space": DISPLAY_SRGB}, {"radiance": None, "radiance_color_space": None}):
+            with pytest.raises(InvalidArrayError, match="cloud must have radiance in lin_rec709_scene"):
+                begin_track(ball_cloud(9).with_arrays(**changes), views, BRIEF, device=device)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [("joint_count", 0), ("largest_drop", -1.0), ("largest_gap", np.nan), ("largest_tear", -0.1)],
+    )
+    def test_options_of_tracking(self, name, value):
+        with pytest.raises(InvalidOptionError, match=f"{name} must be"):
+            TrackOptions(**{name: value})
+
+    @pytest.mark.parametrize(
+        ("changes", "match"),
+        [
+            ({"levels": (1,)}, "levels and iterations must be as many"),
+            ({"levels": (), "iterations": ()}, "levels and iterations must be as many"),
+            ({"levels": (4, 0, 1), "iterations": (1, 1, 1)}, "levels must be an integer"),
+            ({"levels": (4, 2, 1), "iterations": (1, -1, 1)}, "iterations must be an integer"),
+            ({"rigidity": -1.0}, "rigidity must be a number"),
+            ({"rotation_rate": np.nan}, "rotation_rate must be a number"),
+            ({"position_rate": -1.0}, "position_rate must be a number"),
+            ({"final_rate": 1.5}, "final_rate must be a number"),
+            ({"blend": "cubic"}, "blend must be one of linear, dual"),
+        ],
+    )
+    def test_options_of_joints(self, changes, match):
+        with pytest.raises(InvalidOptionError, match=match):
+            JointOptions(**changes)
+
+    def test_rates_of_the_refinement(self):
+        with pytest.raises(InvalidOptionError, match="color must be a number"):
+            TrackOptions(refinement=FitOptions(rates=LearningRates(color=-1.0)))

@@ -1,0 +1,579 @@
+"""The deferred renderer: closed forms of light on planes, furnace, turning, bounces, meshes, hazards, and frames again.
+
+Scenes are flat Gaussians so large that a pixel sees a plane; environments have 16 to 32 rows.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.figure_asset import figure_asset
+
+from beam_warp.errors import InvalidOptionError
+from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
+from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
+from beam_warp.render.split_sum import relight
+from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap, texel_directions
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
+from beam_warp.world.mesh import MaterialMesh
+from beam_warp.world.shot import Shot, ShotMesh
+
+UP = np.array([0.0, 0.0, 1.0])
+PLAIN = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=128)
+SMALL = DeferredOptions(environment_shadows=4, bounces=2, light_map_size=128, environment_map_size=64)
+FLOAT32 = float(np.finfo(np.float32).eps)
+
+
+def discs(positions, normals, radius, *, color=1.0, roughness=1.0, openness=1.0, opacity=1.0):
+    """Flat Gaussians; the rasteriser caps alpha at 0.99."""
+    positions = np.atleast_2d(np.asarray(positions, np.float32))
+    count = len(positions)
+    n = np.broadcast_to(np.asarray(normals, float), (count, 3))
+    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], n), 1.0 + n[:, 2:]], axis=1)
+    turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    return GaussianCloud(
+        positions=positions,
+        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        scales=np.tile([radius, radius, 0.0], (count, 1)),
+        opacities=np.full(count, opacity),
+        base_color=np.broadcast_to(np.asarray(color, np.float32), (count, 3)),
+        roughness=np.broadcast_to(np.float32(roughness), (count,)),
+        ambient_occlusion=np.full(count, openness),
+        normals=n,
+    )
+
+
+def floor(**material):
+    """A plane z = 0, one Gaussian."""
+    return discs([0.0, 0.0, 0.0], UP, 50.0, **material)
+
+
+def camera(eye=(0.0, -2.0, 2.0), target=(0.0, 0.0, 0.0), size=9, fov=10.0):
+    up = (0, 0, 1) if abs(eye[0] - target[0]) + abs(eye[1] - target[1]) > 1e-6 else (0, 1, 0)
+    return Camera.look_at(eye, target, up=up, width=size, height=size, vertical_fov=fov)
+
+
+def middle(image):
+    """Colour of the pixel in the middle, not multiplied by alpha."""
+    row, column = (n // 2 for n in image.alpha.shape)
+    return image.rgb[row, column] / image.alpha[row, column]
+
+
+def render(shot, device, options=PLAIN, raster=None):
+    return DeferredRenderer(options, raster=raster, device=device).draw(shot)
+
+
+def brdf_twin(normal, view, light, roughness):
+    """Float64: the dielectric GGX lobe, without the cosine."""
+    n, v, d = (np.asarray(a, float) / np.linalg.norm(a, axis=-1, keepdims=True) for a in (normal, view, light))
+    half = v + d
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    alpha = roughness**2
+    n_l, n_v = (n * d).sum(-1), (n * v).sum(-1)
+    shadowing = 1.0 / (1.0 + smith_lambda(n_l, alpha) + smith_lambda(n_v, alpha))
+    fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight((v * half).sum(-1))
+    return ggx_distribution((n * half).sum(-1), alpha) * shadowing * fresnel / (4.0 * n_l * n_v)
+
+
+def figure(frame_count=1):
+    return figure_asset(frame_count=frame_count)
+
+
+def figure_camera(cloud, size=(20, 30), azimuth=30.0):
+    return Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
+
+
+def random_light(rng, height=16):
+    return EnvironmentMap((rng.random((height, 2 * height, 3)) ** 4).astype(np.float32))
+
+
+# ---- lights on a plane: closed forms --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (1.0, 0.3, -0.7)])
+def test_a_plane_in_the_sun(device, roughness, direction):
+    """E cos (rho (1 - E_spec) / pi + f_s). Bilinear lookup of E_spec errs by 2e-4 of its values of up to 0.1, as tested
+    with its table; the rest is some hundred roundings."""
+    color = np.array([0.9, 0.5, 0.2])
+    light = DirectionalLight(direction=direction, irradiance=(3.0, 2.0, 1.0), angular_diameter=0.0)
+    eye = np.array([0.0, -2.0, 2.0])
+    found = middle(
+        render(Shot(cloud=floor(color=color, roughness=roughness), camera=camera(eye), lights=(light,)), device)
+    )
+    view, to_light = eye / np.linalg.norm(eye), -np.asarray(light.direction)
+    diffuse = color * (1.0 - specular_albedo(view[2], roughness)) / np.pi
+    expected = np.array([3.0, 2.0, 1.0]) * to_light[2] * (diffuse + brdf_twin(UP, view, to_light, roughness))
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def test_a_point_light_falls_with_the_square(device):
+    """White and rough, seen from above: intensity cos / r^2 (1 - E_spec) / pi + f_s at three places of the plane."""
+    light = PointLight(position=(0.0, 0.0, 1.5), intensity=(2.0, 2.0, 2.0), casts_shadows=False)
+    for x in (0.0, 1.0, 3.0):
+        eye = np.array([x, 0.0, 4.0])
+        shot = Shot(cloud=floor(), camera=camera(eye, (x, 0.0, 0.0)), lights=(light,))
+        away = np.array([-x, 0.0, 1.5])
+        cosine, squared = 1.5 / np.linalg.norm(away), away @ away
+        scattered = (1.0 - specular_albedo(1.0, 1.0)) / np.pi + brdf_twin(UP, UP, away, 1.0)
+        assert middle(render(shot, device))[1] == pytest.approx(2.0 * cosine / squared * scattered, rel=1e-3)
+
+
+def test_a_spot_lights_its_cone_only(device):
+    light = SpotLight(position=(0, 0, 2), direction=(0, 0, -1), intensity=(1, 1, 1), inner_angle=10.0, outer_angle=20.0)
+    found = []
+    for x in (0.0, 0.2, 0.5, 0.9):  # 0, 6, 14 and 24 degrees from the axis
+        shot = Shot(cloud=floor(), camera=camera((x, 0, 4.0), (x, 0, 0)), lights=(light,))
+        found.append(middle(render(shot, device))[0])
+    assert found[0] > found[1] > found[2] > 0.0
+    assert found[3] == 0.0
+
+
+@pytest.mark.parametrize(("roughness", "diameter", "most"), [(1.0, 20.0, 0.02), (0.5, 10.0, 0.03), (0.25, 0.53, 0.02)])
+def test_a_wide_light_in_a_glossy_plane(device, roughness, diameter, most):
+    """Against the sum over 4000 directions of the disc, at the mirror direction and away from it, black below. The
+    widened lobe is a model: what it is off by is stated, as a share of the highlight."""
+    half = np.radians(diameter / 2)
+    k = np.arange(4000) + 0.5
+    height, phi = 1.0 - (1.0 - np.cos(half)) * k / 4000, k * np.pi * (3.0 - 5.0**0.5)
+    cone = np.stack([np.sqrt(1 - height**2) * np.cos(phi), np.sqrt(1 - height**2) * np.sin(phi), height], axis=-1)
+    eye = np.array([0.0, -1.0, 1.0])
+    view = eye / np.linalg.norm(eye)
+    errors, values = [], []
+    for tilt in (0.0, 10.0, 25.0):
+        angle = np.radians(45.0 - tilt)
+        to_light = np.array([0.0, np.sin(angle), np.cos(angle)])
+        light = DirectionalLight(direction=tuple(-to_light), irradiance=(1, 1, 1), angular_diameter=diameter)
+        shot = Shot(cloud=floor(color=0.0, roughness=roughness), camera=camera(eye), lights=(light,))
+        side = np.array([1.0, 0.0, 0.0])
+        directions = cone @ np.stack([side, np.cross(to_light, side), to_light])
+        scattered = brdf_twin(UP, view, directions, roughness) * directions[:, 2]
+        expected = scattered.sum() / height.sum()  # even radiance whose irradiance on a plane that faces it is 1
+        errors.append(abs(middle(render(shot, device))[0] - expected))
+        values.append(expected)
+    assert max(errors) < most * max(values)
+
+
+def test_shadows_of_gaussians_on_gaussians(device):
+    """A disc 1 m above the floor: dark below, lit beside, and partly lit if it is translucent."""
+    sun = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=0.0)
+    for opacity, most in ((1.0, 0.05), (0.8, 0.25)):
+        blocker = discs([0.0, 0.0, 1.0], UP, 0.2, opacity=opacity)
+        whole = [np.concatenate([getattr(floor(), n), getattr(blocker, n)]) for n in ("positions", "orientations")]
+        cloud = discs([[0, 0, 0], [0, 0, 1]], UP, 1.0)
+        cloud = cloud.with_arrays(
+            positions=whole[0],
+            orientations=whole[1],
+            scales=np.array([[3.0, 3.0, 0.0], [0.2, 0.2, 0.0]], np.float32),
+            opacities=np.array([1.0, opacity], np.float32),
+        )
+        eye = (0.0, -3.0, 0.8)
+        below, beside = (
+            middle(render(Shot(cloud=cloud, camera=camera((x, *eye[1:]), (x, 0, 0)), lights=(sun,)), device, SMALL))[0]
+            for x in (0.0, 1.5)
+        )
+        free = middle(
+            render(
+                Shot(cloud=cloud, camera=camera((0.0, *eye[1:])), lights=(replace(sun, casts_shadows=False),)),
+                device,
+                replace(SMALL, bounces=0),
+            )
+        )[0]
+        assert below < most * free
+        assert beside > 0.9 * free
+
+
+# ---- the environment ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [0.0, 180.0])
+def test_without_shadows_it_is_relight(device, rng, degrees):
+    """Pixel by pixel, up to rounding: sums of some fifty float32 terms; a half turn of the map is a copy."""
+    cloud = figure()[0]
+    view = figure_camera(cloud)
+    light = random_light(rng)
+    found = render(Shot(cloud=cloud, camera=view, environment=light, environment_rotation=degrees), device)
+    lighting = EnvironmentLighting.from_environment(light, device=device)
+    expected = relight(rasterize(cloud, view, device=device), lighting if degrees == 0.0 else lighting.turned_around())
+    np.testing.assert_allclose(found.rgb, expected, rtol=200 * FLOAT32, atol=200 * FLOAT32 * expected.max())
+
+
+@pytest.mark.parametrize("options", [PLAIN, SMALL])
+def test_turning_the_light_is_turning_everything_else_back(device, options):
+    """Any angle. Without shadows up to rounding; with them maps see the subject at another angle and their texels fall
+    elsewhere: what differs is small against what turning the light changes."""
+    radiance = np.full((16, 32, 3), 0.02, np.float32)
+    radiance[:8, 4:12] = (1.0, 0.7, 0.5)
+    cloud, light, degrees = figure()[0], EnvironmentMap(radiance), 40.0
+    angle = -np.radians(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    q = np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])
+    x, y, z, w = cloud.orientations.T
+    turned_q = np.stack([q[3] * x - q[2] * y, q[3] * y + q[2] * x, q[3] * z + q[2] * w, q[3] * w - q[2] * z], axis=-1)
+    back = cloud.with_arrays(
+        positions=(cloud.positions @ turn.T).astype(np.float32),
+        normals=(cloud.normals @ turn.T).astype(np.float32),
+        orientations=turned_q.astype(np.float32),
+    )
+    view = figure_camera(cloud)
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    moved = replace(view, camera_to_world=pose @ view.camera_to_world)
+    one = render(Shot(cloud=cloud, camera=view, environment=light, environment_rotation=degrees), device, options)
+    two = render(Shot(cloud=back, camera=moved, environment=light), device, options)
+    three = render(Shot(cloud=cloud, camera=view, environment=light), device, options)
+    difference = np.abs(one.rgb - two.rgb).mean()
+    assert difference < (1e-3 if options is PLAIN else 0.05) * np.abs(one.rgb - three.rgb).mean()
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.03, 0.5, 1.0])
+@pytest.mark.parametrize("options", [PLAIN, SMALL], ids=["plain", "shadows"])
+def test_white_furnace(device, roughness, options):
+    """A white open plane under even light shows it, at every angle and roughness, within 1 %."""
+    furnace = EnvironmentMap.constant((1.0, 0.5, 2.0))
+    for eye in ((0.0, -0.1, 2.0), (0.0, -2.0, 1.0), (0.0, -2.0, 0.25)):
+        shot = Shot(cloud=floor(roughness=roughness), camera=camera(eye), environment=furnace)
+        np.testing.assert_allclose(middle(render(shot, device, options)), [1.0, 0.5, 2.0], rtol=0.01)
+
+
+def test_a_convex_body_is_open(device):
+    """Under any light a ball of rough white discs is as bright as without shadows, within 2 %: none falls on itself."""
+    count = 3000
+    k = np.arange(count) + 0.5
+    z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    normals = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
+    cloud = discs(normals, normals, 0.06)
+    radiance = 1.0 + texel_directions(16, 32) @ [0.5, -0.3, 0.4]
+    light = EnvironmentMap(radiance[..., None] * np.ones(3))
+    shot = Shot(cloud=cloud, camera=figure_camera(cloud, (24, 24)), environment=light)
+    one, two = (render(shot, device, options) for options in (PLAIN, replace(SMALL, environment_map_size=128)))
+    core = one.alpha > 0.999
+    assert core.sum() > 100
+    assert np.abs(two.rgb[core] / one.rgb[core] - 1.0).mean() < 0.02
+
+
+def test_a_roof_darkens_what_is_below(device):
+    """A floor under a roof that hides all of a sky that comes from above is dark; ambient occlusion says nothing."""
+    radiance = np.full((32, 64, 3), 1e-6, np.float32)
+    radiance[:2] = 50.0
+    light = EnvironmentMap(radiance)
+    low = discs([[0, 0, 0]], UP, 0.5)
+    both = discs([[0, 0, 0], [0, 0, 0.4]], UP, 0.5)
+    view = camera((0.0, -3.0, 0.3), size=9)
+    free, dark = (
+        middle(render(Shot(cloud=c, camera=view, environment=light), device, replace(SMALL, bounces=0)))[0]
+        for c in (low, both)
+    )
+    assert dark < 0.15 * free
+
+
+def test_bounces_in_a_closed_room(device):
+    """Discs on a sphere that look inward see nothing but each other in 1 - V of their hemisphere: after b bounces what
+    arrives is pi V sum_k ((1 - V) R)^k, k to b. All clusters send alike, so that the mean over them is exact; the
+    specular lobe's albedo of diffuse light stands for its mean, which is off by less than 0.01 of R."""
+    count, openness, color = 2000, 0.4, 0.6
+    k = np.arange(count) + 0.5
+    z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    outward = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
+    cloud = discs(outward, -outward, 0.06, color=color, openness=openness)
+    shot = Shot(cloud=cloud, camera=figure_camera(cloud), environment=EnvironmentMap.constant((1.0, 1.0, 1.0)))
+    for bounces in (1, 3):
+        frame = DeferredRenderer(replace(PLAIN, bounces=bounces), device=device).frame(shot)
+        arriving = frame.gaussians.values.numpy()[:, 8:11]
+        share = specular_albedo(2.0 / 3.0, 1.0)
+        reflects = color * (1.0 - share) + share
+        expected = np.pi * openness * sum(((1 - openness) * reflects) ** k for k in range(bounces + 1))
+        np.testing.assert_allclose(arriving, expected, rtol=2e-3)
+
+
+# ---- triangles ------------------------------------------------------------------------------------------------------
+
+
+def plate(z=0.0, half=3.0, x=0.0, *, catches=False, color=1.0, flip=False):
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return corners, faces[:, ::-1] if flip else faces, np.tile(-UP if flip else UP, (4, 1)), color, catches
+
+
+def mesh_of(*plates):
+    corners, faces, normals, colors, catches = [], [], [], [], []
+    for one in plates:
+        faces.append(one[1] + 4 * len(corners))
+        corners.append(one[0])
+        normals.append(one[2])
+        colors.append(np.full((4, 3), one[3]))
+        catches += [one[4]] * 2
+    surface = MaterialMesh(
+        vertices=np.concatenate(corners),
+        faces=np.concatenate(faces).astype(np.int32),
+        normals=np.concatenate(normals),
+        base_color=np.concatenate(colors),
+        roughness=np.ones(4 * len(corners)),
+    )
+    return ShotMesh(surface=surface, catches_shadows=np.array(catches))
+
+
+def nothing():
+    return discs(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_a_mesh_is_shaded_like_gaussians(device, flip):
+    """A plane of triangles and one of Gaussians show the same, from either side of its faces, up to their depths."""
+    sun = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(3, 2, 1))
+    light = EnvironmentMap.constant((0.5, 0.6, 0.7))
+    rest = {"camera": camera(), "lights": (sun,), "environment": light}
+    one = middle(render(Shot(cloud=floor(color=0.4), **rest), device))
+    two = render(Shot(cloud=nothing(), mesh=mesh_of(plate(color=0.4, flip=flip)), **rest), device)
+    assert (two.alpha == 1.0).all()
+    np.testing.assert_allclose(middle(two), one, rtol=1e-3)
+    np.testing.assert_allclose(two.layers["base_color"], 0.4, rtol=1e-6)
+    np.testing.assert_allclose(two.layers["normals"][4, 4], UP, atol=1e-6)
+    assert two.layers["depth"][4, 4] == pytest.approx(8**0.5, rel=1e-5)
+
+
+@pytest.mark.parametrize("z", [-0.5, 0.5])
+def test_the_nearer_one_is_in_front(device, z):
+    """A red plate of Gaussians before a white one of triangles, and behind it."""
+    cloud = discs([0.0, 0.0, 0.0], UP, 5.0, color=(0.8, 0.0, 0.0), opacity=0.6)
+    light = EnvironmentMap.constant((1.0, 1.0, 1.0))
+    view = camera((0.0, -0.01, 3.0))
+    alone = render(Shot(cloud=cloud, camera=view, environment=light), device)
+    mesh = render(Shot(cloud=nothing(), camera=view, environment=light, mesh=mesh_of(plate(z))), device)
+    both = render(Shot(cloud=cloud, camera=view, environment=light, mesh=mesh_of(plate(z))), device)
+    expected = mesh.rgb if z > 0 else alone.rgb + (1.0 - alone.alpha[..., None]) * mesh.rgb
+    np.testing.assert_allclose(both.rgb, expected, rtol=1e-5)
+    np.testing.assert_allclose(both.alpha, 1.0, rtol=1e-6)
+    depth = 3.0 - z if z > 0 else 0.6 * 3.0 + 0.4 * 3.5
+    assert both.layers["depth"][4, 4] == pytest.approx(depth, rel=1e-3)
+
+
+def test_a_caught_shadow_is_what_light_is_missing(device):
+    """Below a plate the sun's part of the irradiance is gone; beside it nothing is. The catcher is not seen."""
+    sun = DirectionalLight(direction=(0, 0, -1), irradiance=(2, 2, 2), angular_diameter=0.0)
+    sky = EnvironmentMap.constant((0.3, 0.3, 0.3))
+    mesh = mesh_of(plate(catches=True), plate(0.5, 0.3))
+    cloud = discs([[-0.9, 0.0, 0.0], [0.9, 0.0, 0.0]], UP, 1e-3)  # the subject that shadow maps look at
+    for environment, share in ((None, 1.0), (sky, 2.0 / (2.0 + 0.3 * np.pi))):
+        for x, expected in ((0.0, share), (0.7, 0.0)):
+            shot = Shot(
+                cloud=cloud,
+                camera=camera((x, -2.0, 0.2), (x, 0.0, 0.0)),
+                lights=(sun,),
+                environment=environment,
+                mesh=mesh,
+            )
+            image = render(shot, device, replace(PLAIN, light_map_size=128))
+            assert image.alpha[4, 4] == pytest.approx(expected, abs=1e-3)
+            assert not image.rgb[4, 4].any()
+            assert not image.layers["base_color"][4, 4].any()
+
+
+def test_gaussians_cast_on_triangles_and_triangles_on_gaussians(device):
+    sun = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
+    ball = discs([[0, 0, 1.0], [0.1, 0.1, 1.0], [-0.1, 0, 1.0]], UP, 0.3)
+    view = camera((0.0, -2.0, 0.5))
+    on_mesh = render(Shot(cloud=ball, camera=view, lights=(sun,), mesh=mesh_of(plate())), device, SMALL)
+    assert middle(on_mesh).max() < 0.02 / np.pi
+    low = discs([[-0.9, 0, 0], [0, 0, 0], [0.9, 0, 0]], UP, 0.3)
+    on_cloud = render(Shot(cloud=low, camera=view, lights=(sun,), mesh=mesh_of(plate(0.8, 0.3))), device, SMALL)
+    assert middle(on_cloud).max() < 0.05 / np.pi
+
+
+# ---- what is hard, and what is kept ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [PLAIN, SMALL], ids=["plain", "shadows"])
+def test_hazards_are_finite(device, rng, options):
+    """Roughness 0.03 and 1, a firefly of 5e4, lights inside the subject and at a Gaussian, a camera among Gaussians,
+    black and no light, no Gaussians."""
+    cloud = figure()[0]
+    extremes = cloud.with_arrays(roughness=np.where(rng.random(len(cloud)) < 0.5, 0.03, 1.0).astype(np.float32))
+    firefly = np.full((16, 32, 3), 0.1, np.float32)
+    firefly[3, 5] = 5e4
+    bright = EnvironmentMap(firefly)
+    inside = PointLight(position=tuple(np.median(cloud.positions, axis=0)), intensity=(5, 5, 5), radius=0.05)
+    touching = PointLight(position=tuple(cloud.positions[0].tolist()), intensity=(5, 5, 5))
+    spot = SpotLight(position=inside.position, direction=(0, 0, 1), intensity=(1, 1, 1), outer_angle=85.0)
+    view = figure_camera(cloud, (12, 16))
+    among = replace(view, camera_to_world=view.camera_to_world.copy())
+    pose = view.camera_to_world.copy()
+    pose[:3, 3] = cloud.positions[100]
+    among = replace(view, camera_to_world=pose)
+    black = EnvironmentMap.constant((0, 0, 0))
+    renderer = DeferredRenderer(options, device=device)
+    shots = [
+        Shot(cloud=extremes, camera=view, environment=bright, lights=(inside, touching, spot)),
+        Shot(cloud=extremes, camera=among, environment=bright, lights=(inside,)),
+        Shot(cloud=cloud, camera=view, environment=black),
+        Shot(cloud=cloud, camera=view),
+        Shot(cloud=nothing(), camera=view, environment=bright, lights=(inside,)),
+        Shot(cloud=nothing(), camera=view, lights=(inside,), mesh=mesh_of(plate(catches=True))),
+    ]
+    for shot in shots:
+        image = renderer.draw(shot)
+        for array in (image.rgb, image.alpha, *image.layers.values()):
+            assert np.isfinite(array).all()
+        assert image.rgb.min() >= 0.0
+        if shot.environment is None and not shot.lights:
+            assert not image.rgb.any()
+            assert image.alpha.any()
+
+
+def test_shots_of_any_order_and_size(device, rng):
+    """What a renderer keeps of shots before changes nothing: the same bits as a new renderer's."""
+    clouds = [*figure(2)]
+    fewer = clouds[0].select(np.arange(0, len(clouds[0]), 2)) if hasattr(clouds[0], "select") else None
+    light, other = random_light(rng), random_light(rng)
+    sun = DirectionalLight(direction=(1, 0.5, -1), irradiance=(1, 1, 1))
+    lamp = PointLight(position=(2, -2, 2), intensity=(3, 3, 3), radius=0.1)
+    inside = PointLight(position=tuple(np.median(clouds[0].positions, axis=0)), intensity=(1, 1, 1))
+    view, small = figure_camera(clouds[0]), figure_camera(clouds[0], (10, 11))
+    shots = [
+        Shot(cloud=clouds[0], camera=view, environment=light, lights=(sun,)),
+        Shot(cloud=clouds[0], camera=figure_camera(clouds[0], azimuth=90.0), environment=light, lights=(sun,)),
+        Shot(cloud=clouds[0], camera=view, environment=light, environment_rotation=70.0, lights=(sun,)),
+        Shot(cloud=clouds[1], camera=view, environment=other, lights=(lamp,)),
+        Shot(cloud=clouds[1], camera=view, lights=(inside, sun)),
+        Shot(cloud=clouds[1], camera=view, environment=other, mesh=mesh_of(plate()), lights=(sun,)),
+        Shot(cloud=clouds[1], camera=view, environment=other, lights=(sun, lamp)),
+        Shot(cloud=clouds[0] if fewer is None else fewer, camera=small, environment=light),
+    ]
+    renderer = DeferredRenderer(SMALL, device=device)
+    for shot in shots:
+        found, fresh = renderer.draw(shot), render(shot, device, SMALL)
+        np.testing.assert_array_equal(found.rgb, fresh.rgb)
+        np.testing.assert_array_equal(found.alpha, fresh.alpha)
+
+
+def test_launching_is_drawing(device, rng):
+    """After Gaussians, light and camera changed, one launch shows what a new renderer does, to the bit."""
+    one, two = figure(2)
+    light = random_light(rng)
+    sun, lower = (DirectionalLight(direction=(1, 0.5, z), irradiance=(1, 1, 1)) for z in (-1.0, -0.3))
+    mesh = mesh_of(plate())
+    first = Shot(cloud=one, camera=figure_camera(one), environment=light, lights=(sun,), mesh=mesh)
+    frame = DeferredRenderer(SMALL, device=device).frame(first)
+    drawn = frame.image()
+    for again in (frame.launch, frame.launch_view, frame.launch):
+        again()
+        np.testing.assert_array_equal(frame.image().rgb, drawn.rgb)
+    later = Shot(
+        cloud=two,
+        camera=figure_camera(one, azimuth=60.0),
+        environment=light,
+        environment_rotation=25.0,
+        lights=(lower,),
+        mesh=mesh,
+    )
+    frame.set(later)
+    frame.launch()
+    np.testing.assert_array_equal(frame.image().rgb, render(later, device, SMALL).rgb)
+
+
+def test_gaussians_moved_on_the_device(device, rng):
+    """Who writes positions into the frame's arrays and launches sees them there, with shadows of where they are."""
+    one, two = figure(2)
+    shot = Shot(cloud=one, camera=figure_camera(one), environment=random_light(rng))
+    frame = DeferredRenderer(SMALL, device=device).frame(shot)
+    before = frame.image().rgb
+    frame.gaussians.positions.assign(two.positions)
+    frame.launch()
+    moved = frame.image().rgb
+    assert (moved != before).any()
+    frame.gaussians.positions.assign(one.positions)
+    frame.launch()
+    np.testing.assert_array_equal(frame.image().rgb, before)
+
+
+def test_a_frame_refuses_what_does_not_fit(device):
+    cloud = figure()[0]
+    frame = DeferredRenderer(PLAIN, device=device).frame(Shot(cloud=cloud, camera=figure_camera(cloud)))
+    other = Shot(cloud=cloud, camera=figure_camera(cloud, (9, 9)))
+    assert not frame.fits(other)
+    with pytest.raises(
+        InvalidOptionError, match="shot must have 6000 Gaussians and 20 x 30 pixels, got 6000 and 9 x 9"
+    ):
+        frame.set(other)
+
+
+def test_same_bits_with_any_number_of_threads(rng, monkeypatch):
+    cloud = figure()[0]
+    lamp = PointLight(position=(1, -1, 1.5), intensity=(3, 3, 3), radius=0.1)
+    shot = Shot(
+        cloud=cloud,
+        camera=figure_camera(cloud, (60, 80)),
+        environment=random_light(rng),
+        lights=(lamp,),
+        mesh=mesh_of(plate()),
+    )
+    images = []
+    for threads in ("1", "2", "2"):
+        monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+        images.append(render(shot, "cpu", SMALL).rgb)
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[1], images[2])
+
+
+def test_samples_are_averaged(device, rng):
+    """Three by three samples a pixel are the means of the image of three times the side; layers by coverage."""
+    cloud = figure()[0]
+    view = figure_camera(cloud)
+    shot = Shot(cloud=cloud, camera=view, environment=random_light(rng))
+    found = render(shot, device, replace(PLAIN, samples=3))
+    fine = render(replace(shot, camera=view.supersampled(3)), device)
+    np.testing.assert_allclose(found.rgb, fine.rgb.reshape(30, 3, 20, 3, 3).mean(axis=(1, 3)), rtol=1e-5, atol=1e-7)
+    weight = fine.alpha.reshape(30, 3, 20, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(found.alpha, weight, rtol=1e-5, atol=1e-7)
+    seen = weight > 0.01
+    roughness = (fine.layers["roughness"] * fine.alpha).reshape(30, 3, 20, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(found.layers["roughness"][seen], roughness[seen] / weight[seen], rtol=1e-4)
+
+
+def test_layers_are_those_of_rasterize(device):
+    cloud = figure()[0]
+    view = figure_camera(cloud)
+    raster = RasterOptions(antialiased=True, low_pass=0.1)
+    found = render(Shot(cloud=cloud, camera=view), device, raster=raster)
+    buffer = rasterize(cloud, view, options=raster, device=device)
+    for name, layer in found.layers.items():
+        expected = buffer.depth if name == "depth" else buffer.channels[name]
+        assert layer.shape == expected.shape
+        np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-5)
+    assert not render(Shot(cloud=cloud, camera=view), device, replace(PLAIN, layers=())).layers
+
+
+def test_options_are_checked():
+    for bad in ({"environment_shadows": 3}, {"bounces": -1}, {"samples": 0}, {"layers": ("colour",)}):
+        with pytest.raises(InvalidOptionError, match=next(iter(bad))):
+            DeferredOptions(**bad)
+
+
+def test_where_the_front_leaks_light_still_falls_on_the_front(device):
+    """Before a far back, a front of 0.8: the mean depth lies between the two, in the shadow of the front."""
+    light = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
+    camera = Camera.look_at((0.01, 0.0, 3.0), (0.0, 0.0, 0.0), width=8, height=8, vertical_fov=4.0)
+    quarter_turn = (0.0, 0.0, 0.0, 1.0)
+    means = []
+    for opacity in (0.8, 0.99):
+        cloud = GaussianCloud(
+            positions=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+            orientations=np.array([quarter_turn, quarter_turn]),
+            scales=np.tile([1.0, 1.0, 1e-3], (2, 1)),
+            opacities=np.array([opacity, 0.99]),
+            normals=np.tile([0.0, 0.0, 1.0], (2, 1)),
+            base_color=np.full((2, 3), 0.5),
+            roughness=np.ones(2),
+            ambient_occlusion=np.ones(2),
+            axes="rfu",
+        )
+        options = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=128)
+        image = DeferredRenderer(options, device=device).draw(Shot(cloud=cloud, camera=camera, lights=(light,)))
+        means.append(image.rgb.mean() / image.alpha.mean())
+    # one surface of one material: what leaks is lit as the front is, shadowed by nothing that is nearer
+    assert means[0] == pytest.approx(means[1], rel=0.02)

@@ -1,0 +1,430 @@
+"""Every stress case on every device under every hierarchy; that the suite notices faults; how naive tracers fail."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+from support.shapes import random_cloud, random_rays
+
+from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp.kernels.trace.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED, launch_pack_gaussians
+from beam_warp.kernels.trace.gaussian import Gaussians
+from beam_warp.stability import tracing as stability
+from beam_warp.stability import tracing_cases as stress_cases
+from beam_warp.stability.page import HOW_TO_READ, OCCLUSION_TEXT
+from beam_warp.stability.tracing import HIERARCHIES, run_case, scene_under
+from beam_warp.stability.tracing_cases import CASES, case_of
+from beam_warp.trace.reference import rotation_matrices, visibility_enclosure, visibility_reference
+from beam_warp.trace.scene import BACKENDS
+from beam_warp.trace.transmittance import EXACT, TraceOptions
+
+SMALL = [case for case in CASES if not case.large]
+
+
+class TestCases:
+    @pytest.mark.parametrize("hierarchy", HIERARCHIES)
+    @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
+    def test_holds(self, device, hierarchy, case):
+        """The bound of each ray is derived in `beam_warp.trace.reference`: no case has a tolerance."""
+        (outcome,) = run_case(case, device, hierarchies=(hierarchy,))
+        assert outcome.faults == ()
+
+    @pytest.mark.parametrize("hierarchy", HIERARCHIES)
+    @pytest.mark.parametrize("seed", range(12))
+    def test_random_clouds_stay_in_their_intervals(self, device, hierarchy, seed):
+        """Every mixture of scales, rules and degrees, without the stop that would hide rounding below it."""
+        rng = np.random.default_rng(seed)
+        cloud = random_cloud(rng, 300, scale=[(-3.5, 0.8), (-5.0, 1.5), (-3.0, 2.5), (-7.0, 1.0)][seed % 4])
+        cloud = cloud.with_arrays(opacities=0.6 * cloud.opacities)
+        rays = stress_cases.aimed_rays(rng, cloud, 300, distance=(-0.1, 2.0))
+        degree, front = (2, 2, 4)[seed % 3], ("peak", "entry")[seed // 2 % 2]
+        t_max = rng.uniform(0.0, 2.0, 300).astype(np.float32) if seed % 5 == 0 else np.inf
+        scene = scene_under(hierarchy, cloud, device, degree)
+        result = visibility(scene, *rays, t_max=t_max, options=TraceOptions(front=front, stop=0.0))
+        truth = visibility_enclosure(
+            stability.traced_cloud(cloud, scene),
+            *rays,
+            t_max=t_max,
+            front=front,
+            response_degree=degree,
+            middle=scene.origin,
+        )
+        assert ((result >= truth.low) & (result <= truth.high)).all()
+
+    def test_names_are_unique(self):
+        assert len({case.name for case in CASES}) == len(CASES)
+
+    @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
+    def test_cases_are_the_same_each_time(self, case):
+        one, other = case.build(), case.build()
+        assert np.array_equal(one.cloud.positions, other.cloud.positions)
+        assert np.array_equal(one.origins, other.origins)
+
+    @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
+    def test_rays_meet_something(self, case):
+        """A case whose rays all miss would prove nothing."""
+        stress = case.build()
+        if stress.known is None and len(stress.origins):
+            (outcome,) = run_case(case, "cpu", hierarchies=("warp",))
+            truth = stability.Truth.of(stress, Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
+            assert (truth.rays.hits > 0).mean() > 0.5, outcome.did
+
+
+def test_the_page_in_the_docs_is_of_these_cases():
+    """After a change of cases or of the text: beam stability --large --out docs/stability.md."""
+    page = (Path(__file__).parents[2] / "docs" / "stability.md").read_text(encoding="utf-8")
+    listed = [line.split(" | ")[0].removeprefix("| ") for line in page.splitlines() if line.startswith("| ")]
+    names = [case.name for case in CASES]
+    assert [name for name in listed if name in names] == names
+    assert HOW_TO_READ.partition("{command}")[2] in page
+    assert OCCLUSION_TEXT in page
+
+
+class TestTheSuiteItself:
+    """A check that cannot fail is none."""
+
+    def outcome(self, monkeypatch, change, name="round"):
+        real = stability.visibility
+        monkeypatch.setattr(stability, "visibility", lambda *rays, **options: change(real(*rays, **options)))
+        return run_case(case_of(name), "cpu", hierarchies=("warp",))[0]
+
+    def test_a_small_bias_is_noticed(self, monkeypatch):
+        outcome = self.outcome(monkeypatch, lambda v: v * np.float32(1.0 + 1e-3))
+        assert any("rays differ by more than rounding explains" in fault for fault in outcome.faults)
+        assert not outcome.passed
+
+    def test_lost_hits_are_noticed(self, monkeypatch):
+        def lose(v):
+            v[7] = 1.0
+            return v
+
+        assert self.outcome(monkeypatch, lose).faults == ("1 rays differ by more than rounding explains",)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1.5])
+    def test_nonsense_is_noticed(self, monkeypatch, bad):
+        def spoil(v):
+            v[3] = bad
+            return v
+
+        outcome = self.outcome(monkeypatch, spoil, "duplicates on 2⁻ᵏ")
+        assert outcome.faults[0] == "1 rays are not finite or outside [0, 1]"
+        assert np.isfinite(outcome.error)
+
+    @pytest.mark.parametrize(
+        ("name", "change", "fault"),
+        [
+            ("transmittance", lambda x: x * np.float32(1.001), "rays let pass what rounding does not explain"),
+            ("expected_depth", lambda x: x * np.nan, "rays have no finite expected depth in front"),
+            ("expected_depth", lambda x: -x, "rays have no finite expected depth in front"),
+            ("normals", lambda x: 0.999 * x, "rays have normals that are no directions"),
+            ("normals", lambda x: np.nan * x, "rays have normals that are no directions"),
+            ("depth", lambda x: np.random.default_rng(0).permutation(x), "rays meet their thresholds out of order"),
+            ("depth", lambda x: x * np.nan, "rays meet their thresholds out of order"),
+        ],
+        ids=str,
+    )
+    def test_wrong_surfaces_are_noticed(self, monkeypatch, name, change, fault):
+        real = stability.closest_surface
+        seen = []
+
+        def spoiled(*rays, **options):
+            hit = real(*rays, **options)
+            seen.append(hit)
+            return dataclasses.replace(hit, **{name: change(getattr(hit, name))}) if len(seen) == 1 else hit
+
+        monkeypatch.setattr(stability, "closest_surface", spoiled)
+        (outcome,) = run_case(case_of("round"), "cpu", hierarchies=("wide",))
+        assert len(outcome.faults) == 1
+        assert fault in outcome.faults[0]
+
+    @pytest.mark.parametrize(
+        ("change", "fault"),
+        [
+            (lambda v: np.maximum(v, np.arange(len(v)) % 10 == 0), "Bernoulli samples have mean"),
+            (lambda v: np.minimum(v, np.arange(len(v)) % 10 > 0), "Bernoulli samples have mean"),
+            (lambda v: v * 0.5, "Bernoulli samples are not 0 or 1"),
+            (lambda v: v * np.nan, "Bernoulli samples are not 0 or 1"),
+        ],
+        ids=["too bright", "too dark", "half", "NaN"],
+    )
+    def test_biased_samples_are_noticed(self, monkeypatch, change, fault):
+        real = stability.visibility
+
+        def spoiled(*rays, options, **others):
+            v = real(*rays, options=options, **others)
+            return change(v) if options.acceptance == "bernoulli" else v
+
+        monkeypatch.setattr(stability, "visibility", spoiled)
+        (outcome,) = run_case(case_of("t_max cuts through Gaussians"), "cpu", hierarchies=("wide",))
+        assert len(outcome.faults) == 1
+        assert outcome.faults[0].startswith(fault)
+
+    def test_counts_that_differ_are_noticed(self):
+        case = case_of("opacity 0, 1/255, just above, 1")
+        wrong = dataclasses.replace(
+            case, build=lambda: dataclasses.replace(case.build(), expected={"dropped": 7}, expected_left_out=(1, 0, 0))
+        )
+        (outcome,) = run_case(wrong, "cpu", hierarchies=("warp",))
+        assert outcome.faults == ("dropped must be 7, got 200", "rows left out must be (1, 0, 0), got (0, 0, 0)")
+
+
+class TestReference:
+    """The oracle has one too: a loop over Gaussians, for each rule."""
+
+    def loop(self, cloud, origins, directions, *, t_max=np.inf, front="peak", cull=False, response_degree=2):
+        o, d = origins.astype(np.float64), directions.astype(np.float64)
+        result = np.ones(len(o))
+        for k in range(len(cloud)):
+            whitening = rotation_matrices(cloud.orientations[k : k + 1])[0].T / cloud.scales[k].astype(float)[:, None]
+            q, v = (o - cloud.positions[k].astype(float)) @ whitening.T, d @ whitening.T
+            vv = (v * v).sum(1)
+            t = -(q * v).sum(1) / vv
+            squared = ((q + t[:, None] * v) ** 2).sum(1)
+            exponent = -0.5 * squared if response_degree == 2 else -(squared**2) / 18.0
+            alpha = np.minimum(0.99, float(cloud.opacities[k]) * np.exp(exponent))
+            level = np.log(255.0 * float(cloud.opacities[k]))
+            support = 2.0 * level if response_degree == 2 else np.sqrt(18.0 * level) if level > 0.0 else -1.0
+            start = t - (np.sqrt(np.maximum(support - squared, 0.0) / vv) if front == "entry" else 0.0)
+            hit = (alpha >= 1.0 / 255.0) & (start > 0.0) & (t < t_max)
+            if cull:
+                hit &= d @ cloud.normals[k].astype(float) <= 0.0
+            result *= np.where(hit, 1.0 - alpha, 1.0)
+        return result
+
+    @pytest.mark.parametrize(
+        "rules",
+        [
+            {},
+            {"front": "entry"},
+            {"cull": True},
+            {"response_degree": 4},
+            {"t_max": 0.4},
+            {"t_max": np.linspace(0.0, 2.0, 150)},
+            {"t_max": 0.5, "front": "entry", "cull": True, "response_degree": 4},
+        ],
+        ids=str,
+    )
+    def test_agrees_with_a_loop(self, rng, rules):
+        cloud = random_cloud(rng, 200, scale=(-2.5, 0.8))
+        n = rng.normal(size=(200, 3))
+        cloud = cloud.with_arrays(normals=n / np.linalg.norm(n, axis=1, keepdims=True))
+        rays = random_rays(rng, 150)
+        expected = self.loop(cloud, *rays, **rules)
+        assert visibility_reference(cloud, *rays, **rules) == pytest.approx(expected, abs=1e-12)
+        enclosure = visibility_enclosure(cloud, *rays, **rules)
+        assert enclosure.exact == pytest.approx(expected, abs=1e-12)
+        assert (enclosure.low <= expected).all()
+        assert (enclosure.high >= expected).all()
+        assert expected.min() < 0.5
+
+    def test_without_roundings_the_interval_is_the_value(self, rng):
+        cloud, rays = random_cloud(rng, 200, scale=(-2.5, 0.8)), random_rays(rng, 150)
+        enclosure = visibility_enclosure(cloud, *rays, roundoff=0.0)
+        assert np.array_equal(enclosure.low, enclosure.exact)
+        assert np.array_equal(enclosure.high, enclosure.exact)
+
+    def test_the_interval_follows_distance_over_scale(self, rng):
+        """Ten times farther away or ten times smaller: ten times wider."""
+        widths = []
+        for scale, distance in ((1e-2, 1.0), (1e-2, 10.0), (1e-3, 1.0)):
+            cloud = GaussianCloud(
+                positions=np.zeros((1, 3)), orientations=[[0, 0, 0, 1.0]], scales=[[scale] * 3], opacities=[0.5]
+            )
+            origin = np.array([[-distance, scale, 0.0]])
+            widths.append(visibility_enclosure(cloud, origin, [[1.0, 0.0, 0.0]]).width[0])
+        assert widths[1] / widths[0] == pytest.approx(10.0, rel=0.2)
+        assert widths[2] / widths[0] == pytest.approx(10.0, rel=0.2)
+
+
+def pairs(rng, scales, *, distance, center=0.0, count=2000):
+    """Gaussians, one a ray that passes it at about one standard deviation, all float32, and the exact distance."""
+    q = rng.normal(size=(count, 4))
+    rotation = rotation_matrices(q)
+    whitening = (rotation.transpose(0, 2, 1) / np.asarray(scales)[:, None]).astype(np.float32)
+    c = (center + rng.uniform(-1.0, 1.0, (count, 3))).astype(np.float32)
+    d = rng.normal(size=(count, 3))
+    d = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+    target = c + np.einsum("nij,nj->ni", rotation, rng.normal(size=(count, 3)) * scales)
+    o = (target - distance * d).astype(np.float32)
+    p, v = (np.einsum("nij,nj->ni", whitening.astype(float), x.astype(float)) for x in (o.astype(float) - c, d))
+    exact = np.linalg.norm(np.cross(p, v), axis=1) / np.linalg.norm(v, axis=1)
+    return o, d, c, whitening, exact
+
+
+def response_error(distance_squared, exact):
+    with np.errstate(over="ignore", invalid="ignore"):
+        response = np.exp(np.float32(-0.5) * distance_squared)
+    return np.nan_to_num(np.abs(response - np.exp(-0.5 * exact**2)), nan=1.0, posinf=1.0).max()
+
+
+def times(matrix, v):
+    return np.einsum("nij,nj->ni", matrix, v)
+
+
+def dot(a, b):
+    return np.einsum("nk,nk->n", a, b)
+
+
+def discriminant(o, d, c, whitening):
+    """C - B^2 / A: textbook quadratic."""
+    p, v = times(whitening, o - c), times(whitening, d)
+    return dot(p, p) - dot(p, v) ** 2 / dot(v, v)
+
+
+def affine(o, d, c, whitening):
+    """Cross form with M o + b, b = -M c folded beforehand."""
+    p, v = times(whitening, o) - times(whitening, c), times(whitening, d)
+    cross = np.cross(p, v)
+    return dot(cross, cross) / dot(v, v)
+
+
+def shifted(o, d, c, whitening):
+    """What the kernel does: to the closest point first."""
+    p = o - c
+    p = p - d * dot(p, d)[:, None]
+    q, v = times(whitening, p), times(whitening, d)
+    cross = np.cross(q, v)
+    return dot(cross, cross) / dot(v, v)
+
+
+@wp.kernel
+def count_boxes_kernel(bvh: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], out: wp.array[int]):
+    i = wp.tid()
+    query = wp.bvh_query_ray(bvh, origins[i], directions[i])
+    index = int(0)  # noqa: RUF046, UP018  # a variable of the kernel, not a constant
+    found = int(0)  # noqa: RUF046, UP018
+    while wp.bvh_query_next(query, index):
+        found += 1
+    out[i] = found
+
+
+class TestNaiveForms:
+    """Each precaution is there for something: without it the same cases fail."""
+
+    def test_discriminant_loses_benign_cases(self, rng):
+        """Its error is u (distance / sigma)^2: 1.5e-2, and 1.5 ten times farther away; ours is u distance / sigma."""
+        for distance, floor in ((2.0, 5e-3), (20.0, 0.5)):
+            o, d, c, whitening, exact = pairs(rng, np.array([4e-2, 4e-3, 4e-3]), distance=distance)
+            assert response_error(discriminant(o, d, c, whitening), exact) > floor
+            assert response_error(shifted(o, d, c, whitening), exact) < 4.0 * 2.0**-24 * distance / 4e-3
+
+    def test_discriminant_loses_needles(self, rng):
+        o, d, c, whitening, exact = pairs(rng, np.array([1e-1, 1e-5, 1e-5]), distance=0.5)
+        assert response_error(discriminant(o, d, c, whitening), exact) > 0.9
+
+    def test_affine_form_loses_scenes_far_from_the_origin(self, rng):
+        o, d, c, whitening, exact = pairs(rng, np.array([4e-2, 4e-3, 4e-3]), distance=0.5, center=1e4)
+        assert response_error(affine(o, d, c, whitening), exact) > 0.1  # u 1e4 / sigma = 0.15
+        assert response_error(shifted(o, d, c, whitening), exact) < 1e-4
+
+    def test_scales_without_a_floor_overflow(self, rng):
+        o, d, c, whitening, _ = pairs(rng, np.array([1.0, 1.0, 1e-20]), distance=0.5, count=50)
+        with np.errstate(over="ignore", invalid="ignore"):
+            assert not np.isfinite(shifted(o, d, c, whitening)).all()
+
+    def test_support_of_what_cannot_be_seen_is_not_a_number(self):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            assert np.isnan(np.sqrt(2.0 * np.log(255.0 * np.array([0.0, 1.0 / 300.0])))).all()
+
+    def test_one_broken_row_makes_every_ray_not_a_number(self):
+        positions = np.zeros((1000, 3), np.float32)
+        positions[500] = np.nan
+        middle = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
+        assert np.isnan(np.zeros((10, 3)) - middle).all()
+        assert np.isnan(np.prod(1.0 - np.minimum(0.99, positions[:, 0])))
+
+    def test_zero_components_lose_boxes(self):
+        """Warp's slab test computes 0 * inf where an axis-parallel ray runs in a box plane, and misses that box.
+
+        The floor under direction components removes the NaN; that boxes are a little larger than their Gaussians
+        makes what remains, rays that leave along the plane, miss nothing that they would meet.
+        """
+        stress = case_of("axis-parallel rays on box planes").build()
+        lower, upper = stress_cases.box_planes(stress.cloud)
+        bvh = wp.Bvh(*(wp.array(plane, dtype=wp.vec3, device="cpu") for plane in (lower, upper)), leaf_size=1)
+        d = stress.directions
+        found = []
+        for directions in (d, np.where(d == 0.0, np.copysign(np.float32(1e-12), d), d)):
+            out = wp.zeros(len(d), dtype=int, device="cpu")
+            rays = [wp.array(vectors, dtype=wp.vec3, device="cpu") for vectors in (stress.origins, directions)]
+            wp.launch(count_boxes_kernel, len(d), inputs=[bvh.id, *rays], outputs=[out], device="cpu")
+            found.append(out.numpy())
+        o, along = stress.origins[:, None, :], (d != 0.0)[:, None, :]
+        touched = (((o >= lower) & (o <= upper)) | along).all(axis=2).sum(axis=1)
+        entered = (((o > lower) & (o < upper)) | along).all(axis=2).sum(axis=1)
+        assert (found[0] < touched).mean() > 0.2
+        assert (found[1] < touched).mean() < (found[0] < touched).mean()
+        assert (found[1] >= entered).all()
+
+
+class TestOnTheDevice:
+    """Arrays that come from a device were never checked: packing leaves out what cannot be traced, and says why."""
+
+    def pack(self, device, **changes):
+        arrays = {
+            "positions": np.zeros((1, 3)),
+            "orientations": np.array([[0, 0, 0, 1.0]]),
+            "scales": np.full((1, 3), 0.1),
+            "opacities": np.array([0.5]),
+        } | changes
+        types = {"positions": wp.vec3, "orientations": wp.quat, "scales": wp.vec3, "opacities": float}
+        inputs = [wp.array(np.float32(arrays[name]), dtype=types[name], device=device) for name in types]
+        gaussians = Gaussians()
+        for name in ("center_opacity", "whitening_0", "whitening_1", "whitening_2"):
+            setattr(gaussians, name, wp.zeros(1, dtype=wp.vec4, device=device))
+        gaussians.degree = 2
+        lower, upper = (wp.zeros(1, dtype=wp.vec3, device=device) for _ in range(2))
+        fates, takes_part = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        outputs = (gaussians, lower, upper, fates, takes_part)
+        launch_pack_gaussians(*inputs, wp.vec3(), 1e-7, 1e-4, *outputs, wp.get_device(device))
+        packed = [getattr(gaussians, f"whitening_{k}").numpy() for k in range(3)]
+        values = [gaussians.center_opacity.numpy()[:, :3], lower.numpy(), upper.numpy(), *packed]
+        return int(fates.numpy()[0]), float(packed[0][0, 3]), all(np.isfinite(value).all() for value in values)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize(("name", "width"), [("positions", 3), ("orientations", 4), ("scales", 3)])
+    def test_broken_vectors(self, device, name, width, bad):
+        for column in range(width):
+            value = np.full((1, width), 0.5)
+            value[0, column] = bad
+            assert self.pack(device, **{name: value}) == (int(NOT_FINITE), -1.0, True), column
+
+    @pytest.mark.parametrize(("bad", "fate"), [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-np.inf, INVISIBLE)])
+    def test_broken_opacities(self, device, bad, fate):
+        assert self.pack(device, opacities=[bad]) == (int(fate), -1.0, True)
+
+    @pytest.mark.parametrize(
+        ("changes", "fate"),
+        [
+            ({}, TRACED),
+            ({"scales": [[0.1, -0.1, 0.1]]}, NOT_FINITE),
+            ({"orientations": [[0.0, 0.0, 0.0, 0.0]]}, NOT_FINITE),
+            ({"scales": [[0.1, 0.1, 0.0]]}, RAISED),
+            ({"opacities": [1.0 / 255.0]}, INVISIBLE),
+            ({"opacities": [0.0]}, INVISIBLE),
+            ({"opacities": [1.1]}, NOT_FINITE),
+        ],
+        ids=str,
+    )
+    def test_fates(self, device, changes, fate):
+        found, radius, finite = self.pack(device, **changes)
+        assert found == int(fate)
+        assert finite
+        assert (radius > 0.0) == (fate in (TRACED, RAISED))
+
+    @pytest.mark.parametrize("backend", BACKENDS)
+    @pytest.mark.parametrize("tree", ["refit", "fast", "quality"])
+    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, device, rng, backend, tree):
+        cloud, rays = random_cloud(rng, 60, scale=(-2.0, 0.3), opacity=(0.1, 0.9)), random_rays(rng, 200)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        positions = cloud.positions.copy()
+        positions[7] = np.nan
+        scene.move(positions, cloud.orientations, cloud.scales, tree=tree)
+        truth = visibility_enclosure(
+            cloud.select(np.delete(np.arange(60), 7)), *rays, stop=EXACT.stop, middle=scene.origin
+        )
+        result = visibility(scene, *rays)
+        assert ((result >= truth.low) & (result <= truth.high)).all()
+        assert (scene.report.traced, scene.report.not_finite) == (59, 1)

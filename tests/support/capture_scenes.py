@@ -1,0 +1,59 @@
+"""Views of a ball whose masks are known exactly: what tests of reconstruction's first steps start from."""
+
+import numpy as np
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.world.camera import Camera
+
+SUPERSAMPLES = 4
+"""Along each side of a pixel: coverage is a box filter's to a quarter of a row, so that edges are right to 1/8."""
+
+EDGE_ERROR = 0.25
+"""Pixels that the place of half coverage, linear between centres, is off the edge: at 45 degrees, where coverage is
+least linear in the distance, 0.1, of the samples 0.125, of the circle's curvature less than the rest."""
+
+
+def directions(count):
+    """Unit vectors evenly over the sphere (spherical Fibonacci)."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * i
+    ring = np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+def cameras_around(count, *, distance=2.0, size=64, fov=40.0, center=(0.0, 0.0, 0.0)):
+    """Cameras evenly around a point that look at it."""
+    middle = np.asarray(center, float)
+    return [
+        Camera.look_at(
+            middle + distance * d,
+            middle,
+            up=(0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0),
+            width=size,
+            height=size,
+            vertical_fov=fov,
+        )
+        for d in directions(count)
+    ]
+
+
+def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0.3, 0.1)):
+    """One view of a ball of one colour: its rays pass the centre at no more than the radius."""
+    s = SUPERSAMPLES
+    x = (np.arange(camera.width * s) + 0.5) / s
+    y = (np.arange(camera.height * s) + 0.5) / s
+    rays = np.ones((len(y), len(x), 3))
+    rays[..., 0] = (x - camera.center_x) / camera.focal_x
+    rays[..., 1] = ((y - camera.center_y) / camera.focal_y)[:, None]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    to_center = camera.camera_to_world[:3, :3].T @ (np.asarray(center, float) - camera.position)
+    along = rays @ to_center
+    hit = (along > 0.0) & ((to_center**2).sum() - along**2 <= radius**2)
+    alpha = hit.reshape(camera.height, s, camera.width, s).mean(axis=(1, 3), dtype=np.float32)
+    return CapturedView(name=name, camera=camera, color=alpha[..., None] * np.float32(color), alpha=alpha)
+
+
+def ball_views(count, **options):
+    """Views of a ball of radius 0.5 around the origin."""
+    return [ball_view(f"view_{i}", camera) for i, camera in enumerate(cameras_around(count, **options))]

@@ -1,0 +1,78 @@
+"""A painted ball in closed form: what every camera sees of it, wherever it is and however it is turned."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.image.color import LINEAR_REC709
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+RADIUS = 0.5
+
+SH_BASIS_0 = 0.28209479177387814
+
+SAMPLES = 4
+"""Side of the square of rays of a pixel."""
+
+
+def rig(count=6, size=40, **changes):
+    """Cameras around the origin, some from above, some from below."""
+    options = {"width": size, "height": size, "vertical_fov": 32.0, **changes}
+    return [Camera.orbit((0, 0, 0), 2.5, 360.0 * k / count, (15.0, -20.0)[k % 2], **options) for k in range(count)]
+
+
+def paint(points):
+    """Scene-linear colour of points of the unit sphere, (..., 3): broad waves, different in every direction."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    waves = np.stack([np.sin(4.0 * x + 1.0), np.sin(5.0 * y - 0.5), np.sin(4.5 * z + 2.0 * x)], axis=-1)
+    return 0.35 + 0.25 * waves
+
+
+def ball_view(camera, center=(0.0, 0.0, 0.0), turn=None, *, with_alpha=True, name="view"):
+    """The mean over each pixel's area of a ball on black, ``SAMPLES``^2 rays each."""
+    fine = camera.supersampled(SAMPLES)
+    rays, offset = fine.directions(), fine.position - np.asarray(center, float)
+    along = rays @ offset
+    square = along**2 - offset @ offset + RADIUS**2
+    hit = square > 0.0
+    distance = -along - np.sqrt(np.where(hit, square, 0.0))
+    normals = (offset + distance[..., None] * rays) / RADIUS
+    own = normals.reshape(-1, 3) @ (turn or Rotation.identity()).as_matrix()  # R^T n, row by row
+    image = np.where(hit[..., None], paint(own.reshape(normals.shape)), 0.0)
+    color, alpha = (block_means(array) for array in (image, hit[..., None].astype(float)))
+    return CapturedView(
+        name=name,
+        camera=camera,
+        color=color.astype(np.float32),
+        alpha=alpha[..., 0].astype(np.float32) if with_alpha else None,
+    )
+
+
+def ball_views(cameras, center=(0.0, 0.0, 0.0), turn=None, **options):
+    return [ball_view(camera, center, turn, name=f"view {k}", **options) for k, camera in enumerate(cameras)]
+
+
+def block_means(image):
+    height, width = image.shape[0] // SAMPLES, image.shape[1] // SAMPLES
+    return image.reshape(height, SAMPLES, width, SAMPLES, -1).mean(axis=(1, 3))
+
+
+def ball_cloud(count=300, *, radius=RADIUS, painted=True):
+    """Discs on the ball, evenly along a spiral, local z outward; grey unless they are painted."""
+    z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
+    ring = np.sqrt(1.0 - z**2)
+    normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
+    spacing = radius * np.sqrt(4.0 * np.pi / count)
+    turns = np.stack([-normals[:, 1], normals[:, 0], np.zeros(count), 1.0 + normals[:, 2]], axis=-1)
+    color = paint(normals) if painted else np.full((count, 3), 0.35)
+    return GaussianCloud(
+        positions=radius * normals,
+        orientations=turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
+        opacities=np.full(count, 0.8),
+        radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
+        radiance_color_space=LINEAR_REC709,
+        ids=np.arange(count),
+    )

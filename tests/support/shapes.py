@@ -1,0 +1,63 @@
+"""Shapes tiled with flat Gaussians, for tests with closed forms; used by several test files."""
+
+import numpy as np
+
+from beam_warp.world.gaussians import GaussianCloud
+
+
+def quaternions_from_normals(normals):
+    """Shortest rotations that carry +z to each normal, xyzw."""
+    w = 1.0 + normals[:, 2]
+    q = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), np.maximum(w, 1e-6)], axis=1)
+    q[w < 1e-6] = (1.0, 0.0, 0.0, 0.0)
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def tiles(points, normals, spacing, *, flatness=0.1, opacity=0.95):
+    """One Gaussian per point: tangential deviation 0.65 spacing, so that the surface is closed."""
+    count = len(points)
+    return {
+        "positions": np.asarray(points),
+        "orientations": quaternions_from_normals(np.asarray(normals, dtype=float)),
+        "scales": np.tile([0.65 * spacing, 0.65 * spacing, 0.65 * spacing * flatness], (count, 1)),
+        "opacities": np.full(count, opacity),
+    }
+
+
+def cloud_of(*parts, **fields):
+    return GaussianCloud(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}, **fields)
+
+
+def sphere_points(count):
+    """Spherical Fibonacci set and its spacing on the unit sphere."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * i
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1), np.sqrt(4.0 * np.pi / count)
+
+
+def disc_points(radius, spacing):
+    """Sunflower set on a disc in the plane z = 0."""
+    count = int(np.pi * radius**2 / spacing**2)
+    i = np.arange(count) + 0.5
+    r = radius * np.sqrt(i / count)
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * i
+    return np.stack([r * np.cos(phi), r * np.sin(phi), np.zeros(count)], axis=1)
+
+
+def random_cloud(rng, count, *, scale=(-3.5, 0.8), opacity=(0.0, 1.0)):
+    q = rng.normal(size=(count, 4))
+    return GaussianCloud(
+        positions=rng.uniform(-1.0, 1.0, (count, 3)),
+        orientations=q / np.linalg.norm(q, axis=1, keepdims=True),
+        scales=np.exp(rng.normal(*scale, (count, 3))),
+        opacities=rng.uniform(*opacity, count),
+    )
+
+
+def random_rays(rng, count):
+    d = rng.normal(size=(count, 3))
+    return rng.uniform(-1.0, 1.0, (count, 3)).astype(np.float32), (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(
+        np.float32
+    )

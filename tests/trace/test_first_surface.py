@@ -1,0 +1,398 @@
+"""What rays see: closed forms, then a float64 sort and blend, rounds of the buffer, ties, and what must be refused."""
+
+import numpy as np
+import pytest
+import warp as wp
+from support.shapes import random_cloud, random_rays
+
+from beam_warp import GaussianCloud, Scene, closest_surface, visibility
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE
+from beam_warp.stability.tracing import traced_cloud
+from beam_warp.trace.reference import FLOAT32_ROUNDOFF, closest_surface_reference, rotation_matrices
+from beam_warp.trace.scene import BACKENDS
+from beam_warp.trace.transmittance import TraceOptions
+
+WHOLE = TraceOptions(stop=0.0)
+FIELDS = (
+    "depth",
+    "expected_depth",
+    "normals",
+    "attributes",
+    "transmittance",
+    "gaussians",
+    "hit_counts",
+    "mesh_depth",
+    "mesh_faces",
+)
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    return request.param
+
+
+def aligned(positions, opacities, scales=(0.1, 0.1, 0.1)):
+    count = len(positions)
+    return GaussianCloud(
+        positions=positions,
+        orientations=np.tile([0, 0, 0, 1.0], (count, 1)),
+        scales=np.broadcast_to(scales, (count, 3)),
+        opacities=np.broadcast_to(opacities, count),
+    )
+
+
+def along_x(y=0.0, z=0.0, x=-2.0):
+    return np.array([[x, y, z]]), np.array([[1.0, 0.0, 0.0]])
+
+
+def blend(alphas, values):
+    """Front to back, by hand."""
+    weights = np.asarray(alphas) * np.cumprod(np.r_[1.0, 1.0 - np.asarray(alphas)])[:-1]
+    return weights @ np.asarray(values) / weights.sum()
+
+
+class TestClosedForm:
+    @pytest.mark.parametrize(("y", "z"), [(0.0, 0.0), (0.1, 0.0), (0.15, -0.3)])
+    def test_one_gaussian(self, device, backend, y, z):
+        scales, opacity = np.array([0.1, 0.2, 0.3]), 0.9
+        scene = Scene.from_gaussians(aligned([[0, 0, 0]], opacity, scales), device, backend=backend)
+        hit = closest_surface(scene, *along_x(y, z), attributes=[[3.0, -1.0]], threshold=0.8)
+        squared = (y / 0.2) ** 2 + (z / 0.3) ** 2
+        entry = np.array([-np.sqrt(2.0 * np.log(255.0 * opacity) - squared), y / 0.2, z / 0.3])
+        normal = entry / scales
+        assert hit.transmittance == pytest.approx(1.0 - opacity * np.exp(-0.5 * squared), abs=1e-6)
+        assert hit.depth == pytest.approx(2.0, abs=1e-6)
+        assert hit.expected_depth == pytest.approx(2.0, abs=1e-6)
+        assert hit.normals[0] == pytest.approx(normal / np.linalg.norm(normal), abs=1e-6)
+        assert hit.attributes[0] == pytest.approx([3.0, -1.0], rel=1e-6)
+        assert (hit.gaussians[0], hit.hit_counts[0], hit.mesh_faces[0]) == (0, 1, -1)
+        assert np.isinf(hit.mesh_depth[0])
+
+    def test_normal_of_a_turned_gaussian(self, device, backend, rng):
+        """R S^-1 y, against the gradient of the squared whitened distance at the entry."""
+        q = rng.normal(size=(1, 4))
+        q /= np.linalg.norm(q)
+        scales = np.array([0.3, 0.1, 0.02])
+        cloud = aligned([[0, 0, 0]], 0.9, scales).with_arrays(orientations=q)
+        origin, direction = along_x(0.01, 0.02)
+        whitening = rotation_matrices(cloud.orientations)[0].T / cloud.scales[0].astype(float)[:, None]
+        a, b = whitening @ origin[0], whitening @ direction[0]
+        radius = 2.0 * np.log(255.0 * float(cloud.opacities[0]))
+        t = (-a @ b - np.sqrt((a @ b) ** 2 - (b @ b) * (a @ a - radius))) / (b @ b)
+        gradient = whitening.T @ (a + t * b)
+        hit = closest_surface(Scene.from_gaussians(cloud, device, backend=backend), origin, direction)
+        truth = closest_surface_reference(cloud, origin, direction)
+        assert truth.normals[0] == pytest.approx(gradient / np.linalg.norm(gradient), abs=1e-9)
+        assert np.linalg.norm(hit.normals - truth.normals) <= truth.normal_error[0] < 1e-3
+
+    def test_three_on_a_ray(self, device, backend):
+        cloud = aligned([[2, 0, 0], [0, 0, 0], [1, 0, 0]], [0.3, 0.1, 0.6])  # not in order
+        colors = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        hit = closest_surface(scene, *along_x(), attributes=colors)
+        alphas, order = [0.1, 0.6, 0.3], [1, 2, 0]
+        assert hit.transmittance == pytest.approx(0.9 * 0.4 * 0.7, abs=1e-6)
+        assert hit.attributes[0] == pytest.approx(blend(alphas, colors[order]), abs=1e-6)
+        assert hit.expected_depth == pytest.approx(blend(alphas, [2.0, 3.0, 4.0]), abs=1e-6)
+        assert hit.depth == pytest.approx(3.0, abs=1e-6)  # 0.9, then 0.36
+        assert (hit.gaussians[0], hit.hit_counts[0]) == (2, 3)
+        assert hit.normals[0] == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
+
+    @pytest.mark.parametrize(("threshold", "row"), [(1.0, 1), (0.91, 1), (0.89, 2), (0.37, 2), (0.35, 0), (0.26, 0)])
+    def test_threshold(self, device, backend, threshold, row):
+        scene = Scene.from_gaussians(
+            aligned([[2, 0, 0], [0, 0, 0], [1, 0, 0]], [0.3, 0.1, 0.6]), device, backend=backend
+        )
+        hit = closest_surface(scene, *along_x(), threshold=threshold)
+        assert (hit.gaussians[0], hit.depth[0]) == (row, pytest.approx([4.0, 2.0, 3.0][row], abs=1e-6))
+
+    def test_threshold_that_is_not_met(self, device, backend):
+        scene = Scene.from_gaussians(aligned([[2, 0, 0]], 0.3), device, backend=backend)
+        hit = closest_surface(scene, *along_x(), threshold=0.5)
+        assert (hit.gaussians[0], hit.depth[0], hit.hit_counts[0]) == (-1, np.inf, 1)
+        assert hit.expected_depth == pytest.approx(4.0, abs=1e-6)
+
+    def test_reach_ends_before_peaks(self, device, backend):
+        scene = Scene.from_gaussians(aligned([[0, 0, 0], [1, 0, 0]], [0.3, 0.4]), device, backend=backend)
+        hit = closest_surface(scene, np.tile(along_x()[0], (3, 1)), np.tile(along_x()[1], (3, 1)), t_max=[1.9, 2.5, 9])
+        assert hit.hit_counts.tolist() == [0, 1, 2]
+        assert hit.transmittance == pytest.approx([1.0, 0.7, 0.42], abs=1e-6)
+
+    def test_blending_ends_below_the_stop(self, device, backend):
+        scene = Scene.from_gaussians(aligned(np.arange(9)[:, None] * [1.0, 0, 0], 0.5), device, backend=backend)
+        hit = closest_surface(scene, *along_x(), options=TraceOptions(stop=0.2))
+        assert (hit.hit_counts[0], hit.transmittance[0]) == (3, pytest.approx(0.125, abs=1e-6))
+
+    def test_nothing_to_see(self, device, backend):
+        for cloud in (aligned(np.zeros((0, 3)), []), aligned([[0, 5, 0]], 0.5), aligned([[0, 0, 0]], 0.0)):
+            scene = Scene.from_gaussians(cloud, device, backend=backend)
+            hit = closest_surface(scene, *along_x(), attributes=np.ones((len(cloud), 2)))
+            assert (hit.depth[0], hit.expected_depth[0], hit.transmittance[0]) == (np.inf, np.inf, 1.0)
+            assert (hit.gaussians[0], hit.hit_counts[0]) == (-1, 0)
+            assert not hit.normals.any()
+            assert not hit.attributes.any()
+
+    def test_no_rays(self, device, backend, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 5), device, backend=backend)
+        hit = closest_surface(scene, np.zeros((0, 3)), np.zeros((0, 3)), attributes=np.zeros((5, 4)))
+        shapes = [getattr(hit, name).shape for name in FIELDS]
+        assert shapes == [(0,), (0,), (0, 3), (0, 4), (0,), (0,), (0,), (0,), (0,)]
+
+    def test_rays_that_graze_the_support_have_finite_results(self, device, backend):
+        """Leaf and packed rows may round to different sides of the edge; 0 / 0 was the outcome."""
+        rng = np.random.default_rng(0)
+        q, count = rng.normal(size=(1, 4)), 20_000
+        cloud = aligned([[0.3, 0.2, 0.1]], 0.8, (0.3, 0.01, 0.1)).with_arrays(orientations=q / np.linalg.norm(q))
+        rotation, scales = rotation_matrices(cloud.orientations)[0], cloud.scales[0].astype(float)
+        y = rng.normal(size=(count, 3))
+        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        edge = cloud.positions + (np.sqrt(2.0 * np.log(255.0 * 0.8)) * y * scales) @ rotation.T
+        d = np.cross((y / scales) @ rotation.T, rng.normal(size=(count, 3)))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        hit = closest_surface(Scene.from_gaussians(cloud, device, backend=backend), edge - d, d, attributes=[[1.0]])
+        met = hit.hit_counts > 0
+        assert 0.1 < met.mean() < 0.9
+        assert np.isfinite(hit.expected_depth[met]).all()
+        assert (hit.transmittance[met] < 1.0).all()
+        assert hit.attributes[met] == pytest.approx(1.0, abs=1e-6)
+        assert np.linalg.norm(hit.normals[met], axis=1) == pytest.approx(1.0, abs=1e-5)
+
+
+def require_agreement(hit, truth, least_decided):
+    """Every decided ray within its own derived bounds; the others at least finite."""
+    sure = truth.decided
+    assert sure.mean() > least_decided
+    assert np.array_equal(hit.hit_counts[sure], truth.hit_counts[sure])
+    assert np.array_equal(hit.gaussians[sure], truth.gaussians[sure])
+    assert np.array_equal(np.isinf(hit.depth), hit.gaussians < 0)
+    assert np.array_equal(np.isinf(hit.expected_depth), hit.hit_counts == 0)
+    met = sure & (truth.hit_counts > 0)
+    ends = sure & (truth.gaussians >= 0)
+    assert (np.abs(hit.transmittance - truth.transmittance) <= truth.transmittance_error + FLOAT32_ROUNDOFF)[sure].all()
+    assert (np.abs(hit.depth[ends] - truth.depth[ends]) <= truth.depth_error[ends]).all()
+    assert (np.abs(hit.expected_depth[met] - truth.expected_depth[met]) <= truth.expected_depth_error[met]).all()
+    assert (np.abs(hit.attributes - truth.attributes) <= truth.attribute_error)[met].all()
+    assert (np.linalg.norm(hit.normals - truth.normals, axis=1) <= truth.normal_error)[met].all()
+    for values in (hit.transmittance, hit.normals, hit.attributes, hit.expected_depth[hit.hit_counts > 0]):
+        assert np.isfinite(values).all()
+
+
+class TestAgainstBruteForce:
+    @pytest.mark.parametrize("channels", [0, 1, 5])
+    @pytest.mark.parametrize("scale", [(-3.5, 0.8), (-2.0, 0.3), (-4.0, 1.2)])
+    def test_random_clouds(self, device, backend, rng, scale, channels):
+        cloud = random_cloud(rng, 600, scale=scale, opacity=(0.05, 1.0))
+        origins, directions = random_rays(rng, 300)
+        directions[:30] = np.eye(3)[rng.integers(0, 3, 30)]
+        values = rng.normal(size=(600, channels)).astype(np.float32)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        hit = closest_surface(scene, origins, directions, attributes=values if channels else None)
+        truth = closest_surface_reference(
+            traced_cloud(cloud, scene), origins, directions, attributes=values, middle=scene.origin
+        )
+        assert hit.attributes.shape == (300, channels)
+        require_agreement(hit, truth, least_decided=0.8)
+        assert np.median(truth.normal_error) < 1e-2
+        assert np.median(truth.expected_depth_error) < 1e-3
+
+    @pytest.mark.parametrize(
+        "rules",
+        [
+            {"front": "entry"},
+            {"cull": True},
+            {"response_degree": 4},
+            {"stop": 0.0},
+            {"stop": 0.2},
+            {"t_max": 0.6},
+            {"t_max": np.linspace(0.0, 2.0, 200)},
+            {"threshold": 0.9},
+            {"threshold": 0.05, "stop": 0.01, "front": "entry", "cull": True, "response_degree": 4, "t_max": 1.0},
+        ],
+        ids=str,
+    )
+    def test_every_rule(self, device, backend, rng, rules):
+        cloud = random_cloud(rng, 500, scale=(-2.5, 0.5), opacity=(0.05, 0.9))
+        n = rng.normal(size=(500, 3))
+        cloud = cloud.with_arrays(normals=n / np.linalg.norm(n, axis=1, keepdims=True))
+        rays, values = random_rays(rng, 200), rng.normal(size=(500, 2)).astype(np.float32)
+        degree = rules.get("response_degree", 2)
+        scene = Scene.from_gaussians(cloud, device, backend=backend, response_degree=degree)
+        options = {name: value for name, value in rules.items() if name in ("front", "cull", "stop")}
+        others = {name: value for name, value in rules.items() if name in ("t_max", "threshold")}
+        hit = closest_surface(
+            scene, *rays, attributes=values, options=TraceOptions(**{"stop": 1e-3, **options}), **others
+        )
+        truth = closest_surface_reference(
+            traced_cloud(cloud, scene), *rays, attributes=values, middle=scene.origin, **rules
+        )
+        require_agreement(hit, truth, least_decided=0.8)
+        assert truth.hit_counts.mean() > 1.0
+
+    def test_the_reference_agrees_with_a_plain_loop(self, rng):
+        cloud, rays = random_cloud(rng, 100, scale=(-2.0, 0.5)), random_rays(rng, 50)
+        values = rng.normal(size=(100, 2))
+        truth = closest_surface_reference(cloud, *rays, attributes=values, stop=0.05)
+        for ray, (o, d) in enumerate(zip(*(x.astype(float) for x in rays), strict=True)):
+            hits = []
+            for k in range(len(cloud)):
+                whitening = (
+                    rotation_matrices(cloud.orientations[k : k + 1])[0].T / cloud.scales[k].astype(float)[:, None]
+                )
+                q, v = whitening @ (o - cloud.positions[k]), whitening @ d
+                t = -(q @ v) / (v @ v)
+                alpha = min(0.99, float(cloud.opacities[k]) * np.exp(-0.5 * np.sum((q + t * v) ** 2)))
+                if alpha >= 1.0 / 255.0 and t > 0.0:
+                    hits.append((t, k, alpha))
+            passed, total, color, first = 1.0, 0.0, np.zeros(2), -1
+            for _, k, alpha in sorted(hits):
+                if passed < 0.05:
+                    break
+                total, color = total + passed * alpha, color + passed * alpha * values[k]
+                passed *= 1.0 - alpha
+                first = k if first < 0 and passed < 0.5 else first
+            assert truth.transmittance[ray] == pytest.approx(passed, abs=1e-12)
+            assert truth.attributes[ray] == pytest.approx(color / total if total else 0.0 * color, abs=1e-9)
+            assert truth.gaussians[ray] == first
+
+
+class TestRounds:
+    """Rounds of `BUFFER_SIZE` hits: none is lost or met twice at their boundaries."""
+
+    SIZES = (1, 15, 16, 17, 31, 32, 33, 100)
+
+    def test_sizes_straddle_the_buffer(self):
+        assert {BUFFER_SIZE - 1, BUFFER_SIZE, BUFFER_SIZE + 1, 2 * BUFFER_SIZE, 2 * BUFFER_SIZE + 1} <= set(self.SIZES)
+
+    @pytest.mark.parametrize("count", SIZES)
+    def test_coincident_hits_are_blended_by_row(self, device, backend, rng, count):
+        alphas, values = rng.uniform(0.01, 0.1, count).astype(np.float32), rng.normal(size=(count, 2))
+        scene = Scene.from_gaussians(aligned(np.zeros((count, 3)), alphas), device, backend=backend)
+        hit = closest_surface(scene, *along_x(), attributes=values, options=WHOLE, threshold=0.0)
+        rounding = 4.0 * (count + 4) * FLOAT32_ROUNDOFF
+        assert hit.hit_counts[0] == count
+        assert hit.transmittance == pytest.approx(np.prod(1.0 - alphas.astype(float)), rel=rounding)
+        assert hit.attributes[0] == pytest.approx(
+            blend(alphas.astype(float), values), abs=rounding * np.abs(values).max()
+        )
+        assert hit.expected_depth == pytest.approx(2.0, abs=2.0 * rounding)
+
+    @pytest.mark.parametrize("count", SIZES)
+    @pytest.mark.parametrize("gap", [1e-6, 1e-3])
+    def test_nearly_coincident_hits_are_blended_by_depth(self, device, backend, rng, count, gap):
+        """Gaps of 8 ulp of the depth and of 8,000; rows in any order."""
+        places = rng.permutation(count)
+        alphas, values = rng.uniform(0.01, 0.1, count).astype(np.float32), rng.normal(size=(count, 1))
+        cloud = aligned(places[:, None] * [gap, 0.0, 0.0], alphas)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        hit = closest_surface(scene, *along_x(), attributes=values, options=WHOLE, threshold=0.0)
+        order = np.argsort(places)
+        rounding = 4.0 * (count + 4) * FLOAT32_ROUNDOFF
+        assert hit.hit_counts[0] == count
+        assert hit.transmittance == pytest.approx(np.prod(1.0 - alphas.astype(float)), rel=rounding)
+        assert hit.attributes[0] == pytest.approx(
+            blend(alphas.astype(float)[order], values[order]), abs=rounding * np.abs(values).max()
+        )
+
+    @pytest.mark.parametrize("stop", [0.0, 1e-3])
+    def test_ten_thousand_in_one_place(self, device, backend, stop):
+        count, alpha = 10_000, np.float32(1.0 / 250.0)
+        scene = Scene.from_gaussians(aligned(np.zeros((count, 3)), alpha), device, backend=backend)
+        hit = closest_surface(scene, *along_x(), options=TraceOptions(stop=stop))
+        log = np.log1p(-float(alpha))
+        expected = count if stop == 0.0 else int(np.ceil(np.log(stop) / log))
+        assert hit.hit_counts[0] == expected
+        # Each factor is rounded twice, and alpha itself as the response's exponential is.
+        growth = expected * (2.0 + 16.0 * float(alpha)) * FLOAT32_ROUNDOFF
+        assert hit.transmittance == pytest.approx(np.exp(expected * log), rel=growth, abs=1e-30)
+        assert hit.gaussians[0] == int(np.ceil(np.log(0.5) / log)) - 1
+
+    def test_row_settles_ties(self, device, backend):
+        """Two that coincide, behind a third: the row that comes first is met first, in either order of the rows."""
+        for rows in ([0.9, 0.2], [0.2, 0.9]):
+            cloud = aligned([[1, 0, 0], [1, 0, 0], [0, 0, 0]], [*rows, 0.1])
+            hit = closest_surface(Scene.from_gaussians(cloud, device, backend=backend), *along_x(), threshold=0.85)
+            assert hit.gaussians[0] == 0
+
+
+class TestProperties:
+    @pytest.mark.parametrize("stop", [0.0, 1e-3, 0.1])
+    def test_transmittance_is_visibility_up_to_the_stop(self, device, backend, rng, stop):
+        cloud, rays = random_cloud(rng, 500, scale=(-2.5, 0.5), opacity=(0.05, 0.9)), random_rays(rng, 300)
+        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        options = TraceOptions(stop=stop)
+        seen = closest_surface(scene, *rays, options=options)
+        passed = visibility(scene, *rays, options=options)
+        open_rays = np.maximum(seen.transmittance, passed) >= stop
+        # Both round 1 - alpha and the product, in another order, and whiten by another factor of the same matrix.
+        truth = closest_surface_reference(traced_cloud(cloud, scene), *rays, stop=0.0, middle=scene.origin)
+        clear = truth.decided & open_rays & (truth.transmittance - truth.transmittance_error > stop)
+        error = 2.0 * truth.transmittance_error[clear] + FLOAT32_ROUNDOFF
+        assert clear.mean() > 0.2
+        assert (np.abs(seen.transmittance - passed)[clear] <= error).all()
+        assert ((seen.transmittance < stop) == (passed < stop))[truth.decided & ~open_rays].all()
+
+    def test_same_bits_for_any_number_of_threads(self, backend, rng, monkeypatch):
+        scene = Scene.from_gaussians(random_cloud(rng, 500, scale=(-2.5, 0.5)), "cpu", backend=backend)
+        rays, values = random_rays(rng, 3000), rng.normal(size=(500, 3))
+        results = []
+        for threads in ("1", "2"):
+            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+            results.append(closest_surface(scene, *rays, attributes=values))
+        for name in FIELDS:
+            assert np.array_equal(getattr(results[0], name), getattr(results[1], name)), name
+
+    @pytest.mark.parametrize("build", ["quality", "fast"])
+    def test_hierarchies_agree(self, device, rng, build):
+        cloud, rays = random_cloud(rng, 2000, scale=(-3.0, 0.5), opacity=(0.05, 0.5)), random_rays(rng, 200)
+        hits = [
+            closest_surface(Scene.from_gaussians(cloud, device, backend=backend, build=build), *rays, options=WHOLE)
+            for backend in BACKENDS
+        ]
+        truth = closest_surface_reference(cloud, *rays, stop=0.0)
+        for hit in hits:
+            assert np.array_equal(hit.hit_counts[truth.decided], truth.hit_counts[truth.decided])
+
+    def test_warp_arrays_in_and_out(self, device, backend, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 50), device, backend=backend)
+        rays, values = random_rays(rng, 20), rng.normal(size=(50, 2))
+        there = closest_surface(scene, *(wp.array(x, dtype=wp.vec3, device=device) for x in rays), attributes=values)
+        here = closest_surface(scene, *rays, attributes=values)
+        for name in FIELDS:
+            assert isinstance(getattr(there, name), wp.array)
+            assert np.array_equal(getattr(there, name).numpy(), getattr(here, name)), name
+
+
+class TestRefusals:
+    @pytest.fixture
+    def scene(self, rng):
+        return Scene.from_gaussians(random_cloud(rng, 5), "cpu")
+
+    def test_bernoulli(self, scene):
+        with pytest.raises(InvalidOptionError, match=r"options\.acceptance must be .product. here, got .bernoulli."):
+            closest_surface(scene, *along_x(), options=TraceOptions(acceptance="bernoulli"))
+
+    @pytest.mark.parametrize("threshold", [-0.1, 1.1, np.nan])
+    def test_threshold_out_of_range(self, scene, threshold):
+        with pytest.raises(InvalidOptionError, match=r"threshold must be a number in \[0, 1\]"):
+            closest_surface(scene, *along_x(), threshold=threshold)
+
+    def test_threshold_behind_the_stop(self, scene):
+        with pytest.raises(InvalidOptionError, match=r"threshold must be at least options.stop, 0.1, got 0.05"):
+            closest_surface(scene, *along_x(), threshold=0.05, options=TraceOptions(stop=0.1))
+
+    def test_attributes(self, scene):
+        with pytest.raises(InvalidArrayError, match=r"attributes must have as many rows as the scene \(5\), got 4"):
+            closest_surface(scene, *along_x(), attributes=np.zeros((4, 1)))
+        with pytest.raises(InvalidArrayError, match=r"attributes must have shape \(N, N\), got \(5,\)"):
+            closest_surface(scene, *along_x(), attributes=np.zeros(5))
+        with pytest.raises(InvalidArrayError, match="attributes must be finite, got NaN or infinity at row 2"):
+            closest_surface(scene, *along_x(), attributes=np.where(np.arange(5) == 2, np.nan, 0.0)[:, None])
+
+    def test_rays(self, scene):
+        with pytest.raises(InvalidArrayError, match="directions must have unit length"):
+            closest_surface(scene, [[0, 0, 0]], [[2.0, 0, 0]])
+        with pytest.raises(InvalidArrayError, match=r"directions must have as many rows as origins \(2\), got 1"):
+            closest_surface(scene, np.zeros((2, 3)), [[1.0, 0, 0]])
+        with pytest.raises(InvalidOptionError, match="cull must be False for a scene without normals"):
+            closest_surface(scene, *along_x(), options=TraceOptions(cull=True))

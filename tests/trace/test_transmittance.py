@@ -1,0 +1,290 @@
+"""Visibility: closed forms, then a float64 brute force, then properties, then what must be refused."""
+
+import numpy as np
+import pytest
+import warp as wp
+from support.shapes import random_cloud, random_rays
+
+from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.common import launching
+from beam_warp.trace.reference import visibility_reference
+from beam_warp.trace.transmittance import TraceOptions, traversal_counts
+
+# V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
+# distance over smallest scale (about 1e3 here), on alphas whose slope in the response is at most 1.
+VISIBILITY_TOLERANCE = 2e-4
+
+
+def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), position=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0)):
+    return GaussianCloud(positions=[position], orientations=[orientation], scales=[scales], opacities=[opacity])
+
+
+def along_x(y=0.0, z=0.0, x=-2.0):
+    return np.array([[x, y, z]]), np.array([[1.0, 0.0, 0.0]])
+
+
+class TestClosedForm:
+    @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.7, 0.95])
+    def test_through_the_centre_passes_one_minus_opacity(self, device, opacity):
+        scene = Scene.from_gaussians(one_gaussian(opacity), device)
+        assert visibility(scene, *along_x()) == pytest.approx(1.0 - opacity, abs=1e-6)
+
+    def test_alpha_is_capped(self, device):
+        scene = Scene.from_gaussians(one_gaussian(1.0), device)
+        assert visibility(scene, *along_x()) == pytest.approx(0.01, abs=1e-6)
+
+    @pytest.mark.parametrize(("y", "z"), [(0.1, 0.0), (0.0, 0.5), (0.25, -0.3)])
+    def test_beside_the_centre_follows_the_response(self, device, y, z):
+        scene = Scene.from_gaussians(one_gaussian(0.9), device)
+        response = np.exp(-0.5 * ((y / 0.2) ** 2 + (z / 0.3) ** 2))
+        assert visibility(scene, *along_x(y, z)) == pytest.approx(1.0 - 0.9 * response, abs=1e-6)
+
+    def test_cut_where_alpha_reaches_one_step_of_eight_bits(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.9), device)
+        radius = np.sqrt(2.0 * np.log(255.0 * 0.9))
+        inside, outside = along_x(z=0.3 * (radius - 1e-3)), along_x(z=0.3 * (radius + 1e-3))
+        assert visibility(scene, *inside)[0] < 1.0 - 1.0 / 255.0 + 1e-6
+        assert visibility(scene, *outside)[0] == 1.0
+
+    def test_only_peaks_in_front_and_before_t_max_count(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.5), device)
+        assert visibility(scene, *along_x(x=1e-3))[0] == 1.0
+        assert visibility(scene, *along_x(x=-1e-3)) == pytest.approx(0.5, abs=1e-4)
+        assert visibility(scene, *along_x(), t_max=1.999)[0] == 1.0
+        assert visibility(scene, *along_x(), t_max=2.001) == pytest.approx(0.5, abs=1e-6)
+
+    def test_product_over_gaussians(self, device):
+        cloud = GaussianCloud(
+            positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+            orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
+            scales=np.full((3, 3), 0.1),
+            opacities=[0.1, 0.2, 0.3],
+        )
+        assert visibility(Scene.from_gaussians(cloud, device), *along_x()) == pytest.approx(0.9 * 0.8 * 0.7, abs=1e-6)
+
+    def test_rotated_needle_is_hit_across_and_missed_beside(self, device):
+        half = np.sqrt(0.5)
+        needle = one_gaussian(0.9, (1.0, 1e-3, 1e-3), orientation=(0, 0, half, half))  # now along y
+        scene = Scene.from_gaussians(needle, device)
+        assert visibility(scene, *along_x(y=0.5)) == pytest.approx(1.0 - 0.9 * np.exp(-0.125), abs=1e-5)
+        assert visibility(scene, *along_x(z=0.01))[0] == 1.0
+
+
+class TestAgainstBruteForce:
+    @pytest.mark.parametrize("scale", [(-3.5, 0.8), (-2.5, 0.3), (-5.0, 1.5)])
+    def test_random_clouds(self, device, rng, scale):
+        cloud = random_cloud(rng, 1500, scale=scale)
+        origins, directions = random_rays(rng, 1000)
+        directions[:60] = np.eye(3)[rng.integers(0, 3, 60)]  # axis-parallel
+        result = visibility(Scene.from_gaussians(cloud, device), origins, directions)
+        expected = visibility_reference(cloud, origins, directions)
+        assert np.abs(result - expected).max() <= VISIBILITY_TOLERANCE
+        assert ((result >= 0.0) & (result <= 1.0)).all()
+
+    def test_axis_parallel_rays_on_box_planes_are_not_lost(self, device):
+        """Warp's slab test computes 0 * inf there; without the direction floor 32 of 36 such rays are lost."""
+        cloud = GaussianCloud(
+            positions=[[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]],
+            orientations=np.tile([0, 0, 0, 1.0], (2, 1)),
+            scales=np.full((2, 3), 0.5),
+            opacities=[0.9, 0.9],
+        )
+        scene = Scene.from_gaussians(cloud, device)
+        edge = 0.5 * np.sqrt(2.0 * np.log(255.0 * 0.9)) * 0.999
+        for y in (-edge, 0.0, edge):
+            for z in (0.0, -0.0):
+                origins, directions = np.array([[-5.0, y, z]]), np.array([[1.0, 0.0, -0.0]])
+                expected = visibility_reference(cloud, origins, directions)
+                assert visibility(scene, origins, directions) == pytest.approx(expected, abs=1e-5)
+                assert expected[0] < 1.0
+
+    def test_far_from_the_origin(self, device, rng):
+        cloud = random_cloud(rng, 500)
+        origins, directions = random_rays(rng, 300)
+        shift = np.float32(8192.0)  # a power of two: positions round to a grid of 1/1024, equally in both clouds
+        moved = cloud.with_arrays(positions=cloud.positions + shift)
+        expected = visibility_reference(moved, (origins + shift).astype(np.float32), directions)
+        result = visibility(Scene.from_gaussians(moved, device), (origins + shift).astype(np.float32), directions)
+        assert np.abs(result - expected).max() <= VISIBILITY_TOLERANCE
+
+    def test_coincident_gaussians(self, device):
+        cloud = GaussianCloud(
+            positions=np.zeros((10_000, 3)),
+            orientations=np.tile([0, 0, 0, 1.0], (10_000, 1)),
+            scales=np.full((10_000, 3), 0.1),
+            opacities=np.full(10_000, 1.0 / 250.0),
+        )
+        scene = Scene.from_gaussians(cloud, device)
+        assert visibility(scene, *along_x())[0] < 1e-4  # 0.996^10000 = 4e-18
+        assert visibility(scene, *along_x(z=1.0))[0] == 1.0
+
+
+class TestProperties:
+    def test_order_of_gaussians_matters_only_by_rounding(self, device, rng):
+        cloud = random_cloud(rng, 400)
+        rays = random_rays(rng, 300)
+        one = visibility(Scene.from_gaussians(cloud, device), *rays)
+        other = visibility(Scene.from_gaussians(cloud.select(rng.permutation(400)), device), *rays)
+        # an early stop may come earlier or later: both are below its threshold
+        assert np.abs(one - other).max() <= 1e-4
+
+    def test_never_rises_with_reach(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 400), device)
+        rays = random_rays(rng, 200)
+        reaches = [visibility(scene, *rays, t_max=t) for t in (0.0, 0.2, 0.5, 1.0, np.inf)]
+        assert (reaches[0] == 1.0).all()
+        assert (np.diff(reaches, axis=0) <= 1e-4).all()
+
+    def test_same_bits_for_any_number_of_threads(self, rng, monkeypatch):
+        scene = Scene.from_gaussians(random_cloud(rng, 500), "cpu")
+        rays = random_rays(rng, 5000)
+        results = []
+        for threads in ("1", "2", "5"):
+            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+            assert launching.thread_count() == int(threads)
+            results.append(visibility(scene, *rays))
+        assert np.array_equal(results[0], results[1])
+        assert np.array_equal(results[0], results[2])
+
+    def test_devices_agree(self, device, rng):
+        cloud, rays = random_cloud(rng, 500), random_rays(rng, 500)
+        here = visibility(Scene.from_gaussians(cloud, device), *rays)
+        cpu = visibility(Scene.from_gaussians(cloud, "cpu"), *rays)
+        assert np.abs(here - cpu).max() <= 1e-4  # where both stopped early; see the benchmark for the rest
+
+    def test_warp_arrays_in_and_out(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 50), device)
+        origins, directions = random_rays(rng, 20)
+        there = visibility(
+            scene,
+            wp.array(origins, dtype=wp.vec3, device=device),
+            wp.array(directions, dtype=wp.vec3, device=device),
+        )
+        assert isinstance(there, wp.array)
+        assert np.array_equal(there.numpy(), visibility(scene, origins, directions))
+
+
+class TestScene:
+    def test_invisible_gaussians_are_dropped_and_reported(self, device):
+        cloud = GaussianCloud(
+            positions=np.zeros((4, 3)),
+            orientations=np.tile([0, 0, 0, 1.0], (4, 1)),
+            scales=np.full((4, 3), 0.1),
+            opacities=[0.0, 1.0 / 255.0, 0.5, 1.0],
+        )
+        scene = Scene.from_gaussians(cloud, device)
+        assert (scene.report.traced, scene.report.dropped) == (2, 2)
+
+    def test_scales_that_float32_cannot_resolve_are_raised_and_reported(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.5, (1.0, 0.0, 1e-9)), device)
+        assert scene.report.raised_scales == 1
+        assert visibility(scene, *along_x()) == pytest.approx(0.5, abs=1e-4)
+
+    @pytest.mark.parametrize("count", [0, 1, 2])
+    def test_few_gaussians(self, device, rng, count):
+        cloud = random_cloud(rng, 5).select(np.arange(count))
+        rays = random_rays(rng, 10)
+        assert visibility(Scene.from_gaussians(cloud, device), *rays) == pytest.approx(
+            visibility_reference(cloud, *rays), abs=1e-4
+        )
+
+    @pytest.mark.parametrize("count", [0, 1, 7])
+    @pytest.mark.parametrize("backend", ["wide", "warp"])
+    def test_length_is_the_number_of_gaussians(self, device, rng, count, backend):
+        scene = Scene.from_gaussians(random_cloud(rng, 7).select(np.arange(count)), device, backend=backend)
+        assert len(scene) == count
+        assert scene.report.traced + scene.report.dropped + scene.report.not_finite == count
+
+    def test_culling_needs_normals(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 5), device)
+        with pytest.raises(InvalidOptionError, match="cull must be False for a scene without normals, got True"):
+            visibility(scene, *along_x(), options=TraceOptions(cull=True))
+
+    def test_no_rays(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 5), device)
+        assert visibility(scene, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+
+    def test_unknown_device_is_named(self, rng):
+        with pytest.raises(DeviceError, match=r"device must be one of cpu.*, got 'cuda:99'"):
+            Scene.from_gaussians(random_cloud(rng, 5), "cuda:99")
+
+
+class TestRefusals:
+    @pytest.fixture
+    def scene(self, rng):
+        return Scene.from_gaussians(random_cloud(rng, 5), "cpu")
+
+    def test_shape(self, scene):
+        with pytest.raises(InvalidArrayError, match=r"origins must have shape \(N, 3\), got \(3, 4\)"):
+            visibility(scene, np.zeros((3, 4)), np.zeros((3, 4)))
+
+    def test_not_finite(self, scene):
+        origins, directions = np.zeros((3, 3)), np.tile([1.0, 0, 0], (3, 1))
+        origins[1, 2] = np.nan
+        with pytest.raises(InvalidArrayError, match="origins must be finite, got NaN or infinity at row 1"):
+            visibility(scene, origins, directions)
+
+    def test_not_unit(self, scene):
+        with pytest.raises(InvalidArrayError, match=r"directions must have unit length, got \|v\| = 2 at row 0"):
+            visibility(scene, np.zeros((1, 3)), [[2.0, 0, 0]])
+
+    def test_lengths_differ(self, scene):
+        with pytest.raises(InvalidArrayError, match=r"directions must have as many rows as origins \(2\), got 1"):
+            visibility(scene, np.zeros((2, 3)), [[1.0, 0, 0]])
+
+    @pytest.mark.parametrize("t_max", [-1.0, np.nan])
+    def test_reach(self, scene, t_max):
+        with pytest.raises(InvalidOptionError, match="t_max must be a number in"):
+            visibility(scene, np.zeros((1, 3)), [[1.0, 0, 0]], t_max=t_max)
+
+
+class TestReach:
+    def test_device_arrays_of_another_type_are_refused(self, device):
+        scene = Scene.from_gaussians(one_gaussian(), device)
+        with pytest.raises(InvalidArrayError, match=r"t_max must be a one-dimensional warp array of float32 on"):
+            visibility(scene, *along_x(), t_max=wp.zeros(1, dtype=wp.float64, device=scene.device))
+
+    def test_one_reach_a_ray(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.5), device)
+        origins, directions = (np.repeat(a, 2, axis=0) for a in along_x())
+        found = visibility(scene, origins, directions, t_max=np.array([1.9, 2.1]))
+        assert found == pytest.approx([1.0, 0.5], abs=1e-6)
+        on_device = wp.array([1.9, 2.1], dtype=float, device=scene.device)
+        assert (visibility(scene, origins, directions, t_max=on_device) == found).all()
+
+
+class TestTraversalCounts:
+    def test_hits_are_those_of_brute_force(self, device, rng):
+        cloud, (origins, directions) = random_cloud(rng, 600, scale=(-2.5, 0.3)), random_rays(rng, 200)
+        never = TraceOptions(stop=0.0)
+        found = {
+            backend: traversal_counts(
+                Scene.from_gaussians(cloud, device, backend=backend), origins, directions, options=never
+            )
+            for backend in ("wide", "warp")
+        }
+        # One Gaussian alone blocks or does not: its hits are where V is below 1.
+        hits = np.zeros(200, int)
+        for row in range(600):
+            hits += visibility_reference(cloud.select([row]), origins, directions) < 1.0
+        for counts in found.values():
+            assert np.abs(counts.hits - hits).max() <= 1  # a cut within rounding may go either way
+            assert (counts.tested >= counts.hits).all()
+        assert (found["wide"].nodes > 0).all()
+        assert (found["warp"].nodes == 0).all()
+
+    def test_stop_saves_work(self, device):
+        count = 200
+        cloud = GaussianCloud(
+            positions=np.stack([np.arange(count) * 0.1, np.zeros(count), np.zeros(count)], axis=1),
+            orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+            scales=np.full((count, 3), 0.02),
+            opacities=np.full(count, 0.8),
+        )
+        counts = traversal_counts(Scene.from_gaussians(cloud, device), *along_x())
+        assert counts.hits.tolist() == [6]  # 0.2^6 is the first below 1e-4
+        assert (
+            traversal_counts(Scene.from_gaussians(cloud, device), *along_x(), options=TraceOptions(stop=0.0)).hits
+            == 200
+        )

@@ -1,0 +1,134 @@
+"""Axis codes and changes of axes: covariances, colours and normals must mean the same afterwards."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beam_warp.errors import InvalidOptionError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.axes import AXIS_CODES, TARGETS, axes_matrix, change_axes, handedness
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import sh_color
+
+EPSILON = np.finfo(np.float32).eps
+
+
+def make_cloud(rng, count=20, degree=3, axes="rdf"):
+    def units(width):
+        vectors = rng.normal(size=(count, width))
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+    return GaussianCloud(
+        positions=rng.normal(size=(count, 3)),
+        orientations=units(4),
+        scales=np.exp(rng.uniform(-6.0, 0.0, (count, 3))),
+        opacities=rng.uniform(size=count),
+        radiance=rng.normal(size=(count, (degree + 1) ** 2, 3)),
+        radiance_color_space=DISPLAY_SRGB,
+        normals=units(3),
+        axes=axes,
+    )
+
+
+def covariances(cloud):
+    """R S^2 R^T in float64, from the textbook matrix of a quaternion."""
+    x, y, z, w = cloud.orientations.astype(np.float64).T
+    rotation = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+    return np.einsum("nij,nj,nkj->nik", rotation, cloud.scales.astype(np.float64) ** 2, rotation)
+
+
+def test_known_maps():
+    # COLMAP to USD: half a turn about x. USD to Unity: z negated. USD to Unreal: (x, y, z) -> (-z, x, y).
+    assert np.array_equal(axes_matrix("rdf", "rub"), np.diag([1, -1, -1]))
+    assert np.array_equal(axes_matrix("rub", "ruf"), np.diag([1, 1, -1]))
+    assert np.array_equal(axes_matrix("rub", "fru") @ [1.0, 2.0, 3.0], [-3.0, 1.0, 2.0])
+    assert np.array_equal(axes_matrix("rub", "rfu") @ [1.0, 2.0, 3.0], [1.0, -3.0, 2.0])
+
+
+def test_there_are_48_codes_half_of_each_hand():
+    assert len(set(AXIS_CODES)) == 48
+    assert [handedness(code) for code in ("rdf", "rub", "rfu", "ruf", "fru")] == ["right"] * 3 + ["left"] * 2
+    assert sum(handedness(code) == "left" for code in AXIS_CODES) == 24
+
+
+@pytest.mark.parametrize("code", ["", "rd", "rdd", "RDF", "xyz", "rlu"])
+def test_a_wrong_code_is_refused(code, rng):
+    with pytest.raises(InvalidOptionError, match=r"target must be three letters, one each of r/l, u/d and f/b, got"):
+        change_axes(make_cloud(rng), code)
+
+
+def test_nothing_to_do_gives_the_cloud_itself(rng):
+    cloud = make_cloud(rng)
+    assert change_axes(cloud, "rdf") is cloud
+
+
+@settings(max_examples=40, deadline=None)
+@given(source=st.sampled_from(AXIS_CODES), target=st.sampled_from(AXIS_CODES))
+def test_every_pair_keeps_what_is_meant(source, target):
+    rng = np.random.default_rng(7)
+    cloud = make_cloud(rng, axes=source)
+    moved = change_axes(cloud, target)
+    matrix = axes_matrix(source, target)
+    assert moved.axes == target
+    assert np.array_equal(moved.positions, cloud.positions @ matrix.T.astype(np.float32))
+    assert np.array_equal(moved.scales, cloud.scales)
+    assert np.array_equal(moved.normals, cloud.normals @ matrix.T.astype(np.float32))
+    # A quaternion rounded to float32 turns by at most 4 eps; a covariance is at most 1 and twice linear in it.
+    expected = matrix @ covariances(cloud) @ matrix.T
+    assert np.abs(covariances(moved) - expected).max() <= 16 * EPSILON
+    # Colours: from the corresponding direction. 16 coefficients of at most 5, each rounded once.
+    directions = rng.normal(size=(len(cloud), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen, seen_moved = sh_color(cloud.radiance, directions), sh_color(moved.radiance, directions @ matrix.T)
+    assert np.abs(seen - seen_moved).max() <= 16 * 5 * EPSILON
+
+
+@settings(max_examples=30, deadline=None)
+@given(source=st.sampled_from(AXIS_CODES), target=st.sampled_from(AXIS_CODES))
+def test_there_and_back(source, target):
+    cloud = make_cloud(np.random.default_rng(3), axes=source)
+    back = change_axes(change_axes(cloud, target), source)
+    assert np.array_equal(back.positions, cloud.positions)
+    assert np.array_equal(back.normals, cloud.normals)
+    assert np.abs(covariances(back) - covariances(cloud)).max() <= 32 * EPSILON
+    assert np.abs(back.radiance - cloud.radiance).max() <= 32 * 5 * EPSILON
+
+
+@pytest.mark.parametrize("target", ["luf", "ruf", "rdb"])
+def test_a_pure_flip_and_back_is_bit_exact(target, rng):
+    cloud = make_cloud(rng, degree=4, axes="rub")
+    back = change_axes(change_axes(cloud, target), "rub")
+    for name, array in cloud.arrays().items():
+        same = np.array_equal(getattr(back, name), array)
+        assert same or name == "orientations", name
+    # A quaternion and its negative are the same rotation.
+    signs = np.sign(np.sum(back.orientations * cloud.orientations, axis=1, keepdims=True))
+    assert np.array_equal(back.orientations * signs, cloud.orientations)
+
+
+def test_unreal_is_in_centimetres(rng):
+    cloud = make_cloud(rng, axes="rub")
+    axes, units = TARGETS["unreal"]
+    moved = change_axes(cloud, axes, scale=units)
+    assert np.allclose(moved.positions, 100.0 * cloud.positions[:, [2, 0, 1]] * [-1, 1, 1], rtol=2 * EPSILON)
+    assert np.allclose(moved.scales, 100.0 * cloud.scales, rtol=EPSILON)
+
+
+def test_a_wrong_scale_is_refused(rng):
+    with pytest.raises(InvalidOptionError, match=r"scale must be a number in \[1e-06, 1e\+06\], got nan"):
+        change_axes(make_cloud(rng), "rub", scale=float("nan"))
+
+
+def test_zeroth_degree_and_no_optional_arrays(rng):
+    cloud = make_cloud(rng, degree=0).with_arrays(normals=None)
+    moved = change_axes(cloud, "fru")
+    assert np.array_equal(moved.radiance, cloud.radiance)
+    assert moved.normals is None
