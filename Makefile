@@ -1,11 +1,15 @@
 # Two commands do everything on a fresh clone: `make demo` and `make test`. Each sets up .venv first.
+# `make test-all` adds what takes long: CUDA compilation, stability suites, the browser, the wheel, long seeds.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test lint types unit install clean
+.PHONY: demo test test-all lint types unit slow install clean
+
+# A worker a core, each with one launch thread; -P: the checkout in the working folder is not the installed package.
+PYTEST := BEAM_WARP_THREADS=1 $(BIN)/python -P -m pytest -n auto --dist loadfile
 
 $(VENV)/.dependencies: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; set PYTHON=python3.x"; exit 1; }
@@ -23,6 +27,8 @@ demo: install
 
 test: lint types unit
 
+test-all: test slow
+
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -31,7 +37,10 @@ types: install
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 unit: install
-	$(BIN)/python -P -m pytest  # -P: the checkout in the working folder is not the installed package
+	$(PYTEST) -m "not slow"
+
+slow: install
+	$(PYTEST) -m slow
 
 clean:
 	rm -rf $(VENV) build demo *.egg-info

@@ -1,3 +1,5 @@
 """Gaussians drawn from other frameworks: gsplat's arguments in, torch gradients out."""
 
-from beam_warp.interop.gsplat import rasterization as rasterization
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

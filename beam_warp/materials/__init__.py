@@ -1,1 +1,5 @@
 """Decomposition: base colour, roughness, ambient occlusion and normals from images under known light."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

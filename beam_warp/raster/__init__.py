@@ -1,1 +1,5 @@
 """Gaussians drawn as images: any channel, depth and normals, with gradients."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

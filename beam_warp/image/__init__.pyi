@@ -1,0 +1,10 @@
+from .color import DISPLAY_SRGB as DISPLAY_SRGB
+from .color import LINEAR_REC709 as LINEAR_REC709
+from .color import linear_to_srgb as linear_to_srgb
+from .color import srgb_to_linear as srgb_to_linear
+from .files import Image as Image
+from .files import read_image as read_image
+from .files import write_exr as write_exr
+from .files import write_png as write_png
+from .metrics import psnr as psnr
+from .metrics import ssim as ssim

@@ -1,0 +1,1 @@
+from .gsplat import rasterization as rasterization

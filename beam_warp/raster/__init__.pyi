@@ -1,0 +1,12 @@
+from .adam import Adam as Adam
+from .adam import Parameters as Parameters
+from .depth_normals import DepthNormals as DepthNormals
+from .gbuffer import GBuffer as GBuffer
+from .gbuffer import rasterize as rasterize
+from .gbuffer import rasterize_backward as rasterize_backward
+from .losses import L1Loss as L1Loss
+from .losses import NormalLoss as NormalLoss
+from .losses import SsimLoss as SsimLoss
+from .rasterizer import Rasterizer as Rasterizer
+from .records import GaussianArrays as GaussianArrays
+from .records import RasterOptions as RasterOptions

@@ -1,0 +1,10 @@
+from .first_surface import SurfaceHits as SurfaceHits
+from .first_surface import closest_surface as closest_surface
+from .gradients import visibility_gradients as visibility_gradients
+from .incident import Irradiance as Irradiance
+from .incident import irradiance as irradiance
+from .occlusion import AmbientOcclusion as AmbientOcclusion
+from .occlusion import ambient_occlusion as ambient_occlusion
+from .scene import Scene as Scene
+from .transmittance import TraceOptions as TraceOptions
+from .transmittance import visibility as visibility

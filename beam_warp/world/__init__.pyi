@@ -1,0 +1,12 @@
+from .axes import change_axes as change_axes
+from .camera import Camera as Camera
+from .environment import EnvironmentMap as EnvironmentMap
+from .gaussians import GaussianCloud as GaussianCloud
+from .gaussians import GaussianSequence as GaussianSequence
+from .gaussians import Observability as Observability
+from .lights import DirectionalLight as DirectionalLight
+from .lights import PointLight as PointLight
+from .lights import SpotLight as SpotLight
+from .shot import RenderedImage as RenderedImage
+from .shot import Shot as Shot
+from .shot import ShotMesh as ShotMesh

@@ -1,0 +1,46 @@
+"""Docstrings can be read alone: none begins with a bare preposition or pronoun, which needs the name above it."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FILES = sorted(
+    path.relative_to(ROOT)
+    for folder in ("beam_warp", "kernels", "schema", "converters", "tests", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py")
+)
+BARE = re.compile(r"(Of|In|It|At|By|For|From|With|To|On|As|Its|They|Them|This is it|Takes it)\b")
+
+
+def docstrings(tree: ast.Module) -> list[tuple[int, str]]:
+    """Line and text of every docstring, those below constants and fields included."""
+    found = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        before: list[ast.stmt | None] = [None, *node.body]
+        for above, here in zip(before, node.body, strict=False):
+            stated = above is None or isinstance(above, ast.Assign | ast.AnnAssign)
+            if stated and isinstance(here, ast.Expr) and isinstance(here.value, ast.Constant):
+                found += [(here.lineno, here.value.value)] if isinstance(here.value.value, str) else []
+    return found
+
+
+@pytest.mark.parametrize("folder", sorted({path.parts[0] for path in FILES}))
+def test_no_docstring_begins_with_a_bare_preposition_or_pronoun(folder):
+    bare = [
+        f"{path}:{line} {text.splitlines()[0]}"
+        for path in FILES
+        if path.parts[0] == folder
+        for line, text in docstrings(ast.parse((ROOT / path).read_text(encoding="utf-8")))
+        if BARE.match(text)
+    ]
+    assert not bare, "\n".join(bare)
+
+
+def test_docstrings_below_constants_are_found():
+    tree = ast.parse('"""A."""\nX = 1\n"""Of Gaussians."""\nclass C:\n    y: int = 0\n    """At most."""\n')
+    assert [line for line, text in docstrings(tree) if BARE.match(text)] == [3, 6]
