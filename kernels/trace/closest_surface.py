@@ -14,8 +14,7 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
 from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak, whitening_times
-from beam_warp.kernels.trace.settings import TraceSettings, counts
-from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
+from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.wide_tree import Stack, WideTree, first_bit, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
@@ -112,30 +111,6 @@ def nearest_hits(
             first_node = stack[depth] >> 6
             axis = (stack[depth] >> 4) & 3
             inner = stack[depth] & 15
-    return buffer
-
-
-@wp.func
-def nearest_hits(  # noqa: F811
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_last: float,
-    index_last: int,
-    t_max: float,
-) -> HitBuffer:
-    """The same through ``wp.Bvh``, whose order is its own."""
-    buffer = empty_buffer()
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    # A millionth more: boxes must come strictly before the limit, equal hits must not be lost.
-    while wp.bvh_query_next(query, index, wp.min(t_max, buffer.t[LAST] * 1.000001)):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            if is_before(t_last, index_last, peak.t, index):
-                buffer = insert_hit(buffer, peak.t, index)
     return buffer
 
 

@@ -5,8 +5,7 @@ traversal's loop is silently wrong; here the first traversal counts hits and fin
 that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
 No float atomics: the same bits in every run, for any number of threads.
 
-A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over hits around `tally_hit` and `store_hit`,
-in the same order both times.
+`tally_hits` and `store_hits` are the two traversals; they meet hits in the same order.
 """
 
 from typing import Any
@@ -16,7 +15,7 @@ import warp as wp
 from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.mesh.occluder import mesh_blocks
-from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak
+from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.hit_gradients import (
     CloudGradients,
     HitMoments,
@@ -30,8 +29,7 @@ from beam_warp.kernels.trace.hit_gradients import (
     transposed_whitening_times,
     whitened_closest_point,
 )
-from beam_warp.kernels.trace.settings import TraceSettings, counts
-from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
+from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
@@ -97,53 +95,6 @@ def store_hit(
 
 @wp.func
 def tally_hits(
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-) -> HitTally:
-    """V and the number of hits with gradients, over what `warp_tree_transmittance` visits."""
-    tally = HitTally()
-    tally.transmittance = float(1.0)
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    while wp.bvh_query_next(query, index, t_max):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            tally = tally_hit(tally, peak.alpha)
-            if tally.transmittance < settings.stop:
-                break
-    return tally
-
-
-@wp.func
-def store_hits(
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    start: RayReturn,
-    out_hits: HitRecords,
-) -> RayReturn:
-    """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
-    ray = start
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    while wp.bvh_query_next(query, index, t_max):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            ray = store_hit(ray, gaussians, index, peak.alpha, peak.t, origin, direction, out_hits)
-            if ray.slot == ray.end:
-                break
-    return ray
-
-
-@wp.func
-def tally_hits(  # noqa: F811
     tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
@@ -151,7 +102,7 @@ def tally_hits(  # noqa: F811
     direction: wp.vec3,
     t_max: float,
 ) -> HitTally:
-    """The same, over what `wide_tree_transmittance` visits."""
+    """V and the number of hits with gradients, over what `tree_transmittance` visits."""
     inverse = reciprocal(direction)
     stack = Stack()
     depth = int(0)
@@ -186,7 +137,7 @@ def tally_hits(  # noqa: F811
 
 
 @wp.func
-def store_hits(  # noqa: F811
+def store_hits(
     tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
@@ -196,7 +147,7 @@ def store_hits(  # noqa: F811
     start: RayReturn,
     out_hits: HitRecords,
 ) -> RayReturn:
-    """The same, for the wide tree."""
+    """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
     inverse = reciprocal(direction)
     stack = Stack()
     depth = int(0)

@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def wide_tree_transmittance(
+def tree_transmittance(
     tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
@@ -66,7 +66,7 @@ def wide_tree_transmittance(
 
 
 @wp.func
-def wide_tree_sampled_hit(
+def tree_sampled_hit(
     tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
@@ -109,7 +109,7 @@ def wide_tree_sampled_hit(
 
 
 @wp.func
-def wide_tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
+def tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
     """The layer of Gaussians that contain a point; a ray of no reach meets just the boxes around its origin."""
     inverse = reciprocal(n)
     stack = Stack()
