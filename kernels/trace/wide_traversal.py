@@ -161,6 +161,35 @@ def tree_transmittance(
     return pass_all(tree, gaussians, settings, ray, 1.0)
 
 
+@wp.struct
+class NearestHit:
+    """The nearest Gaussian so far that stopped a ray."""
+
+    index: int  # -1 for none
+    t: float  # the ray's reach for none
+
+
+@wp.func
+def draw_gaussian(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: NearestHit, leaf: int
+) -> NearestHit:
+    """Stop the ray at a Gaussian with probability alpha."""
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, found.t)
+    result = found
+    if peak.alpha > 0.0 and unit_float(hash_combine(ray.stream, wp.uint32(peak.index))) < peak.alpha:
+        result.index = peak.index
+        result.t = peak.t
+    return result
+
+
+@wp.func
+def reach_of_nearest(ray: TracedRay, found: NearestHit) -> float:
+    return found.t
+
+
+draw_nearest = traversal("draw_nearest", draw_gaussian, reach=reach_of_nearest)
+
+
 @wp.func
 def tree_sampled_hit(
     tree: WideTree,
@@ -172,36 +201,14 @@ def tree_sampled_hit(
     stream: wp.uint32,
 ) -> int:
     """The nearest of the Gaussians that each stop the ray with probability alpha, or -1."""
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    nearest = int(-1)
-    t_nearest = t_max
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, origin, inverse, 0.0, t_nearest)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(
-                tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_nearest
-            )
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0 and unit_float(hash_combine(stream, wp.uint32(peak.index))) < peak.alpha:
-                nearest = peak.index
-                t_nearest = peak.t
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return nearest
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.stream = stream
+    nearest = NearestHit()
+    nearest.index = -1
+    nearest.t = t_max
+    return draw_nearest(tree, gaussians, settings, ray, nearest).index
 
 
 @wp.func
