@@ -212,30 +212,19 @@ def tree_sampled_hit(
 
 
 @wp.func
+def join_layer(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: SurfaceLayer, leaf: int
+) -> SurfaceLayer:
+    return add_to_layer(found, gaussians, load_leaf(tree, leaf).index, ray.origin, ray.direction)
+
+
+join_all = traversal("join_all", join_layer)
+
+
+@wp.func
 def tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
     """The layer of Gaussians that contain a point; a ray of no reach meets just the boxes around its origin."""
-    inverse = reciprocal(n)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    layer = SurfaceLayer()
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, p, inverse, 0.0, 0.0)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            index = load_leaf(tree, hits.first_leaf + lowest_bit(leaf)).index
-            leaf = leaf & (leaf - 1)
-            layer = add_to_layer(layer, gaussians, index, p, n)
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return layer
+    ray = TracedRay()
+    ray.origin = p
+    ray.direction = n
+    return join_all(tree, gaussians, TraceSettings(), ray, SurfaceLayer())
