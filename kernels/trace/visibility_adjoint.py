@@ -30,6 +30,7 @@ from beam_warp.kernels.trace.hit_gradients import (
     whitened_closest_point,
 )
 from beam_warp.kernels.trace.settings import TraceSettings
+from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
 from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
 
 wp.set_module_options({"enable_backward": False})
@@ -94,6 +95,25 @@ def store_hit(
 
 
 @wp.func
+def tally_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: HitTally, leaf: int
+) -> HitTally:
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    tally = found
+    if peak.alpha > 0.0:
+        tally = tally_hit(found, peak.alpha)
+    return tally
+
+
+@wp.func
+def is_tally_dark(settings: TraceSettings, found: HitTally) -> bool:
+    return found.transmittance < settings.stop
+
+
+tally_all = traversal("tally_all", tally_leaf, is_done=is_tally_dark)
+
+
+@wp.func
 def tally_hits(
     tree: WideTree,
     gaussians: Gaussians,
@@ -103,37 +123,13 @@ def tally_hits(
     t_max: float,
 ) -> HitTally:
     """V and the number of hits with gradients, over what `tree_transmittance` visits."""
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = t_max
     tally = HitTally()
-    tally.transmittance = float(1.0)
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0:
-                tally = tally_hit(tally, peak.alpha)
-                if tally.transmittance < settings.stop:
-                    leaf = 0
-                    inner = 0
-                    depth = 0
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return tally
+    tally.transmittance = 1.0
+    return tally_all(tree, gaussians, settings, ray, tally)
 
 
 @wp.func
