@@ -31,7 +31,7 @@ from beam_warp.kernels.trace.hit_gradients import (
 )
 from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
-from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.trace.wide_tree import LeafPeak, WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,7 +53,8 @@ class RayReturn:
     """What the second traversal of a ray carries."""
 
     weight: float  # -V times the ray's adjoint
-    slot: int  # where the next hit goes
+    hits: HitRecords  # where hits go
+    slot: int  # of the next hit
     end: int
     origin: wp.vec3  # gradients with respect to the ray
     direction: wp.vec3
@@ -69,27 +70,18 @@ def tally_hit(tally: HitTally, alpha: float) -> HitTally:
 
 
 @wp.func
-def store_hit(
-    ray: RayReturn,
-    gaussians: Gaussians,
-    index: int,
-    alpha: float,
-    t: float,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    out_hits: HitRecords,
-) -> RayReturn:
-    """Store a hit with its peak at ``t``, unless it has no gradient, and add that gradient to the ray's."""
-    result = ray
-    if alpha < ALPHA_MAX:
-        q = whitened_closest_point(gaussians, index, origin, direction)
-        e = ray.weight * alpha / (1.0 - alpha)
-        out_hits.gaussian[ray.slot] = index
-        out_hits.record[ray.slot] = wp.vec4(q[0], q[1], q[2], e)
+def store_hit(start: RayReturn, gaussians: Gaussians, peak: LeafPeak, ray: TracedRay) -> RayReturn:
+    """Store a hit, unless it has no gradient, and add that gradient to the ray's."""
+    result = start
+    if peak.alpha < ALPHA_MAX:
+        q = whitened_closest_point(gaussians, peak.index, ray.origin, ray.direction)
+        e = start.weight * peak.alpha / (1.0 - peak.alpha)
+        start.hits.gaussian[start.slot] = peak.index
+        start.hits.record[start.slot] = wp.vec4(q[0], q[1], q[2], e)
         w = e * log_response_slope(gaussians.degree, wp.dot(q, q))
-        pull = transposed_whitening_times(gaussians, index, q) * (2.0 * w)
+        pull = transposed_whitening_times(gaussians, peak.index, q) * (2.0 * w)
         result.origin += pull
-        result.direction += pull * t
+        result.direction += pull * peak.t
         result.slot += 1
     return result
 
@@ -133,6 +125,25 @@ def tally_hits(
 
 
 @wp.func
+def store_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: RayReturn, leaf: int
+) -> RayReturn:
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    result = found
+    if peak.alpha > 0.0:
+        result = store_hit(found, gaussians, peak, ray)
+    return result
+
+
+@wp.func
+def is_full(settings: TraceSettings, found: RayReturn) -> bool:
+    return found.slot == found.end
+
+
+store_all = traversal("store_all", store_leaf, is_done=is_full)
+
+
+@wp.func
 def store_hits(
     tree: WideTree,
     gaussians: Gaussians,
@@ -141,39 +152,13 @@ def store_hits(
     direction: wp.vec3,
     t_max: float,
     start: RayReturn,
-    out_hits: HitRecords,
 ) -> RayReturn:
     """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    ray = start
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0:
-                ray = store_hit(ray, gaussians, peak.index, peak.alpha, peak.t, origin, direction, out_hits)
-                if ray.slot == ray.end:
-                    leaf = 0
-                    inner = 0
-                    depth = 0
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return ray
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = t_max
+    return store_all(tree, gaussians, settings, ray, start)
 
 
 @wp.kernel
@@ -238,11 +223,12 @@ def store_hits_kernel(
     ray.weight = -adjoints[i] * transmittances[i]
     ray.end = slot_ends[i]
     begin = ray.end - hit_counts[i]
+    ray.hits = out_hits
     ray.slot = begin
     if begin < ray.end:
         t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
         origin = origins[i] - occluders.origin
-        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray, out_hits)
+        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray)
     # The compiler may round a tie differently in the two traversals; then a slot stays free, and none overflows.
     for slot in range(ray.slot, ray.end):
         out_hits.gaussian[slot] = gaussian_count
