@@ -1,4 +1,4 @@
-"""The tracer's speed, and its error beside it: both backends against a plain wp.Bvh loop and against Embree.
+"""The tracer's speed, and its error beside it: against a plain wp.Bvh loop and against Embree.
 
     python benchmarks/tracing.py [--device cuda:0] [--out DIR] [--quick]
 
@@ -43,21 +43,17 @@ from beam_warp.jobs.report import versions
 from beam_warp.trace.transmittance import ACCEPTANCES, TraceOptions
 
 SCENE_BUILDS: dict[str, dict[str, Any]] = {
-    "wide": {"backend": "wide"},
-    "wide fast": {"backend": "wide", "build": "fast"},
-    "warp": {"backend": "warp"},
+    "wide": {},
+    "wide fast": {"build": "fast"},
 }
 """Scenes that are compared, as arguments of `Scene.from_gaussians`; the first is what users get."""
 
-MOVES = (("wide", "refit"), ("wide", "fast"), ("wide", "quality"), ("warp", "refit"), ("warp", "quality"))
-"""Backend and way of `Scene.move` that are timed."""
+MOVES = ("refit", "fast", "quality")
+"""Ways of `Scene.move` that are timed."""
 
 FROM_HOST = "Scene.from_gaussians "
 PLAIN = "plain wp.Bvh"
 EMBREE = "Embree 4"
-
-BVH_NODE_BYTES = 84
-"""What ``wp.Bvh`` holds a box beside the box: two nodes of 32 bytes, parents, counts, one index (Warp 1.19)."""
 
 BRUTE_FORCE_PAIRS = 2e8
 """Pairs of ray and Gaussian that the float64 truth of a growth row may cost: a few seconds."""
@@ -125,7 +121,7 @@ class Contender:
     Attributes:
         task: Traces all rays and keeps the result in ``found``.
         exact: Whether V is the product; else one Bernoulli sample of it a ray.
-        baseline: Whether it stands for ``wp.Bvh``.
+        baseline: Whether it is a form of the plain ``wp.Bvh`` loop.
         found: The last result.
     """
 
@@ -159,7 +155,6 @@ def contenders_for(
             found[f"{name} {acceptance}"] = Contender.of(
                 lambda scene=scene, options=options: visibility(scene, origins, directions, options=options),
                 exact=acceptance == "product",
-                baseline=build["backend"] == "warp" and acceptance == "product",
             )
     packed = pack_gaussians(cloud)
     for constructor in ("sah", "lbvh") if device.is_cuda else ("sah",):
@@ -269,9 +264,9 @@ def build_tasks(cloud: GaussianCloud, packed: PackedGaussians, device: Any) -> I
         wp.array(array, dtype=dtype, device=device)
         for array, dtype in ((cloud.positions, wp.vec3), (cloud.orientations, wp.quat), (cloud.scales, wp.vec3))
     ]
-    for backend, way in MOVES:
-        scene = Scene.from_gaussians(cloud, str(device), backend=backend)
-        yield f"Scene.move {backend} {way}", Task(lambda s=scene, w=way: s.move(*placed, tree=w))
+    for way in MOVES:
+        scene = Scene.from_gaussians(cloud, str(device))
+        yield f"Scene.move wide {way}", Task(lambda s=scene, w=way: s.move(*placed, tree=w))
     lowers, uppers = (
         wp.array(np.ascontiguousarray(part), dtype=wp.vec3, device=device)
         for part in (packed.boxes[:, :3], packed.boxes[:, 3:])
@@ -324,7 +319,7 @@ def scene_bytes(cloud: GaussianCloud, device: Any) -> dict[str, int]:
 
 
 def allocated_bytes(*roots: Any) -> int:
-    """Return the bytes of every array that objects hold at any depth, each once, and of the trees of ``wp.Bvh``."""
+    """Return the bytes of every array that objects hold at any depth, each once."""
     total, pending, seen = 0, list(roots), set()
     while pending:
         value = pending.pop()
@@ -334,9 +329,6 @@ def allocated_bytes(*roots: Any) -> int:
         seen.add(key)
         if isinstance(value, wp.array):
             total += value.capacity
-        elif isinstance(value, wp.Bvh):
-            pending += [value.lowers, value.uppers]
-            total += BVH_NODE_BYTES * len(value.lowers)
         elif isinstance(value, (list, tuple)):
             pending += value
         elif isinstance(value, dict):

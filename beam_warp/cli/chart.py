@@ -67,7 +67,6 @@ class TracingChart:
         float, arg(metavar="S", help="Time for references and measuring; what does not fit is skipped and counted.")
     ] = 120.0
     rays: Annotated[tuple[int, ...], arg(metavar="N ...", help="Rays per point.")] = (4, 16, 64, 256, 1024)
-    backends: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="wide, warp.")] = ("wide", "warp")
     acceptances: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="product, bernoulli.")] = (
         "product",
         "bernoulli",
@@ -226,7 +225,6 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
     from beam_warp.study.tracing_plan import TracingPlan
 
     plan = TracingPlan(
-        backends=args.backends,
         acceptances=args.acceptances,
         samplers=args.samplers,
         offsets=args.offsets,

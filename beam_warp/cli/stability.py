@@ -155,7 +155,7 @@ def _faults(result: StabilityResult) -> list[str]:
         if not outcome.passed
     ]
     return lines + [
-        f"failed: {o.shape} at spacing {o.spacing:g} on {o.device}, {o.backend}: {o.largest_z:.1f} standard errors"
+        f"failed: {o.shape} at spacing {o.spacing:g} on {o.device}: {o.largest_z:.1f} standard errors"
         for o in result.occlusion
         if not o.passed
     ]
@@ -245,13 +245,12 @@ def _print_tracing(result: StabilityResult) -> None:
             f"[red]failed: {failed}[/red]" if failed else "ok",
         )
     console.print(table)
-    titles = ("shape", "spacing", "backend", "smooth", "tiled", "discretisation", "estimate", "largest z", "verdict")
+    titles = ("shape", "spacing", "smooth", "tiled", "discretisation", "estimate", "largest z", "verdict")
     table = Table(*titles, title=f"ambient occlusion on {device}")
     for o in result.occlusion:
         table.add_row(
             o.shape,
             f"{o.spacing:g}",
-            o.backend,
             *(f"{value:.4f}" for value in (o.closed_form, o.quadrature, o.discretisation, o.estimate)),
             f"{o.largest_z:.2f}",
             "ok" if o.passed else "[red]failed[/red]",

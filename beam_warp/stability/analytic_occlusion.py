@@ -19,7 +19,7 @@ from beam_warp.device.arrays import device_label
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference
-from beam_warp.trace.scene import BACKENDS, Scene
+from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -69,12 +69,11 @@ class KnownShape:
 
 @dataclass(frozen=True)
 class OcclusionOutcome:
-    """What one backend on one device made of one shape; all but counts and z are means over points.
+    """What one device made of one shape; all but counts and z are means over points.
 
     Attributes:
         shape: Name of the shape.
         device: Warp device.
-        backend: Hierarchy.
         spacing: Of the tiles [m].
         gaussians: Number of tiles.
         points: Number of points.
@@ -90,7 +89,6 @@ class OcclusionOutcome:
 
     shape: str
     device: str
-    backend: str
     spacing: float
     gaussians: int
     points: int
@@ -166,19 +164,17 @@ def measure_occlusion(
     shape: KnownShape,
     device: str | None = None,
     *,
-    backends: Sequence[str] = BACKENDS,
     spacing: float | None = None,
     point_count: int = 12,
     sample_count: int = 64,
     frame_count: int = 16,
     quadrature_count: int = 2048,
-) -> list[OcclusionOutcome]:
-    """Estimate a shape's ambient occlusion on each backend and compare it with quadrature and closed form.
+) -> OcclusionOutcome:
+    """Estimate a shape's ambient occlusion and compare it with quadrature and closed form.
 
     Args:
         shape: From `SHAPES`.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
-        backends: Hierarchies; they share the quadrature.
         spacing: Of the tiles [m]; None takes the shape's own.
         point_count: Points on the shape.
         sample_count: Rays a point and frame.
@@ -187,63 +183,53 @@ def measure_occlusion(
     """
     distance = shape.spacing if spacing is None else spacing
     tiled = shape.build(distance, point_count)
-    outcomes = []
-    truth = truth_error = np.zeros(0)
-    for backend in backends:
-        scene = Scene.from_gaussians(tiled.cloud, device, backend=backend)  # type: ignore[arg-type]
-        if not len(truth):
-            origins = traced_origins(scene, tiled.points, tiled.normals)
-            truth, truth_error = occlusion_quadrature(tiled.cloud, origins, tiled.normals, quadrature_count)
-        runs = [
-            ambient_occlusion(scene, tiled.points, tiled.normals, sample_count=sample_count, frame=frame)
-            for frame in range(frame_count)
-        ]
-        values = np.array([run.visibility for run in runs], np.float64)
-        stated = np.array([run.standard_error for run in runs], np.float64)
-        # What the tracer stops below is not noise, and no number of samples removes it.
-        other = np.square(truth_error) + EXACT.stop**2
-        z = (values.mean(axis=0) - truth) / np.sqrt(values.var(axis=0, ddof=1) / frame_count + other)
-        outcomes.append(
-            OcclusionOutcome(
-                shape=shape.name,
-                device=device_label(scene.device),
-                backend=backend,
-                spacing=distance,
-                gaussians=len(tiled.cloud),
-                points=len(tiled.points),
-                closed_form=float(tiled.visibility.mean()),
-                quadrature=float(truth.mean()),
-                estimate=float(values[0].mean()),
-                standard_error=float(stated[0].mean()),
-                largest_z=float((np.abs(values - truth) / np.sqrt(np.square(stated) + other))[0].max()),
-                mean_z=float(z.mean()),
-                chi_square=float(np.square(z).mean()),
-                discretisation=float(np.abs(truth - tiled.visibility).mean()),
-            )
-        )
-    return outcomes
+    scene = Scene.from_gaussians(tiled.cloud, device)
+    origins = traced_origins(scene, tiled.points, tiled.normals)
+    truth, truth_error = occlusion_quadrature(tiled.cloud, origins, tiled.normals, quadrature_count)
+    runs = [
+        ambient_occlusion(scene, tiled.points, tiled.normals, sample_count=sample_count, frame=frame)
+        for frame in range(frame_count)
+    ]
+    values = np.array([run.visibility for run in runs], np.float64)
+    stated = np.array([run.standard_error for run in runs], np.float64)
+    # What the tracer stops below is not noise, and no number of samples removes it.
+    other = np.square(truth_error) + EXACT.stop**2
+    z = (values.mean(axis=0) - truth) / np.sqrt(values.var(axis=0, ddof=1) / frame_count + other)
+    return OcclusionOutcome(
+        shape=shape.name,
+        device=device_label(scene.device),
+        spacing=distance,
+        gaussians=len(tiled.cloud),
+        points=len(tiled.points),
+        closed_form=float(tiled.visibility.mean()),
+        quadrature=float(truth.mean()),
+        estimate=float(values[0].mean()),
+        standard_error=float(stated[0].mean()),
+        largest_z=float((np.abs(values - truth) / np.sqrt(np.square(stated) + other))[0].max()),
+        mean_z=float(z.mean()),
+        chi_square=float(np.square(z).mean()),
+        discretisation=float(np.abs(truth - tiled.visibility).mean()),
+    )
 
 
 def measure_shapes(
     shapes: Sequence[KnownShape],
     device: str | None = None,
     *,
-    backends: Sequence[str] = BACKENDS,
     refinements: Sequence[float] = (1.0, 0.5, 0.25),
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[OcclusionOutcome]:
-    """Measure shapes one after the other with ever finer tiles, each on every backend.
+    """Measure shapes one after the other with ever finer tiles.
 
     Args:
         shapes: From `SHAPES`.
         device: As `measure_occlusion`.
-        backends: As `measure_occlusion`.
         refinements: Spacings of the tiles, in the shape's own.
         progress: Called with (shapes done, shapes in all).
     """
     for done, shape in enumerate(shapes, start=1):
         for refinement in refinements:
-            yield from measure_occlusion(shape, device, backends=backends, spacing=shape.spacing * refinement)
+            yield measure_occlusion(shape, device, spacing=shape.spacing * refinement)
         if progress is not None:
             progress(done, len(shapes))
 

@@ -28,9 +28,9 @@ those of one run of
 
     {command}
 
-Each case runs under the own tree in both builds, under one that was built for other places and refitted, and under
-`wp.Bvh`; the table has the worst of them. Each device has a column: run with `--json` there, and give those files to
-`--beside` of the run that writes the page.
+Each case runs under the tree in both builds and under one that was built for other places and refitted; the table has
+the worst of them. Each device has a column: run with `--json` there, and give those files to `--beside` of the run that
+writes the page.
 
 **Error** is the largest |V - V_float64| over the rays of a case; **allowed** is the difference that float32 explains
 there, median and largest over the rays. Nothing is fitted: the reference (`beam_warp/trace/reference.py`) carries an

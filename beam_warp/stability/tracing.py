@@ -34,8 +34,8 @@ from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.gaussians import GaussianCloud
 
-HIERARCHIES = ("wide", "wide, fast", "wide, refitted", "warp")
-"""The own tree by either build, one that was built for other places and refitted, and ``wp.Bvh``."""
+HIERARCHIES = ("quality", "fast", "refitted")
+"""The tree by either build, and one that was built for other places and refitted."""
 
 SCALE_FOR_ZERO = 1e-7
 """In the truth of an unraised cloud a scale of 0 stands for this part of the smallest one traced."""
@@ -126,12 +126,12 @@ def run_case(case: StressCase, device: str | None = None, *, hierarchies: Sequen
     """Run one case under each hierarchy; they share the float64 truth."""
     stress = case.build()
     outcomes: list[Outcome] = []
-    truth: Truth | None = None
+    truth: ReferenceVisibility | None = None
     for hierarchy in hierarchies:
         start = time.perf_counter()
         scene = scene_under(hierarchy, stress.cloud, device, stress.response_degree)
         result = visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=stress.options)
-        truth = truth or Truth.of(stress, scene)
+        truth = truth or ReferenceVisibility.of(stress, scene)
         faults = _faults(stress, scene, result, truth)
         faults += _surface_faults(stress, scene, truth) + _bernoulli_faults(stress, scene, truth)
         did = _range_of("V", result)
@@ -168,23 +168,18 @@ def scene_under(hierarchy: str, cloud: GaussianCloud, device: str | None, respon
     The refitted tree was built for a scene of the same extent in which every Gaussian was in its neighbour's place.
     """
     require_choice("hierarchy", hierarchy, HIERARCHIES)
-    if hierarchy == "warp":
-        return Scene.from_gaussians(cloud, device, backend="warp", response_degree=response_degree)
-    if hierarchy != "wide, refitted":
-        build = "fast" if hierarchy == "wide, fast" else "quality"
-        return Scene.from_gaussians(cloud, device, backend="wide", build=build, response_degree=response_degree)
+    if hierarchy != "refitted":
+        return Scene.from_gaussians(cloud, device, build=hierarchy, response_degree=response_degree)  # type: ignore[arg-type]
     seen = np.flatnonzero(cloud.opacities > 1.0 / 255.0)
     positions = cloud.positions.copy()
     positions[seen] = cloud.positions[np.roll(seen, 1)]
-    scene = Scene.from_gaussians(
-        cloud.with_arrays(positions=positions), device, backend="wide", response_degree=response_degree
-    )
+    scene = Scene.from_gaussians(cloud.with_arrays(positions=positions), device, response_degree=response_degree)
     scene.move(cloud.positions, cloud.orientations, cloud.scales, tree="refit")
     return scene
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceVisibility:
     """What float64 says about the rays of a case.
 
     Attributes:
@@ -196,7 +191,7 @@ class Truth:
     raising: float
 
     @classmethod
-    def of(cls, stress: Stress, scene: Scene) -> Truth:
+    def of(cls, stress: Stress, scene: Scene) -> ReferenceVisibility:
         """Evaluate the reference on the Gaussians that a scene traces, and on the cloud's own."""
         rules: dict[str, Any] = {
             "t_max": stress.t_max,
@@ -239,7 +234,7 @@ def _range_of(name: str, values: NDArray[np.float32]) -> str:
     return f"{name} = {low}" if low == high else f"{name} {low} … {high}"
 
 
-def _faults(stress: Stress, scene: Scene, result: NDArray[np.float32], truth: Truth) -> list[str]:
+def _faults(stress: Stress, scene: Scene, result: NDArray[np.float32], truth: ReferenceVisibility) -> list[str]:
     """Return what should not be."""
     faults = []
     # Phrased so that NaN fails.
@@ -266,7 +261,7 @@ def _faults(stress: Stress, scene: Scene, result: NDArray[np.float32], truth: Tr
     return faults
 
 
-def _surface_faults(stress: Stress, scene: Scene, truth: Truth) -> list[str]:
+def _surface_faults(stress: Stress, scene: Scene, truth: ReferenceVisibility) -> list[str]:
     """Return what should not be about the closest surface of the same rays."""
     hits = [
         closest_surface(
@@ -296,7 +291,7 @@ def _surface_faults(stress: Stress, scene: Scene, truth: Truth) -> list[str]:
     return [f"surfaces: {np.count_nonzero(~good)} rays {what}" for what, good in checks.items() if not good.all()]
 
 
-def _bernoulli_faults(stress: Stress, scene: Scene, truth: Truth) -> list[str]:
+def _bernoulli_faults(stress: Stress, scene: Scene, truth: ReferenceVisibility) -> list[str]:
     """Return whether the mean of Bernoulli samples misses that of the truth by more than chance and rounding explain.
 
     Bernstein's inequality for n independent draws b of variance V (1 - V): with probability at least 1 - delta,

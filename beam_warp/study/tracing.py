@@ -70,16 +70,11 @@ def tracing_study(
         OutputError: ``references_file`` cannot be written.
     """
     target = resolve_device(device)
-    scenes = {
-        backend: Scene.from_gaussians(cloud, str(target), backend=backend)  # type: ignore[arg-type]
-        for backend in plan.backends
-    }
-    # Were one tree to lose hits, the other's rows would not fall to the floor, whichever the references come from
-    default = plan.backends[0]
+    scene = Scene.from_gaussians(cloud, str(target))
     references = find_references(
-        cloud, environment, plan, scenes[default], file=references_file, seconds=reference_seconds, progress=progress
+        cloud, environment, plan, scene, file=references_file, seconds=reference_seconds, progress=progress
     )
-    bench = _Bench(plan, references, scenes, SampledEnvironment.from_environment(environment, target), len(cloud))
+    bench = _Bench(plan, references, scene, SampledEnvironment.from_environment(environment, target), len(cloud))
     subject = Subject(
         name="tracing",
         title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {device_name(target)}",
@@ -92,8 +87,8 @@ def tracing_study(
             "Points": f"{len(references.points):,} of {len(cloud):,} Gaussians, at random; normals "
             f"{'as given' if cloud.normals is not None else 'estimated'}; mean ambient occlusion "
             f"{references.occlusion[0].mean():.3f}",
-            "References": f"{plan.reference_rays:,} Owen-scrambled rays a point, product acceptance, backend {default}",
-            "Tracer against float64": check_against_float64(cloud, references, scenes, plan.seed),
+            "References": f"{plan.reference_rays:,} Owen-scrambled rays a point, product acceptance",
+            "Tracer against float64": check_against_float64(cloud, references, scene, plan.seed),
             "Light": environment_name,
             "Mean lift by offset": ", ".join(
                 f"{offset}: {1e3 * references.lift_lengths(offset).mean():.3g} mm" for offset in plan.offsets
@@ -119,7 +114,6 @@ def tracing_study(
 def tracing_axes(plan: TracingPlan) -> tuple[Axis, ...]:
     """Return the factors of the study."""
     sentences = {
-        "backend": "wide: own 4-wide tree. warp: wp.Bvh.",
         "acceptance": "product: transmittances multiply, exact. bernoulli: every hit blocks by chance, unbiased.",
         "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
         "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
@@ -128,7 +122,6 @@ def tracing_axes(plan: TracingPlan) -> tuple[Axis, ...]:
         f"auto is {LIFT_IN_THICKNESSES:g}t.",
     }
     levels = {
-        "backend": plan.backends,
         "acceptance": plan.acceptances,
         "sampler": plan.samplers,
         "density": plan.densities,
@@ -171,11 +164,11 @@ def device_name(device: Any) -> str:
     return f"{name} ({count} thread{'s' if count > 1 else ''})"
 
 
-def check_against_float64(cloud: GaussianCloud, references: References, scenes: dict[str, Scene], seed: int) -> str:
-    """Return in words how far single rays of each backend are off the float64 twin."""
+def check_against_float64(cloud: GaussianCloud, references: References, scene: Scene, seed: int) -> str:
+    """Return in words how far single rays are off the float64 twin."""
     if len(cloud) > FLOAT64_GAUSSIANS:
         return f"not checked, more than {FLOAT64_GAUSSIANS:,} Gaussians"
-    report = next(iter(scenes.values())).report
+    report = scene.report
     if report.raised_scales or report.not_finite:
         return f"not checked, {report.raised_scales + report.not_finite:,} Gaussians were mended for tracing"
     generator = np.random.default_rng(seed)
@@ -187,10 +180,8 @@ def check_against_float64(cloud: GaussianCloud, references: References, scenes: 
     directions = directions.astype(np.float32)
     origins = references.points[rows] + normals * references.lift_lengths("auto")[rows, None]
     truth = visibility_reference(cloud, origins, directions)
-    worst = (
-        f"{name} {np.abs(visibility(scene, origins, directions) - truth).max():.1e}" for name, scene in scenes.items()
-    )
-    return f"largest error of {FLOAT64_RAYS} rays: {', '.join(worst)}"
+    worst = np.abs(visibility(scene, origins, directions) - truth).max()
+    return f"largest error of {FLOAT64_RAYS} rays: {worst:.1e}"
 
 
 class _Bench:
@@ -200,12 +191,12 @@ class _Bench:
         self,
         plan: TracingPlan,
         references: References,
-        scenes: dict[str, Scene],
+        scene: Scene,
         light: SampledEnvironment,
         count: int,
     ) -> None:
         """Keep what is measured on; ``count`` is the number of Gaussians that times are scaled to."""
-        self.plan, self.references, self.scenes, self.light, self.count = plan, references, scenes, light, count
+        self.plan, self.references, self.scene, self.light, self.count = plan, references, scene, light, count
         self.device = light.device
         self.truth = dict(zip(plan.offsets, references.occlusion.astype(np.float64), strict=True))
         self.finest = min(plan.offsets, key=lambda offset: float(references.lift_lengths(offset).mean()))
@@ -224,7 +215,6 @@ class _Bench:
                 "RMS error of ambient occlusion",
                 color="sampler",
                 marker="acceptance",
-                line="backend",
                 apart="offset",
                 floor=root_mean_square(self.references.occlusion_error),
                 sentence=f"Against {rays} from the same offset: noise, which more rays remove.",
@@ -263,7 +253,7 @@ class _Bench:
         points, normals = (
             upload(np.tile(array, (copies, 1)), wp.vec3, self.device) for array in (at, self.references.normals)
         )
-        scene = self.scenes[str(settings["backend"])]
+        scene = self.scene
         common: dict[str, Any] = {
             "sample_count": settings["rays"],
             "sampler": settings["sampler"],

@@ -12,7 +12,6 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.study.table import Settings
 from beam_warp.trace.incident import DENSITIES
 from beam_warp.trace.sampling import SAMPLERS
-from beam_warp.trace.scene import BACKENDS
 from beam_warp.trace.transmittance import ACCEPTANCES
 
 RATIOS = ("ratio", "plain")
@@ -25,8 +24,7 @@ class TracingPlan:
     """Which settings to measure, and how well.
 
     Attributes:
-        backends: Hierarchies; the first of each of these lists is its default.
-        acceptances: How hits add up.
+        acceptances: How hits add up; the first of each of these lists is its default.
         samplers: Sample sets.
         offsets: Lifts of ray origins: ``auto``, metres such as ``0.02``, or multiples of the local thickness such as
             ``2t``, from the local surface.
@@ -43,7 +41,6 @@ class TracingPlan:
         InvalidOptionError: A value is none of its choices, out of range or given twice.
     """
 
-    backends: tuple[str, ...] = BACKENDS
     acceptances: tuple[str, ...] = ACCEPTANCES
     samplers: tuple[str, ...] = SAMPLERS
     offsets: tuple[str, ...] = ("auto", "2t", "8t", "0.02")
@@ -59,7 +56,6 @@ class TracingPlan:
     def __post_init__(self) -> None:
         """Check every option once."""
         for name, choices in (
-            ("backends", BACKENDS),
             ("acceptances", ACCEPTANCES),
             ("samplers", SAMPLERS),
             ("densities", DENSITIES),
@@ -71,7 +67,7 @@ class TracingPlan:
         for count in self.rays:
             # Fewest that every estimator takes: half of the rays of mis come from either density, and pair up
             require_count("rays", count, 4, 1 << 16)
-        for name in ("backends", "acceptances", "samplers", "offsets", "densities", "ratios", "rays"):
+        for name in ("acceptances", "samplers", "offsets", "densities", "ratios", "rays"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
@@ -86,24 +82,22 @@ class TracingPlan:
     def occlusion_settings(self) -> list[Settings]:
         """Return the settings of ambient occlusion without rays, the most telling first."""
         axes = {
-            "backend": self.backends,
             "acceptance": self.acceptances,
             "sampler": self.samplers,
             "offset": self.offsets,
         }
-        return _crossed(axes, self.crossing, ({"backend", "acceptance"}, {"acceptance", "sampler"}, {"offset"}))
+        return _crossed(axes, self.crossing, ({"acceptance", "sampler"}, {"offset"}))
 
     def irradiance_settings(self) -> list[Settings]:
         """Return the settings of irradiance without rays; the offset stays at its default."""
         axes = {
-            "backend": self.backends,
             "acceptance": self.acceptances,
             "sampler": self.samplers,
             "offset": self.offsets[:1],
             "density": self.densities,
             "ratio": self.ratios,
         }
-        return _crossed(axes, self.crossing, ({"density", "ratio"}, {"sampler"}, {"acceptance"}, {"backend"}))
+        return _crossed(axes, self.crossing, ({"density", "ratio"}, {"sampler"}, {"acceptance"}))
 
 
 def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], float]:

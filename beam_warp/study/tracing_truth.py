@@ -185,7 +185,7 @@ def _fingerprint(cloud: GaussianCloud, environment: EnvironmentMap, plan: Tracin
         digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     digest.update(environment.radiance.tobytes())
     chosen = (plan.offsets, plan.reference_rays, plan.points, plan.seed)
-    digest.update(repr((chosen, scene.device.name, scene.device.is_cuda, scene.backend, __version__)).encode())
+    digest.update(repr((chosen, scene.device.name, scene.device.is_cuda, __version__)).encode())
     return digest.hexdigest()
 
 

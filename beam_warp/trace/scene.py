@@ -13,9 +13,9 @@ from beam_warp.checks import require_array, require_choice, require_finite, requ
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
-from beam_warp.kernels.trace.occluders import OCCLUDERS
+from beam_warp.kernels.trace.occluders import GaussianAndMeshOccluders, GaussianOccluders
 from beam_warp.trace.packing import PackedGaussians
-from beam_warp.trace.wide_tree import build_wide_tree, refit
+from beam_warp.trace.wide_tree import BuiltTree, build_wide_tree, refit
 from beam_warp.world.gaussians import GaussianCloud
 
 NOTHING = GaussianCloud(
@@ -26,11 +26,8 @@ NOTHING = GaussianCloud(
 )
 """One Gaussian that no ray sees: with it kernels need no case for an empty scene."""
 
-BACKENDS = ("wide", "warp")
 BUILDS = ("quality", "fast")
-WARP_BUILDS = {"quality": "sah", "fast": "lbvh"}
 
-Backend = Literal["wide", "warp"]
 Build = Literal["quality", "fast"]
 
 
@@ -43,7 +40,7 @@ class SceneReport:
         dropped: Gaussians left out because their opacity is at most 1/255: no ray can see them.
         raised_scales: Gaussians traced with a scale raised to the smallest that float32 can resolve.
         not_finite: Gaussians left out because of NaN, infinity, a negative scale or a zero quaternion.
-        depth: Levels of the wide tree; 0 for ``wp.Bvh``, which does not tell.
+        depth: Levels of the tree.
         build: How the tree was built; ``"places"`` where the method asked for made it too deep to traverse.
     """
 
@@ -60,17 +57,15 @@ class Scene:
     """One device's copy of a cloud; `from_gaussians` makes it, `move` moves it.
 
     Attributes:
-        backend: Hierarchy that rays traverse.
         occluders: What kernels trace, relative to ``origin``.
         mesh: Triangles among the Gaussians; None for none.
     """
 
-    backend: Backend
     occluders: Any
     mesh: wp.Mesh | None
     _packed: PackedGaussians = field(repr=False)
     _count: int = field(repr=False)
-    _tree: Any = field(repr=False, default=None)
+    _tree: BuiltTree = field(repr=False, init=False)
     _report: SceneReport = field(repr=False, default=SceneReport(0, 0, 0))
     _refitted: bool = field(repr=False, default=False)
 
@@ -80,7 +75,6 @@ class Scene:
         cloud: GaussianCloud,
         device: str | None = None,
         *,
-        backend: Backend = "wide",
         build: Build = "quality",
         response_degree: Literal[2, 4] = 2,
         mesh: Any = None,
@@ -90,9 +84,7 @@ class Scene:
         Args:
             cloud: Any number of Gaussians, none included.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
-            backend: ``"wide"``, the own hierarchy of four children a node, or ``"warp"``, ``wp.Bvh``.
-            build: ``"quality"`` for many rays, ``"fast"`` for geometry that changes with every few. With ``wp.Bvh``:
-                the surface-area heuristic, on the host, or LBVH, which only CUDA has.
+            build: ``"quality"`` for many rays, ``"fast"`` for geometry that changes with every few.
             response_degree: 2 for Gaussians, 4 for the faster falloff exp(-x^4 / 18) of 3DGRT, if trained with it.
             mesh: Opaque triangles in the same world, ground or props: anything with ``vertices`` ``(V, 3)`` [m] and
                 ``faces`` ``(F, 3)``, a ``trimesh.Trimesh`` for one.
@@ -103,19 +95,17 @@ class Scene:
             InvalidOptionError: An option is none of its choices.
         """
         target = resolve_device(device)
-        require_choice("backend", backend, BACKENDS)
         require_choice("build", build, BUILDS)
         if response_degree not in (2, 4):
             raise InvalidOptionError(f"response_degree must be 2 or 4, got {response_degree!r}. Choose one of them.")
         packed = PackedGaussians.from_cloud(cloud if len(cloud) else NOTHING, response_degree, target)
-        occluders = OCCLUDERS[backend, mesh is not None]()
-        triangles = None
+        occluders, triangles = GaussianOccluders(), None
         if mesh is not None:
-            triangles = _upload_mesh(mesh, packed.origin, target)
+            occluders, triangles = GaussianAndMeshOccluders(), _upload_mesh(mesh, packed.origin, target)
             occluders.mesh.mesh = triangles.id
         occluders.gaussians = packed.gaussians
         occluders.origin = wp.vec3(*packed.origin.tolist())
-        scene = cls(backend, occluders, triangles, packed, len(cloud))
+        scene = cls(occluders, triangles, packed, len(cloud))
         scene._build(build)
         return scene
 
@@ -124,10 +114,9 @@ class Scene:
         """What was left out or changed; after a refit it is counted when asked for, as a refit reads nothing back."""
         if self._refitted:
             fates = self._packed.fates.numpy().copy()
-            if self.backend == "wide":  # what was left out when the tree was built stays out
-                absent = np.ones(len(fates), np.bool_)
-                absent[self._tree.layout.items.numpy()[: self._tree.count]] = False
-                fates[absent & ((fates == TRACED) | (fates == RAISED))] = NOT_FINITE
+            absent = np.ones(len(fates), np.bool_)  # what was left out when the tree was built stays out
+            absent[self._tree.layout.items.numpy()[: self._tree.count]] = False
+            fates[absent & ((fates == TRACED) | (fates == RAISED))] = NOT_FINITE
             number = np.bincount(fates, minlength=4).tolist()
             self._report = replace(
                 self._report,
@@ -214,8 +203,6 @@ class Scene:
         self._refitted = tree == "refit"
         if tree != "refit":
             self._build(tree)
-        elif self.backend == "warp":
-            self._tree.refit()
         else:
             refit(self._tree, self._packed)
 
@@ -224,19 +211,13 @@ class Scene:
         packed = self._packed
         number = packed.fate_counts()
         traced = number[TRACED] + number[RAISED]
-        depth, method = 0, WARP_BUILDS[build]
-        if self.backend == "wide":
-            self._tree = build_wide_tree(packed, traced, build)
-            self.occluders.tree = self._tree.tree
-            depth, method = len(self._tree.levels), self._tree.method
-        else:
-            if not packed.device.is_cuda:
-                method = "sah"
-            self._tree = wp.Bvh(packed.lowers, packed.uppers, constructor=method, leaf_size=1)
-            self.occluders.tree.bvh = self._tree.id
+        self._tree = build_wide_tree(packed, traced, build)
+        self.occluders.tree = self._tree.tree
         # The one Gaussian of an empty scene is not the cloud's.
         invisible = number[INVISIBLE] if len(self) else 0
-        self._report = SceneReport(traced, invisible, number[RAISED], number[NOT_FINITE], depth, method)
+        self._report = SceneReport(
+            traced, invisible, number[RAISED], number[NOT_FINITE], len(self._tree.levels), self._tree.method
+        )
 
 
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:

@@ -8,13 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from beam_warp.checks import require_array, require_choice, require_count, require_number, require_same_length
 from beam_warp.device.arrays import download_like, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common.constants import LARGEST_FLOAT, TRANSMITTANCE_STOP
-from beam_warp.kernels.trace.counts import launch_count_traversal
 from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.visibility import Rays, launch_block_rays, launch_trace_rays, launch_trace_rays_wide
 from beam_warp.trace.scene import Scene
@@ -116,41 +114,13 @@ def visibility(
     return download_like(result, origins, directions)
 
 
-@dataclass(frozen=True)
-class TraversalCounts:
-    """The work of rays, one row each.
-
-    Attributes:
-        nodes: Nodes of the wide tree visited, ``(N,)`` int32; 0 for ``wp.Bvh``, which does not tell.
-        tested: Gaussians tested, ``(N,)``.
-        hits: Gaussians that count, up to where the stop ends the ray, ``(N,)``.
-    """
-
-    nodes: NDArray[np.int32]
-    tested: NDArray[np.int32]
-    hits: NDArray[np.int32]
-
-
-def traversal_counts(
-    scene: Scene, origins: Any, directions: Any, *, t_max: Any = math.inf, options: TraceOptions = EXACT
-) -> TraversalCounts:
-    """Return how much work each ray of `visibility` is; products only. Arguments and errors as there."""
-    starts = upload_vectors("origins", origins, scene.device)
-    ways = upload_vectors("directions", directions, scene.device, unit_length=True)
-    require_same_length("directions", ways, "origins", len(starts))
-    counts = wp.empty(len(starts), dtype=wp.vec3i, device=scene.device)
-    reaches = ray_reaches(t_max, len(starts), scene.device)
-    launch_count_traversal(scene.occluders, options.settings(scene), starts, ways, reaches, counts, scene.device)
-    return TraversalCounts(*counts.numpy().T)
-
-
 def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: wp.array) -> None:
     """Trace rays that are on the scene's device already, by the fastest way that their rules allow.
 
     Where triangles block rays, ``rays`` gets reaches of its own.
     """
     settings = options.settings(scene)
-    if scene.backend != "wide" or options.front != "peak" or options.cull or scene.response_degree != 2:
+    if options.front != "peak" or options.cull or scene.response_degree != 2:
         launch_trace_rays(scene.occluders, settings, rays, out_visibility, scene.device)
         return
     if scene.mesh is not None:

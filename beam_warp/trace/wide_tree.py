@@ -60,11 +60,6 @@ class BuiltTree:
     levels: tuple[tuple[int, int], ...]
     layout: WideLayout
 
-    @property
-    def memory_bytes(self) -> int:
-        """Device memory of what rays read."""
-        return self.tree.nodes.capacity + self.tree.leaves.capacity
-
 
 def build_wide_tree(packed: PackedGaussians, count: int, method: Method) -> BuiltTree:
     """Build a tree whose depth traversal can follow.
@@ -164,7 +159,7 @@ def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method
     if begins[-1] > LARGEST_NODE_COUNT:
         raise InvalidArrayError(
             f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {begins[-1]:,} for {count:,} "
-            'Gaussians. Split the cloud, or use backend="warp".'
+            "Gaussians. Split the cloud."
         )
     layout.lower = wp.empty(begins[-1], dtype=wp.vec3, device=device)
     layout.upper = wp.empty(begins[-1], dtype=wp.vec3, device=device)

@@ -3,6 +3,9 @@
 Every kernel launched here takes ``first: int`` as its first input and works on item ``first + wp.tid()``.
 Items must write disjoint outputs; then the result has the same bits for every chunking and thread count. Kernels that
 share outputs by atomics are launched ``in_order``.
+
+A generic kernel takes structures as ``Any``. Warp would keep all of its forms in one module and compile that module
+anew with each new form, so that the order of calls decides what is compiled; here each form has a module of its own.
 """
 
 from __future__ import annotations
@@ -12,7 +15,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import cache, lru_cache
+from types import FunctionType
 from typing import Any
 
 import warp as wp
@@ -60,6 +64,9 @@ def launch(
         min_chunk: Fewest items of one launch on the CPU, less for items of much work; None for the usual.
     """
     target = wp.get_device(device)
+    if kernel.is_generic:
+        given = zip(kernel.adj.arg_types.values(), (None, *inputs, *outputs), strict=True)
+        kernel = kernel_for(kernel, tuple(value._cls for template, value in given if template is Any))
 
     def run(start: int, length: int) -> None:
         wp.launch(
@@ -73,6 +80,24 @@ def launch(
         )
 
     _run_in_chunks(run, range(count), target, 1 if in_order else thread_count(), min_chunk or MIN_CHUNK)
+
+
+@cache
+def kernel_for(kernel: Any, structures: tuple[Any, ...]) -> Any:
+    """Return the form of a generic kernel that takes these structures, in a module of its own.
+
+    Args:
+        kernel: A kernel with arguments of type ``Any``.
+        structures: Warp structures, one for each of those arguments.
+    """
+    generic = [name for name, template in kernel.adj.arg_types.items() if template is Any]
+    function = kernel.func
+    form = FunctionType(
+        function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    form.__qualname__ = function.__qualname__
+    form.__annotations__ = function.__annotations__ | dict(zip(generic, structures, strict=True))
+    return wp.kernel(form, module="unique", module_options=dict(kernel.module.options), **kernel.options)
 
 
 def launch_adjoint(

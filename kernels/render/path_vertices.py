@@ -17,8 +17,9 @@ from beam_warp.kernels.mesh.occluder import nearest_on_mesh
 from beam_warp.kernels.mesh.surface import RAY_LIFT, MeshSurface, surface_point
 from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE, LAST, nearest_hits
 from beam_warp.kernels.trace.gaussian import ray_peak
-from beam_warp.kernels.trace.occluders import surface_layer, tree_sampled_hit
+from beam_warp.kernels.trace.occluders import surface_layer
 from beam_warp.kernels.trace.settings import TraceSettings
+from beam_warp.kernels.trace.wide_traversal import tree_sampled_hit
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,9 +14,9 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
 from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak, whitening_times
-from beam_warp.kernels.trace.settings import TraceSettings, counts
-from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
-from beam_warp.kernels.trace.wide_tree import Stack, WideTree, first_bit, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.trace.settings import TraceSettings
+from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
+from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,6 +68,26 @@ def empty_buffer() -> HitBuffer:
 
 
 @wp.func
+def insert_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: HitBuffer, leaf: int
+) -> HitBuffer:
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    buffer = found
+    if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
+        buffer = insert_hit(found, peak.t, peak.index)
+    return buffer
+
+
+@wp.func
+def reach_of_buffer(ray: TracedRay, found: HitBuffer) -> float:
+    """What lies behind a full buffer is passed over."""
+    return wp.min(ray.t_max, found.t[LAST])
+
+
+insert_all = traversal("insert_all", insert_leaf, reach=reach_of_buffer, ordered=True)
+
+
+@wp.func
 def nearest_hits(
     tree: WideTree,
     gaussians: Gaussians,
@@ -78,65 +98,14 @@ def nearest_hits(
     index_last: int,
     t_max: float,
 ) -> HitBuffer:
-    """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``.
-
-    Children are visited from near to far along their node's axis; what lies behind a full buffer is passed over.
-    """
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    axis = int(0)
-    buffer = empty_buffer()
-    while inner != 0:
-        bit = first_bit(inner, direction[axis] < 0.0)
-        node = first_node + bit
-        inner = inner & ~(1 << bit)
-        if inner != 0:
-            stack[depth] = (first_node << 6) | (axis << 4) | inner
-            depth += 1
-        reach = wp.min(t_max, buffer.t[LAST])
-        hits = meet_node(tree, node, origin, inverse, t_last, reach)
-        first_node = hits.first_node
-        inner = hits.inner
-        axis = hits.axis
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0 and is_before(t_last, index_last, peak.t, peak.index):
-                buffer = insert_hit(buffer, peak.t, peak.index)
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 6
-            axis = (stack[depth] >> 4) & 3
-            inner = stack[depth] & 15
-    return buffer
-
-
-@wp.func
-def nearest_hits(  # noqa: F811
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_last: float,
-    index_last: int,
-    t_max: float,
-) -> HitBuffer:
-    """The same through ``wp.Bvh``, whose order is its own."""
-    buffer = empty_buffer()
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    # A millionth more: boxes must come strictly before the limit, equal hits must not be lost.
-    while wp.bvh_query_next(query, index, wp.min(t_max, buffer.t[LAST] * 1.000001)):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            if is_before(t_last, index_last, peak.t, index):
-                buffer = insert_hit(buffer, peak.t, index)
-    return buffer
+    """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``."""
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_min = t_last
+    ray.index_min = index_last
+    ray.t_max = t_max
+    return insert_all(tree, gaussians, settings, ray, empty_buffer())
 
 
 @wp.func

@@ -53,7 +53,6 @@ class RayPeak:
 
     alpha: float  # 0 outside the support
     t: float  # of the largest response on the ray's line
-    half_chord_squared: float  # the line is inside the support for half a chord before and behind t
 
 
 @wp.func
@@ -77,7 +76,5 @@ def ray_peak(gaussians: Gaussians, index: int, origin: wp.vec3, direction: wp.ve
     peak = RayPeak()
     peak.t = t_closest - wp.dot(q, d) / dd
     if cc < radius_squared * dd:
-        distance_squared = cc / dd
-        peak.alpha = wp.min(ALPHA_MAX, packed[3] * response(gaussians.degree, distance_squared))
-        peak.half_chord_squared = (radius_squared - distance_squared) / dd
+        peak.alpha = wp.min(ALPHA_MAX, packed[3] * response(gaussians.degree, cc / dd))
     return peak

@@ -1,7 +1,7 @@
-"""What rays meet, whatever it is made of: Gaussians under either hierarchy, with or without triangles among them.
+"""What rays meet: Gaussians, with or without triangles among them.
 
-Kernels take occluders as ``Any`` and are compiled for the structure that they are given, so that neither backend pays
-for the other's registers and shared memory.
+Kernels take occluders as ``Any`` and are compiled for each structure (`beam_warp.kernels.common.launching`), so that
+Gaussians alone do not pay for the registers of a triangle query.
 """
 
 from typing import Any
@@ -11,117 +11,29 @@ import warp as wp
 from beam_warp.kernels.mesh.occluder import MeshOccluder, NoMesh, mesh_blocks, nearest_on_mesh
 from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.settings import TraceSettings
-from beam_warp.kernels.trace.surface_layer import SurfaceLayer, add_to_layer, height_and_thickness
-from beam_warp.kernels.trace.warp_tree import WarpTree, warp_tree_sampled_hit, warp_tree_transmittance
-from beam_warp.kernels.trace.wide_traversal import wide_tree_layer, wide_tree_sampled_hit, wide_tree_transmittance
+from beam_warp.kernels.trace.surface_layer import height_and_thickness
+from beam_warp.kernels.trace.wide_traversal import tree_layer, tree_sampled_hit, tree_transmittance
 from beam_warp.kernels.trace.wide_tree import WideTree
 
 
 @wp.struct
-class WarpTreeOccluders:
-    """Gaussians under ``wp.Bvh``."""
+class GaussianOccluders:
+    """Gaussians and the hierarchy over them."""
 
-    tree: WarpTree
+    tree: WideTree
     mesh: NoMesh
     gaussians: Gaussians
     origin: wp.vec3  # world position that everything here is relative to
 
 
 @wp.struct
-class WideTreeOccluders:
-    """Gaussians under the own hierarchy."""
-
-    tree: WideTree
-    mesh: NoMesh
-    gaussians: Gaussians
-    origin: wp.vec3
-
-
-@wp.struct
-class WarpTreeAndMeshOccluders:
-    """Gaussians under ``wp.Bvh``, and triangles."""
-
-    tree: WarpTree
-    mesh: MeshOccluder
-    gaussians: Gaussians
-    origin: wp.vec3
-
-
-@wp.struct
-class WideTreeAndMeshOccluders:
-    """Gaussians under the own hierarchy, and triangles."""
+class GaussianAndMeshOccluders:
+    """Gaussians with triangles among them; each has a hierarchy of its own."""
 
     tree: WideTree
     mesh: MeshOccluder
     gaussians: Gaussians
     origin: wp.vec3
-
-
-@wp.func
-def tree_transmittance(
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    stream: wp.uint32,
-) -> float:
-    return warp_tree_transmittance(tree, gaussians, settings, origin, direction, t_max, stream)
-
-
-@wp.func
-def tree_transmittance(  # noqa: F811
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    stream: wp.uint32,
-) -> float:
-    return wide_tree_transmittance(tree, gaussians, settings, origin, direction, t_max, stream)
-
-
-@wp.func
-def tree_sampled_hit(
-    tree: WarpTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    stream: wp.uint32,
-) -> int:
-    return warp_tree_sampled_hit(tree, gaussians, settings, origin, direction, t_max, stream)
-
-
-@wp.func
-def tree_sampled_hit(  # noqa: F811
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    stream: wp.uint32,
-) -> int:
-    return wide_tree_sampled_hit(tree, gaussians, settings, origin, direction, t_max, stream)
-
-
-@wp.func
-def tree_layer(tree: WarpTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
-    layer = SurfaceLayer()
-    query = wp.bvh_query_aabb(tree.bvh, p, p)
-    index = int(0)
-    while wp.bvh_query_next(query, index):
-        layer = add_to_layer(layer, gaussians, index, p, n)
-    return layer
-
-
-@wp.func
-def tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:  # noqa: F811
-    return wide_tree_layer(tree, gaussians, p, n)
 
 
 @wp.func
@@ -166,10 +78,5 @@ def surface_layer(occluders: Any, point: wp.vec3, normal: wp.vec3) -> wp.vec2:
     return height_and_thickness(tree_layer(occluders.tree, occluders.gaussians, point, normal))
 
 
-OCCLUDERS = {
-    ("warp", False): WarpTreeOccluders,
-    ("warp", True): WarpTreeAndMeshOccluders,
-    ("wide", False): WideTreeOccluders,
-    ("wide", True): WideTreeAndMeshOccluders,
-}
-"""Structure for a backend, without and with triangles."""
+OCCLUDER_TYPES = (GaussianOccluders, GaussianAndMeshOccluders)
+"""Structures without and with triangles."""

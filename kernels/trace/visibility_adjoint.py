@@ -5,8 +5,7 @@ traversal's loop is silently wrong; here the first traversal counts hits and fin
 that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
 No float atomics: the same bits in every run, for any number of threads.
 
-A hierarchy needs two overloads, `tally_hits` and `store_hits`: its loop over hits around `tally_hit` and `store_hit`,
-in the same order both times.
+`tally_hits` and `store_hits` are the two traversals; they meet hits in the same order.
 """
 
 from typing import Any
@@ -16,7 +15,7 @@ import warp as wp
 from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.mesh.occluder import mesh_blocks
-from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak
+from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.hit_gradients import (
     CloudGradients,
     HitMoments,
@@ -30,9 +29,9 @@ from beam_warp.kernels.trace.hit_gradients import (
     transposed_whitening_times,
     whitened_closest_point,
 )
-from beam_warp.kernels.trace.settings import TraceSettings, counts
-from beam_warp.kernels.trace.warp_tree import WarpTree, box_test_direction
-from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_leaf, meet_node, reciprocal
+from beam_warp.kernels.trace.settings import TraceSettings
+from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
+from beam_warp.kernels.trace.wide_tree import LeafPeak, WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,7 +53,8 @@ class RayReturn:
     """What the second traversal of a ray carries."""
 
     weight: float  # -V times the ray's adjoint
-    slot: int  # where the next hit goes
+    hits: HitRecords  # where hits go
+    slot: int  # of the next hit
     end: int
     origin: wp.vec3  # gradients with respect to the ray
     direction: wp.vec3
@@ -70,163 +70,95 @@ def tally_hit(tally: HitTally, alpha: float) -> HitTally:
 
 
 @wp.func
-def store_hit(
-    ray: RayReturn,
-    gaussians: Gaussians,
-    index: int,
-    alpha: float,
-    t: float,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    out_hits: HitRecords,
-) -> RayReturn:
-    """Store a hit with its peak at ``t``, unless it has no gradient, and add that gradient to the ray's."""
-    result = ray
-    if alpha < ALPHA_MAX:
-        q = whitened_closest_point(gaussians, index, origin, direction)
-        e = ray.weight * alpha / (1.0 - alpha)
-        out_hits.gaussian[ray.slot] = index
-        out_hits.record[ray.slot] = wp.vec4(q[0], q[1], q[2], e)
+def store_hit(start: RayReturn, gaussians: Gaussians, peak: LeafPeak, ray: TracedRay) -> RayReturn:
+    """Store a hit, unless it has no gradient, and add that gradient to the ray's."""
+    result = start
+    if peak.alpha < ALPHA_MAX:
+        q = whitened_closest_point(gaussians, peak.index, ray.origin, ray.direction)
+        e = start.weight * peak.alpha / (1.0 - peak.alpha)
+        start.hits.gaussian[start.slot] = peak.index
+        start.hits.record[start.slot] = wp.vec4(q[0], q[1], q[2], e)
         w = e * log_response_slope(gaussians.degree, wp.dot(q, q))
-        pull = transposed_whitening_times(gaussians, index, q) * (2.0 * w)
+        pull = transposed_whitening_times(gaussians, peak.index, q) * (2.0 * w)
         result.origin += pull
-        result.direction += pull * t
+        result.direction += pull * peak.t
         result.slot += 1
     return result
 
 
 @wp.func
+def tally_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: HitTally, leaf: int
+) -> HitTally:
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    tally = found
+    if peak.alpha > 0.0:
+        tally = tally_hit(found, peak.alpha)
+    return tally
+
+
+@wp.func
+def is_tally_dark(settings: TraceSettings, found: HitTally) -> bool:
+    return found.transmittance < settings.stop
+
+
+tally_all = traversal("tally_all", tally_leaf, is_done=is_tally_dark)
+
+
+@wp.func
 def tally_hits(
-    tree: WarpTree,
+    tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
     origin: wp.vec3,
     direction: wp.vec3,
     t_max: float,
 ) -> HitTally:
-    """V and the number of hits with gradients, over what `warp_tree_transmittance` visits."""
+    """V and the number of hits with gradients, over what `tree_transmittance` visits."""
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = t_max
     tally = HitTally()
-    tally.transmittance = float(1.0)
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    while wp.bvh_query_next(query, index, t_max):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            tally = tally_hit(tally, peak.alpha)
-            if tally.transmittance < settings.stop:
-                break
-    return tally
+    tally.transmittance = 1.0
+    return tally_all(tree, gaussians, settings, ray, tally)
+
+
+@wp.func
+def store_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: RayReturn, leaf: int
+) -> RayReturn:
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    result = found
+    if peak.alpha > 0.0:
+        result = store_hit(found, gaussians, peak, ray)
+    return result
+
+
+@wp.func
+def is_full(settings: TraceSettings, found: RayReturn) -> bool:
+    return found.slot == found.end
+
+
+store_all = traversal("store_all", store_leaf, is_done=is_full)
 
 
 @wp.func
 def store_hits(
-    tree: WarpTree,
+    tree: WideTree,
     gaussians: Gaussians,
     settings: TraceSettings,
     origin: wp.vec3,
     direction: wp.vec3,
     t_max: float,
     start: RayReturn,
-    out_hits: HitRecords,
 ) -> RayReturn:
     """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
-    ray = start
-    query = wp.bvh_query_ray(tree.bvh, origin, box_test_direction(direction))
-    index = int(0)
-    while wp.bvh_query_next(query, index, t_max):
-        peak = ray_peak(gaussians, index, origin, direction)
-        if counts(gaussians, settings, index, peak, direction, t_max):
-            ray = store_hit(ray, gaussians, index, peak.alpha, peak.t, origin, direction, out_hits)
-            if ray.slot == ray.end:
-                break
-    return ray
-
-
-@wp.func
-def tally_hits(  # noqa: F811
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-) -> HitTally:
-    """The same, over what `wide_tree_transmittance` visits."""
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    tally = HitTally()
-    tally.transmittance = float(1.0)
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0:
-                tally = tally_hit(tally, peak.alpha)
-                if tally.transmittance < settings.stop:
-                    leaf = 0
-                    inner = 0
-                    depth = 0
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return tally
-
-
-@wp.func
-def store_hits(  # noqa: F811
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    start: RayReturn,
-    out_hits: HitRecords,
-) -> RayReturn:
-    """The same, for the wide tree."""
-    inverse = reciprocal(direction)
-    stack = Stack()
-    depth = int(0)
-    first_node = int(0)
-    inner = int(1)
-    ray = start
-    while inner != 0:
-        node = first_node + lowest_bit(inner)
-        inner = inner & (inner - 1)
-        if inner != 0:
-            stack[depth] = (first_node << 4) | inner
-            depth += 1
-        hits = meet_node(tree, node, origin, inverse, 0.0, t_max)
-        first_node = hits.first_node
-        inner = hits.inner
-        leaf = hits.leaf
-        while leaf != 0:
-            peak = meet_leaf(tree, gaussians, settings, hits.first_leaf + lowest_bit(leaf), origin, direction, t_max)
-            leaf = leaf & (leaf - 1)
-            if peak.alpha > 0.0:
-                ray = store_hit(ray, gaussians, peak.index, peak.alpha, peak.t, origin, direction, out_hits)
-                if ray.slot == ray.end:
-                    leaf = 0
-                    inner = 0
-                    depth = 0
-        if inner == 0 and depth > 0:
-            depth -= 1
-            first_node = stack[depth] >> 4
-            inner = stack[depth] & 15
-    return ray
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = t_max
+    return store_all(tree, gaussians, settings, ray, start)
 
 
 @wp.kernel
@@ -291,11 +223,12 @@ def store_hits_kernel(
     ray.weight = -adjoints[i] * transmittances[i]
     ray.end = slot_ends[i]
     begin = ray.end - hit_counts[i]
+    ray.hits = out_hits
     ray.slot = begin
     if begin < ray.end:
         t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
         origin = origins[i] - occluders.origin
-        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray, out_hits)
+        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray)
     # The compiler may round a tie differently in the two traversals; then a slot stays free, and none overflows.
     for slot in range(ray.slot, ray.end):
         out_hits.gaussian[slot] = gaussian_count

@@ -22,10 +22,6 @@ Stack = wp.types.vector(length=32, dtype=wp.int32)
 LARGEST_NODE_COUNT = 1 << 25
 """A stack's entry numbers a node beside an axis and a mask, six bits, in a signed word."""
 
-FAR_SLACK = wp.constant(1.000002)
-"""Widens the far end of a slab by 16 ulp, more than its rounding errors, those of fast-math division included: no box
-is missed (Ize 2013)."""
-
 
 @wp.struct
 class WideTree:
@@ -86,43 +82,6 @@ def reciprocal(direction: wp.vec3) -> wp.vec3:
     return result
 
 
-@wp.func
-def byte_of(word: int, k: int) -> float:
-    return float((word >> (8 * k)) & 255)
-
-
-@wp.func
-def step_of(exponents: int, axis: int) -> float:
-    """The power of two whose biased exponent is a byte of ``exponents``."""
-    return wp.cast(((exponents >> (8 * axis)) & 255) << 23, float)
-
-
-@wp.func
-def boxes_met_one_by_one(
-    row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_min: float, t_max: float
-) -> int:
-    """Mask of the child boxes that the ray meets between ``t_min`` and ``t_max``: the readable form."""
-    corner_x = (wp.cast(row_0[0], float) - origin[0]) * inverse[0]
-    corner_y = (wp.cast(row_0[1], float) - origin[1]) * inverse[1]
-    corner_z = (wp.cast(row_0[2], float) - origin[2]) * inverse[2]
-    step_x = step_of(row_0[3], 0) * inverse[0]
-    step_y = step_of(row_0[3], 1) * inverse[1]
-    step_z = step_of(row_0[3], 2) * inverse[2]
-    mask = int(0)
-    for k in range(4):
-        x_0 = byte_of(row_1[2], k) * step_x + corner_x
-        x_1 = byte_of(row_2[1], k) * step_x + corner_x
-        y_0 = byte_of(row_1[3], k) * step_y + corner_y
-        y_1 = byte_of(row_2[2], k) * step_y + corner_y
-        z_0 = byte_of(row_2[0], k) * step_z + corner_z
-        z_1 = byte_of(row_2[3], k) * step_z + corner_z
-        near = wp.max(wp.max(wp.min(x_0, x_1), wp.min(y_0, y_1)), wp.max(wp.min(z_0, z_1), t_min))
-        far = wp.min(wp.min(wp.max(x_0, x_1), wp.max(y_0, y_1)), wp.max(z_0, z_1))
-        if near <= wp.min(far * FAR_SLACK, t_max):
-            mask |= 1 << k
-    return mask
-
-
 @wp.func_native("""
     // Near and far planes are chosen once by the direction's signs, then four boxes side by side.
     int near_x = inverse[0] < 0.0f ? row_2[1] : row_1[2], far_x = inverse[0] < 0.0f ? row_1[2] : row_2[1];
@@ -167,7 +126,12 @@ def boxes_met_one_by_one(
 def boxes_met(
     row_0: wp.vec4i, row_1: wp.vec4i, row_2: wp.vec4i, origin: wp.vec3, inverse: wp.vec3, t_min: float, t_max: float
 ) -> int:
-    """The same mask, fast: on the CPU with vectors of four, which Warp's own code does not become."""
+    """Mask of the child boxes that the ray meets between ``t_min`` and ``t_max``.
+
+    The far end of each slab is widened by 16 ulp, more than its rounding errors, those of fast-math division included:
+    no box is missed (Ize 2013). The code is native: on the CPU it works on vectors of four, which Warp's own code does
+    not become.
+    """
     ...
 
 

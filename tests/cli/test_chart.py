@@ -13,7 +13,7 @@ from beam_warp.world.shapes import still_life
 
 QUICK = (
     *("--device", "cpu", "--points", 8, "--reference-rays", 64, "--repeats", 1, "--rays", 4, 8),
-    *("--backends", "warp", "--samplers", "owen", "--densities", "product", "--offsets", "auto", "0.01"),
+    *("--samplers", "owen", "--densities", "product", "--offsets", "auto", "0.01"),
 )
 
 

@@ -78,7 +78,7 @@ def test_json_of_another_device_stands_beside(tmp_path, capsys):
     assert run("--out", tmp_path / "page.md", "--beside", tmp_path / "gpu.json", "--quiet") == 0
     page = (tmp_path / "page.md").read_text(encoding="utf-8")
     assert "| error, cpu | error, Some GPU | verdict |" in page
-    assert "| Some GPU, wide, fast: 3 rays differ by more than rounding explains |" in page
+    assert "| Some GPU, fast: 3 rays differ by more than rounding explains |" in page
 
 
 def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
@@ -86,7 +86,7 @@ def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
     broken = dataclasses.replace(case, build=lambda: dataclasses.replace(case.build(), expected={"traced": 2}))
     monkeypatch.setattr(stress_cases, "CASES", [broken])
     assert run("--quiet") == 1
-    assert "failed: one Gaussian on cpu, wide: traced must be 2, got 1" in capsys.readouterr().err
+    assert "failed: one Gaussian on cpu, quality: traced must be 2, got 1" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from beam_warp.stability.page import HOW_TO_READ, OCCLUSION_TEXT
 from beam_warp.stability.tracing import HIERARCHIES, run_case, scene_under
 from beam_warp.stability.tracing_cases import CASES, case_of
 from beam_warp.trace.reference import rotation_matrices, visibility_enclosure, visibility_reference
-from beam_warp.trace.scene import BACKENDS
 from beam_warp.trace.transmittance import EXACT, TraceOptions
 
 SMALL = [case for case in CASES if not case.large]
@@ -67,8 +66,8 @@ class TestCases:
         """A case whose rays all miss would prove nothing."""
         stress = case.build()
         if stress.known is None and len(stress.origins):
-            (outcome,) = run_case(case, "cpu", hierarchies=("warp",))
-            truth = stability.Truth.of(stress, Scene.from_gaussians(stress.cloud, "cpu", backend="warp"))
+            (outcome,) = run_case(case, "cpu", hierarchies=("quality",))
+            truth = stability.ReferenceVisibility.of(stress, Scene.from_gaussians(stress.cloud, "cpu"))
             assert (truth.rays.hits > 0).mean() > 0.5, outcome.did
 
 
@@ -88,7 +87,7 @@ class TestTheSuiteItself:
     def outcome(self, monkeypatch, change, name="round"):
         real = stability.visibility
         monkeypatch.setattr(stability, "visibility", lambda *rays, **options: change(real(*rays, **options)))
-        return run_case(case_of(name), "cpu", hierarchies=("warp",))[0]
+        return run_case(case_of(name), "cpu", hierarchies=("quality",))[0]
 
     def test_a_small_bias_is_noticed(self, monkeypatch):
         outcome = self.outcome(monkeypatch, lambda v: v * np.float32(1.0 + 1e-3))
@@ -135,7 +134,7 @@ class TestTheSuiteItself:
             return dataclasses.replace(hit, **{name: change(getattr(hit, name))}) if len(seen) == 1 else hit
 
         monkeypatch.setattr(stability, "closest_surface", spoiled)
-        (outcome,) = run_case(case_of("round"), "cpu", hierarchies=("wide",))
+        (outcome,) = run_case(case_of("round"), "cpu", hierarchies=("quality",))
         assert len(outcome.faults) == 1
         assert fault in outcome.faults[0]
 
@@ -157,7 +156,7 @@ class TestTheSuiteItself:
             return change(v) if options.acceptance == "bernoulli" else v
 
         monkeypatch.setattr(stability, "visibility", spoiled)
-        (outcome,) = run_case(case_of("t_max cuts through Gaussians"), "cpu", hierarchies=("wide",))
+        (outcome,) = run_case(case_of("t_max cuts through Gaussians"), "cpu", hierarchies=("quality",))
         assert len(outcome.faults) == 1
         assert outcome.faults[0].startswith(fault)
 
@@ -166,7 +165,7 @@ class TestTheSuiteItself:
         wrong = dataclasses.replace(
             case, build=lambda: dataclasses.replace(case.build(), expected={"dropped": 7}, expected_left_out=(1, 0, 0))
         )
-        (outcome,) = run_case(wrong, "cpu", hierarchies=("warp",))
+        (outcome,) = run_case(wrong, "cpu", hierarchies=("quality",))
         assert outcome.faults == ("dropped must be 7, got 200", "rows left out must be (1, 0, 0), got (0, 0, 0)")
 
 
@@ -414,11 +413,10 @@ class TestOnTheDevice:
         assert finite
         assert (radius > 0.0) == (fate in (TRACED, RAISED))
 
-    @pytest.mark.parametrize("backend", BACKENDS)
     @pytest.mark.parametrize("tree", ["refit", "fast", "quality"])
-    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, device, rng, backend, tree):
+    def test_rows_that_break_on_the_way_are_left_out_and_counted(self, device, rng, tree):
         cloud, rays = random_cloud(rng, 60, scale=(-2.0, 0.3), opacity=(0.1, 0.9)), random_rays(rng, 200)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         positions = cloud.positions.copy()
         positions[7] = np.nan
         scene.move(positions, cloud.orientations, cloud.scales, tree=tree)

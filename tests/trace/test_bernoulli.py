@@ -15,7 +15,6 @@ from beam_warp.kernels.common.sampling import hash_combine
 from beam_warp.kernels.trace.occluders import sampled_hit
 from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.trace.reference import visibility_reference
-from beam_warp.trace.scene import BACKENDS
 from beam_warp.trace.transmittance import TraceOptions
 
 SEEDS = 256
@@ -26,11 +25,6 @@ PATHS = {
     "entry": TraceOptions(acceptance="bernoulli", front="entry"),
 }
 """Batches of rays by the default rules have a kernel of their own under the wide tree; other rules have another."""
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request):
-    return request.param
 
 
 @pytest.fixture(params=PATHS)
@@ -58,10 +52,10 @@ def require_chi_square(squares, degrees):
     assert low <= squares <= high
 
 
-def test_the_mean_over_seeds_is_the_product(device, backend, options, rng):
+def test_the_mean_over_seeds_is_the_product(device, options, rng):
     """Each ray's count of open seeds is binomial with its own V; rays are independent, so that squares add up."""
     cloud, rays = random_cloud(rng, 300, scale=(-2.0, 0.4), opacity=(0.05, 1.0)), random_rays(rng, 400)
-    scene = Scene.from_gaussians(cloud, device, backend=backend)
+    scene = Scene.from_gaussians(cloud, device)
     truth = visibility_reference(cloud, *rays, front=options.front)
     drawn = np.array([visibility(scene, *rays, options=options, seed=seed) for seed in range(SEEDS)])
     assert set(np.unique(drawn)) == {0.0, 1.0}
@@ -76,10 +70,10 @@ def test_the_mean_over_seeds_is_the_product(device, backend, options, rng):
 
 
 @pytest.mark.parametrize("opacities", [(0.5,), (0.5, 0.5), (0.1, 0.2, 0.3), (0.3,) * 5, (1 / 250,) * 100], ids=len)
-def test_equal_rays_draw_independently(device, backend, options, opacities):
+def test_equal_rays_draw_independently(device, options, opacities):
     """A batch of one ray, many times: the mean is the product, which tells Gaussians that draw alike from others."""
     count = 20_000
-    scene = Scene.from_gaussians(on_x(opacities), device, backend=backend)
+    scene = Scene.from_gaussians(on_x(opacities), device)
     truth = np.prod(1.0 - np.asarray(opacities))
     sigma = np.sqrt(truth * (1.0 - truth) / count)
     drawn = np.array([visibility(scene, *along_x(count), options=options, seed=seed) for seed in range(20)])
@@ -92,7 +86,7 @@ def test_equal_rays_draw_independently(device, backend, options, opacities):
         assert abs(np.mean(one * other)) * np.sqrt(one.size) < LARGEST_Z
 
 
-def test_each_pair_of_gaussians_draws_independently(device, backend, options):
+def test_each_pair_of_gaussians_draws_independently(device, options):
     """Ray k meets a pair of its own; over many pairs of rows the mean is that of independent draws."""
     rng, count = np.random.default_rng(3), 4000
     positions = np.concatenate(
@@ -107,7 +101,7 @@ def test_each_pair_of_gaussians_draws_independently(device, backend, options):
     )
     origins = np.column_stack([np.full(count, -1.0), np.arange(count), np.zeros(count)])
     directions = np.tile([1.0, 0.0, 0.0], (count, 1))
-    scene = Scene.from_gaussians(cloud, device, backend=backend)
+    scene = Scene.from_gaussians(cloud, device)
     drawn = np.array([visibility(scene, origins, directions, options=options, seed=seed) for seed in range(16)])
     require_zero_mean(drawn.T - 0.25)  # one mean a pair
     z = (drawn.mean(0) - 0.25) / np.sqrt(0.25 * 0.75 / 16)
@@ -116,17 +110,17 @@ def test_each_pair_of_gaussians_draws_independently(device, backend, options):
     assert abs(np.mean(z**2) - 1.0) < LARGEST_Z * spread
 
 
-def test_seeds_decide_the_bits(device, backend, options, rng):
+def test_seeds_decide_the_bits(device, options, rng):
     cloud, rays = random_cloud(rng, 300, scale=(-2.0, 0.4)), random_rays(rng, 500)
-    scene = Scene.from_gaussians(cloud, device, backend=backend)
+    scene = Scene.from_gaussians(cloud, device)
     one, again, other = (visibility(scene, *rays, options=options, seed=seed) for seed in (7, 7, 8))
     assert np.array_equal(one, again)
     assert 0.05 < (one != other).mean() < 0.5
 
 
 @pytest.mark.parametrize("seed", [0, 2**31, 2**32 - 1])
-def test_every_seed_is_taken(device, backend, options, seed):
-    scene = Scene.from_gaussians(on_x([0.5]), device, backend=backend)
+def test_every_seed_is_taken(device, options, seed):
+    scene = Scene.from_gaussians(on_x([0.5]), device)
     drawn = visibility(scene, *along_x(10_000), options=options, seed=seed)
     assert abs(drawn.mean() - 0.5) < LARGEST_Z * 0.5 / np.sqrt(10_000)
 
@@ -148,7 +142,7 @@ def sample_hits_kernel(
 
 @pytest.mark.parametrize("front", ["peak", "entry"])
 @pytest.mark.parametrize("limit", ["none", "t_max", "mesh"])
-def test_sampled_hits_follow_alpha_times_the_transmittance_before(device, backend, front, limit):
+def test_sampled_hits_follow_alpha_times_the_transmittance_before(device, front, limit):
     """Indices of hits on one ray, counted over streams, against the weights of blending: a chi-square test."""
     rng, count = np.random.default_rng(11), 50_000
     opacities, places = rng.uniform(0.05, 0.5, 10), rng.permutation(10)
@@ -158,7 +152,7 @@ def test_sampled_hits_follow_alpha_times_the_transmittance_before(device, backen
     if limit == "mesh":
         vertices = [[6.5, -9.0, -9.0], [6.5, 9.0, -9.0], [6.5, 0.0, 9.0]]
         plate, reach = SimpleNamespace(vertices=vertices, faces=[[0, 1, 2]]), 3e38
-    scene = Scene.from_gaussians(cloud, device, backend=backend, mesh=plate)
+    scene = Scene.from_gaussians(cloud, device, mesh=plate)
     drawn = wp.empty(count, dtype=int, device=device)
     settings = TraceOptions(front=front).settings(scene)
     inputs = [scene.occluders, settings, wp.vec3(-2.0, 0.0, 0.0), wp.vec3(1.0, 0.0, 0.0), reach, wp.uint32(5)]

@@ -15,7 +15,6 @@ from beam_warp.trace.transmittance import TraceOptions
 WHOLE = TraceOptions(stop=0.0)
 OF_GAUSSIANS = ("positions", "orientations", "scales", "opacities")
 ATTRIBUTES = (*OF_GAUSSIANS, "origins", "directions")
-BACKENDS = ("wide", "warp")
 
 
 def rounding(cloud, gradient):
@@ -50,16 +49,11 @@ def along_x(y=0.0, z=0.0, x=-2.0):
     return np.array([[x, y, z]]), np.array([[1.0, 0.0, 0.0]])
 
 
-@pytest.fixture(params=BACKENDS)
-def backend(request):
-    return request.param
-
-
 class TestClosedForm:
     @pytest.mark.parametrize("degree", [2, 4])
-    def test_axis_parallel_ray(self, device, backend, degree):
+    def test_axis_parallel_ray(self, device, degree):
         y, z, opacity, adjoint = 0.25, -0.3, 0.9, 1.7
-        scene = Scene.from_gaussians(one_gaussian(opacity), device, backend=backend, response_degree=degree)
+        scene = Scene.from_gaussians(one_gaussian(opacity), device, response_degree=degree)
         result = visibility_gradients(scene, *along_x(y, z), [adjoint])
         a, b = y / 0.2, z / 0.3
         distance = a * a + b * b
@@ -74,42 +68,42 @@ class TestClosedForm:
         turn = 2 * a * b * (0.3 / 0.2 - 0.2 / 0.3) * slope  # about x; q = (sin(angle / 2), 0, 0, cos(angle / 2))
         assert result.orientations[0] == pytest.approx([2 * turn, 0, 0, 0], **tolerance)
 
-    def test_three_on_a_ray(self, device, backend):
+    def test_three_on_a_ray(self, device):
         cloud = GaussianCloud(
             positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]],
             orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
             scales=np.full((3, 3), 0.1),
             opacities=[0.1, 0.2, 0.3],
         )
-        result = visibility_gradients(Scene.from_gaussians(cloud, device, backend=backend), *along_x(), [1.0])
+        result = visibility_gradients(Scene.from_gaussians(cloud, device), *along_x(), [1.0])
         # Autodiff through the loop returns (0, -0.90, -0.648) here.
         assert result.opacities == pytest.approx([-0.8 * 0.7, -0.9 * 0.7, -0.9 * 0.8], rel=1e-6)
         assert np.abs(result.positions).max() == 0.0
 
     @pytest.mark.parametrize("opacity", [0.99, 1.0])
-    def test_capped_alpha_has_no_gradient(self, device, backend, opacity):
-        scene = Scene.from_gaussians(one_gaussian(opacity), device, backend=backend)
+    def test_capped_alpha_has_no_gradient(self, device, opacity):
+        scene = Scene.from_gaussians(one_gaussian(opacity), device)
         result = visibility_gradients(scene, *along_x(), [1.0])
         assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
-    def test_behind_a_capped_gaussian_the_others_keep_theirs(self, device, backend):
+    def test_behind_a_capped_gaussian_the_others_keep_theirs(self, device):
         cloud = GaussianCloud(
             positions=[[0, 0, 0], [1, 0, 0]],
             orientations=np.tile([0, 0, 0, 1.0], (2, 1)),
             scales=np.full((2, 3), 0.1),
             opacities=[1.0, 0.25],
         )
-        result = visibility_gradients(Scene.from_gaussians(cloud, device, backend=backend), *along_x(), [1.0])
+        result = visibility_gradients(Scene.from_gaussians(cloud, device), *along_x(), [1.0])
         assert result.opacities == pytest.approx([0.0, -0.01], abs=1e-7)
 
     @pytest.mark.parametrize("opacity", [0.0, 1.0 / 255.0])
-    def test_dropped_gaussians_have_no_gradient(self, device, backend, opacity):
-        scene = Scene.from_gaussians(one_gaussian(opacity), device, backend=backend)
+    def test_dropped_gaussians_have_no_gradient(self, device, opacity):
+        scene = Scene.from_gaussians(one_gaussian(opacity), device)
         result = visibility_gradients(scene, *along_x(), [1.0])
         assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
-    def test_only_what_counts_has_a_gradient(self, device, backend):
-        scene = Scene.from_gaussians(one_gaussian(0.5), device, backend=backend)
+    def test_only_what_counts_has_a_gradient(self, device):
+        scene = Scene.from_gaussians(one_gaussian(0.5), device)
         # the support starts at -0.1 * sqrt(2 ln 127.5) = -0.311 along x
         for x, options, expected in (
             (-1e-3, WHOLE, -1.0),
@@ -123,16 +117,16 @@ class TestClosedForm:
             result = visibility_gradients(scene, *along_x(), [1.0], t_max=reach)
             assert result.opacities[0] == pytest.approx(expected, abs=1e-6)
 
-    def test_culled_gaussians_have_no_gradient(self, device, backend):
+    def test_culled_gaussians_have_no_gradient(self, device):
         for normal, expected in (([[-1, 0, 0]], -1.0), ([[1, 0, 0]], 0.0)):
-            scene = Scene.from_gaussians(one_gaussian(0.5, normals=normal), device, backend=backend)
+            scene = Scene.from_gaussians(one_gaussian(0.5, normals=normal), device)
             result = visibility_gradients(scene, *along_x(), [1.0], options=TraceOptions(cull=True))
             assert result.opacities[0] == pytest.approx(expected, abs=1e-6)
 
-    def test_raised_scales_are_held_still(self, device, backend):
+    def test_raised_scales_are_held_still(self, device):
         """A disc of thickness 0 seen obliquely: its wide axes have gradients, the raised one has none."""
         half = np.sqrt(0.5)
-        scene = Scene.from_gaussians(one_gaussian(0.5, (0.2, 0.2, 0.0)), device, backend=backend)
+        scene = Scene.from_gaussians(one_gaussian(0.5, (0.2, 0.2, 0.0)), device)
         origins = np.array([[0.1, 0.05, 0.0]]) - 2.0 * np.array([[0.0, half, half]])
         result = visibility_gradients(scene, origins, [[0.0, half, half]], [1.0])
         assert scene.report.raised_scales == 1
@@ -161,10 +155,10 @@ class TestAgainstDifferences:
     @pytest.mark.parametrize("degree", [2, 4])
     @pytest.mark.parametrize("front", ["peak", "entry"])
     @pytest.mark.parametrize("more", [False, True])  # culling and a reach for each ray
-    def test_every_rule(self, device, backend, rng, degree, front, more):
+    def test_every_rule(self, device, rng, degree, front, more):
         t_max = rng.uniform(0.3, 2.0, 600).astype(np.float32) if more else np.full(600, np.inf, np.float32)
         cloud, rays, t_max, adjoints, frozen = case(rng, t_max=t_max, front=front, cull=more, degree=degree)
-        scene = Scene.from_gaussians(cloud, device, backend=backend, response_degree=degree)
+        scene = Scene.from_gaussians(cloud, device, response_degree=degree)
         options = TraceOptions(front=front, cull=more, stop=0.0)
         # a decision that differs changes V by 1/255 of it at least
         np.testing.assert_allclose(
@@ -174,15 +168,15 @@ class TestAgainstDifferences:
         for name, expected in frozen.gradients(adjoints).items():
             assert relative_error(getattr(result, name), expected) <= min(1e-5, rounding(cloud, expected)), name
 
-    def test_small_and_uneven_gaussians(self, device, backend, rng):
+    def test_small_and_uneven_gaussians(self, device, rng):
         cloud, rays, _, adjoints, frozen = case(rng, scale=(-3.5, 0.8), rays=1000)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
         for name, expected in frozen.gradients(adjoints).items():
             assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected), name
 
     @pytest.mark.parametrize("scales", [(0.3, 3e-4, 3e-4), (0.1, 0.1, 1e-4)])
-    def test_needles_and_discs(self, device, backend, rng, scales):
+    def test_needles_and_discs(self, device, rng, scales):
         count, rays = 100, 1000
         cloud = random_cloud(rng, count, opacity=(0.1, 0.95)).with_arrays(scales=np.tile(scales, (count, 1)))
         aims = rng.integers(0, count, rays)
@@ -192,22 +186,20 @@ class TestAgainstDifferences:
         origins = (targets - rng.uniform(0.2, 1.0, (rays, 1)) * directions).astype(np.float32)
         clear = ~FrozenVisibility(cloud, origins, directions).near_tie
         adjoints = rng.normal(size=clear.sum()).astype(np.float32)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, origins[clear], directions[clear], adjoints, options=WHOLE)
         for name, expected in FrozenVisibility(cloud, origins[clear], directions[clear]).gradients(adjoints).items():
             assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected) < 1e-2, name
 
-    def test_far_from_the_origin(self, device, backend, rng):
+    def test_far_from_the_origin(self, device, rng):
         """The scene is recentred: moved by a power of two it keeps its gradients but for the grid of 1/1024."""
         cloud, rays, _, adjoints, _ = case(rng)
         cloud = cloud.with_arrays(positions=np.round(cloud.positions * 1024.0) / 1024.0)
         origins, directions = (np.round(rays[0] * 1024.0) / 1024.0).astype(np.float32), rays[1]
-        here = visibility_gradients(
-            Scene.from_gaussians(cloud, device, backend=backend), origins, directions, adjoints, options=WHOLE
-        )
+        here = visibility_gradients(Scene.from_gaussians(cloud, device), origins, directions, adjoints, options=WHOLE)
         moved = cloud.with_arrays(positions=cloud.positions + np.float32(8192.0))
         there = visibility_gradients(
-            Scene.from_gaussians(moved, device, backend=backend),
+            Scene.from_gaussians(moved, device),
             (origins + np.float32(8192.0)).astype(np.float32),
             directions,
             adjoints,
@@ -221,9 +213,9 @@ class TestIdentities:
     """V does not change when Gaussians and rays move, grow or turn together: float64 sums of products with it are 0."""
 
     @pytest.fixture
-    def solved(self, device, backend, rng):
+    def solved(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
         fields = {name: getattr(result, name).astype(np.float64) for name in ATTRIBUTES}
         return cloud, rays[0].astype(np.float64), rays[1].astype(np.float64), fields
@@ -267,26 +259,26 @@ class TestIdentities:
             along = (g[name] * unit).sum(1)
             assert np.abs(along).max() <= 8 * 2.0**-23 * np.abs(g[name]).max() * 3.0  # four products and a few sums
 
-    def test_quaternions_that_are_not_quite_unit(self, device, backend, rng):
+    def test_quaternions_that_are_not_quite_unit(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         longer = cloud.with_arrays(orientations=cloud.orientations * np.float32(1.0 + 2.0**-10))
         one, other = (
-            visibility_gradients(Scene.from_gaussians(c, device, backend=backend), *rays, adjoints, options=WHOLE)
+            visibility_gradients(Scene.from_gaussians(c, device), *rays, adjoints, options=WHOLE)
             for c in (cloud, longer)
         )
         expected = one.orientations / (1.0 + 2.0**-10)
         assert relative_error(other.orientations, expected) <= rounding(cloud, expected) < 2.0**-11
 
-    def test_opposite_quaternions_have_opposite_gradients(self, device, backend, rng):
+    def test_opposite_quaternions_have_opposite_gradients(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         opposite = cloud.with_arrays(orientations=-cloud.orientations)
         one, other = (
-            visibility_gradients(Scene.from_gaussians(c, device, backend=backend), *rays, adjoints, options=WHOLE)
+            visibility_gradients(Scene.from_gaussians(c, device), *rays, adjoints, options=WHOLE)
             for c in (cloud, opposite)
         )
         assert np.array_equal(one.orientations, -other.orientations)
 
-    def test_gradients_turn_with_the_scene(self, device, backend, rng):
+    def test_gradients_turn_with_the_scene(self, device, rng):
         cloud, (origins, directions), _, adjoints, _ = case(rng)
         half = np.float32(np.sqrt(0.5))
         turn = rotation_matrices([[0.0, 0.0, half, half]])[0]  # a quarter about z: exact on coordinates
@@ -295,11 +287,9 @@ class TestIdentities:
             positions=cloud.positions @ turn.T.round(),
             orientations=np.stack([half * (x - y), half * (x + y), half * (z + w), half * (w - z)], axis=1),
         )
-        one = visibility_gradients(
-            Scene.from_gaussians(cloud, device, backend=backend), origins, directions, adjoints, options=WHOLE
-        )
+        one = visibility_gradients(Scene.from_gaussians(cloud, device), origins, directions, adjoints, options=WHOLE)
         other = visibility_gradients(
-            Scene.from_gaussians(turned, device, backend=backend),
+            Scene.from_gaussians(turned, device),
             origins @ turn.T.round(),
             directions @ turn.T.round(),
             adjoints,
@@ -311,9 +301,9 @@ class TestIdentities:
         for name in ("scales", "opacities"):
             assert relative_error(getattr(other, name), getattr(one, name)) <= rounding(cloud, getattr(one, name))
 
-    def test_adjoints_enter_linearly(self, device, backend, rng):
+    def test_adjoints_enter_linearly(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         one = visibility_gradients(scene, *rays, adjoints)
         other = visibility_gradients(scene, *rays, -4.0 * adjoints)
         for name in ATTRIBUTES:
@@ -321,7 +311,7 @@ class TestIdentities:
 
 
 class TestStop:
-    def test_gradient_is_that_of_the_product_so_far(self, device, backend):
+    def test_gradient_is_that_of_the_product_so_far(self, device):
         opacities = np.array([0.3, 0.4, 0.5, 0.6, 0.7])
         cloud = GaussianCloud(
             positions=[[k, 0, 0] for k in range(5)],
@@ -329,7 +319,7 @@ class TestStop:
             scales=np.full((5, 3), 0.1),
             opacities=opacities,
         )
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         options = TraceOptions(stop=0.5)
         v = visibility(scene, *along_x(), options=options)[0]
         result = visibility_gradients(scene, *along_x(), [1.0], options=options).opacities
@@ -338,10 +328,10 @@ class TestStop:
         assert v == pytest.approx((1.0 - opacities[met]).prod(), rel=1e-6)
         assert result[met] == pytest.approx(-v / (1.0 - opacities[met]), rel=1e-6)
 
-    def test_error_is_bounded_by_the_stop(self, device, backend, rng):
+    def test_error_is_bounded_by_the_stop(self, device, rng):
         """Each factor left out is at most 1, each divided out at least 0.01."""
         cloud = random_cloud(rng, 600, scale=(-1.7, 0.3), opacity=(0.2, 1.0))
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         origins, directions = random_rays(rng, 100)
         worst = 0.0
         for k in range(100):
@@ -353,8 +343,8 @@ class TestStop:
 
 
 class TestBits:
-    def test_runs_threads_and_parts_give_the_same(self, device, backend, rng, monkeypatch):
-        scene = Scene.from_gaussians(random_cloud(rng, 300, scale=(-2.0, 0.4)), device, backend=backend)
+    def test_runs_threads_and_parts_give_the_same(self, device, rng, monkeypatch):
+        scene = Scene.from_gaussians(random_cloud(rng, 300, scale=(-2.0, 0.4)), device)
         count = 5000
         origins, directions = random_rays(rng, count)
         t_max = rng.uniform(0.2, 2.0, count).astype(np.float32)
@@ -375,14 +365,14 @@ class TestBits:
 
     @pytest.mark.parametrize("first", [0, 1, 255, 256, 257, 700])
     @pytest.mark.parametrize("second", [1, 255, 256, 257, 512, 2000])
-    def test_sums_over_blocks_of_hits_add_each_hit_once(self, device, backend, first, second):
+    def test_sums_over_blocks_of_hits_add_each_hit_once(self, device, first, second):
         cloud = GaussianCloud(
             positions=[[0, 0, 0], [0, 5, 0], [0, 9, 0]],
             orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
             scales=np.full((3, 3), 0.1),
             opacities=[0.5, 0.5, 0.5],
         )
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         origins = np.tile([-2.0, 0.0, 0.0], (first + second, 1))
         origins[first:, 1] = 5.0
         directions = np.tile([1.0, 0.0, 0.0], (first + second, 1))
@@ -390,13 +380,13 @@ class TestBits:
         result = visibility_gradients(scene, origins[mixed], directions, np.ones(first + second))
         assert result.opacities.tolist() == [-first, -second, 0.0]
 
-    def test_many_rays_through_few_gaussians(self, device, backend, rng, monkeypatch):
+    def test_many_rays_through_few_gaussians(self, device, rng, monkeypatch):
         cloud = random_cloud(rng, 3, scale=(-0.7, 0.2), opacity=(0.3, 0.9))
         origins, directions = random_rays(rng, 3000)
         clear = ~FrozenVisibility(cloud, origins, directions).near_tie
         rays = origins[clear], directions[clear]
         adjoints = rng.normal(size=clear.sum()).astype(np.float32)
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         whole = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
         monkeypatch.setenv("BEAM_WARP_THREADS", "2")
         again = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
@@ -410,11 +400,9 @@ class TestBits:
             assert relative_error(getattr(parts, name), value) <= 2.0**-23
 
     @pytest.mark.parametrize("more", [-1, 1])
-    def test_a_tie_that_the_traversals_decide_differently_overflows_no_slot(
-        self, device, backend, rng, monkeypatch, more
-    ):
+    def test_a_tie_that_the_traversals_decide_differently_overflows_no_slot(self, device, rng, monkeypatch, more):
         """A compiler may round one test differently in the two kernels: the loss of a hit is all that may cause."""
-        scene = Scene.from_gaussians(random_cloud(rng, 300, scale=(-2.0, 0.4)), device, backend=backend)
+        scene = Scene.from_gaussians(random_cloud(rng, 300, scale=(-2.0, 0.4)), device)
         rays, adjoints = random_rays(rng, 200), np.ones(200, np.float32)
         expected = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
         launch_count_hits = gradients.launch_count_hits
@@ -449,8 +437,8 @@ class TestBits:
         assert (seen[np.array(counts, int) > 0] == 1).all()
         assert seen.max(initial=0) <= 1
 
-    def test_warp_arrays_in_and_out(self, device, backend, rng):
-        scene = Scene.from_gaussians(random_cloud(rng, 50), device, backend=backend)
+    def test_warp_arrays_in_and_out(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 50), device)
         origins, directions = random_rays(rng, 20)
         adjoints = rng.normal(size=20).astype(np.float32)
         there = visibility_gradients(
@@ -461,11 +449,9 @@ class TestBits:
             assert isinstance(getattr(there, name), wp.array)
             assert np.array_equal(getattr(there, name).numpy(), getattr(here, name))
 
-    def test_devices_agree(self, device, backend, rng):
+    def test_devices_agree(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
-        here = visibility_gradients(
-            Scene.from_gaussians(cloud, device, backend=backend), *rays, adjoints, options=WHOLE
-        )
+        here = visibility_gradients(Scene.from_gaussians(cloud, device), *rays, adjoints, options=WHOLE)
         cpu = visibility_gradients(Scene.from_gaussians(cloud, "cpu"), *rays, adjoints, options=WHOLE)
         for name in ATTRIBUTES:
             assert relative_error(getattr(here, name), getattr(cpu, name)) <= rounding(cloud, getattr(cpu, name))
@@ -474,9 +460,9 @@ class TestBits:
 class TestSizes:
     @pytest.mark.parametrize("rays", [0, 1, 63, 64, 65, 1025])
     @pytest.mark.parametrize("count", [0, 1, 2, 257])
-    def test_shapes(self, device, backend, rng, rays, count):
+    def test_shapes(self, device, rng, rays, count):
         cloud = random_cloud(rng, 300, scale=(-1.0, 0.2)).select(np.arange(count))
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, *random_rays(rng, rays), np.ones(rays), t_max=np.full(rays, 2.0))
         shapes = {"positions": (count, 3), "orientations": (count, 4), "scales": (count, 3), "opacities": (count,)}
         shapes |= {"origins": (rays, 3), "directions": (rays, 3)}
@@ -486,32 +472,30 @@ class TestSizes:
             assert np.isfinite(value).all()
             assert not (count and rays > 60) or np.abs(value).max() > 0.0
 
-    def test_a_moved_scene_has_the_gradients_of_where_it_is(self, device, backend, rng):
+    def test_a_moved_scene_has_the_gradients_of_where_it_is(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         other = random_cloud(rng, 200, scale=(-2.0, 0.4)).with_arrays(opacities=cloud.opacities)
-        moved = Scene.from_gaussians(other, device, backend=backend)
+        moved = Scene.from_gaussians(other, device)
         moved.move(cloud.positions, cloud.orientations, cloud.scales)
         result = visibility_gradients(moved, *rays, adjoints, options=WHOLE)
-        expected = visibility_gradients(
-            Scene.from_gaussians(cloud, device, backend=backend), *rays, adjoints, options=WHOLE
-        )
+        expected = visibility_gradients(Scene.from_gaussians(cloud, device), *rays, adjoints, options=WHOLE)
         for name in ATTRIBUTES:
             reference = getattr(expected, name)
             assert relative_error(getattr(result, name), reference) <= rounding(cloud, reference)
 
-    def test_zero_adjoints(self, device, backend, rng):
-        scene = Scene.from_gaussians(random_cloud(rng, 50, scale=(-1.0, 0.2)), device, backend=backend)
+    def test_zero_adjoints(self, device, rng):
+        scene = Scene.from_gaussians(random_cloud(rng, 50, scale=(-1.0, 0.2)), device)
         result = visibility_gradients(scene, *random_rays(rng, 30), np.zeros(30))
         assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
-    def test_ten_thousand_coincident_gaussians(self, device, backend):
+    def test_ten_thousand_coincident_gaussians(self, device):
         cloud = GaussianCloud(
             positions=np.zeros((10_000, 3)),
             orientations=np.tile([0, 0, 0, 1.0], (10_000, 1)),
             scales=np.full((10_000, 3), 0.1),
             opacities=np.full(10_000, 1.0 / 250.0),
         )
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, *along_x(), [1e10], options=WHOLE)
         # 1 - alpha is rounded by up to 2^-25, the same way in all 1e4 factors
         assert result.opacities == pytest.approx(np.full(10_000, -1e10 * 0.996**9999), rel=1e4 * 2.0**-25)
@@ -550,7 +534,7 @@ class TestRefusals:
 
 
 class TestFit:
-    def test_descent_recovers_positions_and_opacities_from_two_shadows(self, device, backend, rng):
+    def test_descent_recovers_positions_and_opacities_from_two_shadows(self, device, rng):
         """Two orthographic images of V determine centres in space; the descent starts a deviation away."""
         count, side = 6, 20
         # on a ring: no two overlap much in either view, so that neither hides or trades opacity with another
@@ -565,14 +549,14 @@ class TestFit:
         far = np.full(a.shape, 3.0)
         origins = np.concatenate([np.stack([a, b, -far], 1), np.stack([-far, a, b], 1)]).astype(np.float32)
         directions = np.repeat([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], side * side, axis=0)
-        target = visibility(Scene.from_gaussians(cloud, device, backend=backend), origins, directions, options=WHOLE)
+        target = visibility(Scene.from_gaussians(cloud, device), origins, directions, options=WHOLE)
 
         positions = cloud.positions + rng.uniform(-0.1, 0.1, (count, 3)).astype(np.float32)
         opacities = np.full(count, 0.6, np.float32)
         losses = []
         for _ in range(200):
             now = cloud.with_arrays(positions=positions, opacities=opacities)
-            scene = Scene.from_gaussians(now, device, backend=backend)
+            scene = Scene.from_gaussians(now, device)
             difference = visibility(scene, origins, directions, options=WHOLE) - target
             losses.append(float(difference @ difference))
             slope = visibility_gradients(scene, origins, directions, 2.0 * difference, options=WHOLE)

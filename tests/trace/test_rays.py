@@ -107,13 +107,12 @@ class TestOrderDoesNotMatter:
     @pytest.mark.parametrize("sampler", SAMPLERS)
     @pytest.mark.parametrize("sample_count", [32, 27])
     @pytest.mark.parametrize("acceptance", ["product", "bernoulli"])
-    @pytest.mark.parametrize("backend", ["wide", "warp"])
     def test_batches_trace_the_rays_of_the_direct_form(
-        self, device, surroundings, monkeypatch, sampler, sample_count, acceptance, backend
+        self, device, surroundings, monkeypatch, sampler, sample_count, acceptance
     ):
         """One ray a thread in the caller's order, drawn and traced in one kernel, is what batches must add up to."""
         cloud, points, normals = surroundings
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         options = TraceOptions(acceptance=acceptance)
         set_rays_at_once(monkeypatch, 100 * sample_count)
         result = ambient_occlusion(
@@ -188,11 +187,10 @@ class TestOrderDoesNotMatter:
         order = np.random.default_rng(2).permutation(POINTS)
         assert np.array_equal(traced(np.arange(POINTS))[order], traced(order))
 
-    @pytest.mark.parametrize("backend", ["wide", "warp"])
-    def test_negative_reach_is_blocked_and_read_by_nobody(self, device, surroundings, backend):
+    def test_negative_reach_is_blocked_and_read_by_nobody(self, device, surroundings):
         """Rays that are left out may have any direction, none included."""
         cloud, points, normals = surroundings
-        scene = Scene.from_gaussians(cloud, device, backend=backend)
+        scene = Scene.from_gaussians(cloud, device)
         rays = Rays()
         rays.origins = upload(points, wp.vec3, scene.device)
         rays.directions = upload(np.where(np.arange(POINTS)[:, None] % 2, normals, 0.0), wp.vec3, scene.device)
