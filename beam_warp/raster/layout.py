@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beam_warp.kernels.raster.bin_tiles import TILE
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, channel_vector
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.world.camera import Camera
 
 
@@ -27,7 +27,7 @@ class ViewLayout:
         tile_views: Which view each tile belongs to, int32.
     """
 
-    views: list[View]
+    views: list[RasterView]
     first_pixels: NDArray[np.int64]
     first_tiles: NDArray[np.int64]
     tile_views: NDArray[np.int32]
@@ -39,7 +39,7 @@ class ViewLayout:
         tile = pixel = 0
         pixels = [0]
         for i, camera in enumerate(cameras):
-            view = View()
+            view = RasterView()
             view.world_to_camera = wp.mat33(camera.world_to_camera[:3, :3].astype(np.float32))
             view.position = wp.vec3(*camera.position)
             view.focal = wp.vec2(camera.focal_x, camera.focal_y)

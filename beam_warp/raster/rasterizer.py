@@ -29,14 +29,14 @@ from beam_warp.kernels.raster.channel_rows import (
     launch_gather_channels,
     launch_scatter_channels,
 )
-from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, Frame, Images, launch_composite_pixels
+from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, Images, RasterFrame, launch_composite_pixels
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS, Adjoints, pair_length
 from beam_warp.kernels.raster.composite_adjoint_cpu import launch_composite_adjoint_cpu
 from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.raster.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.raster.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.raster.pair_sums import Pairs, launch_resolve_sums, launch_sum_pairs
-from beam_warp.kernels.raster.project import Projection, Splats, View, launch_project, launch_project_adjoint
+from beam_warp.kernels.raster.project import Projection, RasterView, Splats, launch_project, launch_project_adjoint
 from beam_warp.kernels.raster.view_sums import launch_sum_views
 from beam_warp.raster.layout import Rows, ViewLayout, channel_rows
 from beam_warp.raster.records import (
@@ -182,12 +182,12 @@ class Rasterizer:
             self._drawn.median_depth,
         )
         self.gaussian_ids = self._drawn.gaussians
-        self._views = wp.array(self._layout.views, dtype=View)
+        self._views = wp.array(self._layout.views, dtype=RasterView)
         self._projection = Projection()
         self._projection.low_pass = self.options.low_pass
         self._projection.near = self.options.near
         self._projection.antialiased = int(self.options.antialiased)
-        self._frame = Frame()
+        self._frame = RasterFrame()
         self._frame.splats = self._splats
         self._frame.views = self._views
         self._frame.tile_views = wp.array(self._layout.tile_views, dtype=int)
@@ -216,7 +216,7 @@ class Rasterizer:
         """
         self._require_sizes(cameras)
         layout = ViewLayout.of(cameras)
-        return PreparedCameras(tuple(cameras), layout, wp.array(layout.views, dtype=View, device=self.device))
+        return PreparedCameras(tuple(cameras), layout, wp.array(layout.views, dtype=RasterView, device=self.device))
 
     def set_cameras(self, cameras: Sequence[Camera] | PreparedCameras) -> None:
         """Move cameras or change their lenses; their number and sizes stay. `backward` wants a draw in between.

@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
 from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
@@ -22,7 +22,7 @@ def back_project_cpu_kernel(channel_count: int):
 
     @wp.kernel(enable_backward=False, module="unique")
     def back_project_tiles_kernel(
-        first: int, frame: Frame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
+        first: int, frame: RasterFrame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
     ):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed

@@ -14,7 +14,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.project import Splats, View
+from beam_warp.kernels.raster.project import RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
     RELATIVE_MARGIN,
@@ -54,7 +54,7 @@ class TileLists:
 
 
 @wp.func
-def tile_box(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec4i:
+def tile_box(center: wp.vec4, shape: wp.vec4, view: RasterView, band: Band) -> wp.vec4i:
     """First column, first row, end column and end row of the tiles of a band that a splat's box reaches."""
     if not (center[2] > -wp.inf):
         return wp.vec4i(0, 0, 0, 0)
@@ -74,7 +74,7 @@ def tile_box(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec4
 
 
 @wp.func
-def tile_columns(center: wp.vec4, shape: wp.vec4, view: View, box: wp.vec4i, row: int) -> wp.vec2i:
+def tile_columns(center: wp.vec4, shape: wp.vec4, view: RasterView, box: wp.vec4i, row: int) -> wp.vec2i:
     """First and end column of the tiles of a row that a splat's ellipse reaches.
 
     Where the box is one tile wide or high, an ellipse, which touches all its sides, reaches all of it.
@@ -107,7 +107,7 @@ def count_pairs_kernel(
     first: int,
     order: wp.array[int],
     splats: Splats,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     gaussian_count: int,
     band: Band,
     out_counts: wp.array[int],
@@ -132,7 +132,7 @@ def emit_pairs_kernel(
     counts: wp.array[int],
     ends: wp.array[int],
     splats: Splats,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     gaussian_count: int,
     band: Band,
     out_tiles: wp.array[int],

@@ -8,7 +8,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
 from beam_warp.kernels.common.spherical_harmonics import seen_color
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 
 @wp.struct
@@ -25,7 +25,7 @@ def evaluate_colors_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     radiance: wp.array2d[wp.vec3],
-    views: wp.array[View],
+    views: wp.array[RasterView],
     out_colors: wp.array[wp.vec3],
 ):
     """Colour of every Gaussian towards every view's camera. The module has an adjoint, which Warp makes."""

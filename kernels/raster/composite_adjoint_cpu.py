@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
     add_pixel_function,
@@ -27,7 +27,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_adjoint_kernel(
         first: int,
-        frame: Frame,
+        frame: RasterFrame,
         channels: wp.array[Channels],
         images: Images,
         channel_adjoints: wp.array[Channels],

@@ -25,7 +25,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
     add_pixel_function,
@@ -59,7 +59,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     @wp.kernel(enable_backward=False, module="unique")
     def composite_blocks_adjoint_kernel(
         first: int,
-        frame: Frame,
+        frame: RasterFrame,
         channels: wp.array[Channels],
         images: Images,
         channel_adjoints: wp.array[Channels],

@@ -10,8 +10,8 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
-from beam_warp.kernels.raster.project import LOG_CUT, View
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
+from beam_warp.kernels.raster.project import LOG_CUT, RasterView
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
@@ -34,7 +34,7 @@ MIN_TILES = 4
 
 
 @wp.func
-def tile_box(view: View, tile: int) -> wp.vec4i:
+def tile_box(view: RasterView, tile: int) -> wp.vec4i:
     """First x, first y, end x and end y of a tile's pixels."""
     local = tile - view.first_tile
     x = (local % view.columns) * SIDE
@@ -68,7 +68,11 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_kernel(
-        first: int, frame: Frame, channels: wp.array[Channels], out_channels: wp.array[Channels], out_images: Images
+        first: int,
+        frame: RasterFrame,
+        channels: wp.array[Channels],
+        out_channels: wp.array[Channels],
+        out_images: Images,
     ):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed

@@ -30,7 +30,7 @@ SMALLEST_SCALE = wp.constant(1.0e-12)
 
 
 @wp.struct
-class View:
+class RasterView:
     """A camera, and where its tiles and pixels are among those of all cameras that are drawn together."""
 
     world_to_camera: wp.mat33
@@ -75,7 +75,7 @@ def project_gaussians_kernel(
     orientations: wp.array[wp.quat],
     scales: wp.array[wp.vec3],
     opacities: wp.array[float],
-    views: wp.array[View],
+    views: wp.array[RasterView],
     projection: Projection,
     out_centers: wp.array[wp.vec4],
     out_shapes: wp.array[wp.vec4],
