@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.checks import require_array, require_choice, require_finite, require_same_length
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.raster.rasterizer import Rasterizer, require_cameras
+from beam_warp.raster.array_checks import require_cameras
+from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterImages, RasterOptions
 from beam_warp.trace.scene import Scene
 from beam_warp.world.camera import Camera

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -55,6 +55,32 @@ class ViewLayout:
             pixel += camera.width * camera.height
             pixels.append(pixel)
         return cls(views, np.array(pixels), np.array([*rows, tile]), np.concatenate(tile_views))
+
+
+class ChannelRanges(NamedTuple):
+    """Where each kind of channel is among those of a splat.
+
+    Attributes:
+        colors: The captured colour; empty for none.
+        normals: The normals of the surfaces of largest response; empty for none.
+        values: The Gaussians' own values.
+    """
+
+    colors: range
+    normals: range
+    values: range
+
+    @classmethod
+    def of(cls, *, radiance: bool, normals: bool, value_count: int) -> ChannelRanges:
+        """Lay out what is drawn: colour first, then normals, then values."""
+        colors_end = 3 * radiance
+        normals_end = colors_end + 3 * normals
+        return cls(range(colors_end), range(colors_end, normals_end), range(normals_end, normals_end + value_count))
+
+    @property
+    def count(self) -> int:
+        """Number of channels."""
+        return self.values.stop
 
 
 @dataclass(frozen=True, eq=False)

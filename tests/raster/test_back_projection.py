@@ -9,7 +9,7 @@ from reference.rasterizing import decide, pair_terms, pixel_centers
 from beam_warp import Camera, GaussianCloud
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.raster.bin_tiles import TILE
-from beam_warp.raster import rasterizer
+from beam_warp.raster import forward
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
@@ -168,7 +168,7 @@ def test_bands_change_roundings_only(device, rng, monkeypatch):
     made, found = cloud(rng), []
     pixels = rng.normal(size=(sum(camera.width * camera.height for camera in VIEWS), 4)).astype(np.float32)
     for limit in (2**24, 300):
-        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+        monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
         drawer = drawn(made, VIEWS, device)
         assert (len(drawer._bands) > 2) == (limit == 300)
         found.append(back_projected(drawer, pixels))

@@ -5,7 +5,7 @@ import pytest
 from reference import rasterizing as reference
 
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
-from beam_warp.raster import gbuffer, rasterizer
+from beam_warp.raster import forward, gbuffer
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
@@ -113,7 +113,7 @@ def test_same_bits_every_run_thread_count_and_band(device, rng, monkeypatch):
         for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
             np.testing.assert_array_equal(a, b)
     for limit in (1, 2000):
-        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+        monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
         for a, b in zip(first, rasterize_values(cloud, camera, values, device=device), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -296,6 +296,6 @@ def test_errors_name_the_contract(rng):
 
 
 def test_a_row_of_tiles_that_cannot_be_listed_is_refused(rng, monkeypatch):
-    monkeypatch.setattr(rasterizer, "MAX_ROW_PAIRS", 10)
+    monkeypatch.setattr(forward, "MAX_ROW_PAIRS", 10)
     with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 10 times, got"):
         rasterize(make_cloud(rng, 300), front(), channels=(), device="cpu")

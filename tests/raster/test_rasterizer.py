@@ -10,7 +10,7 @@ from reference.rasterizing import decide, replay
 from beam_warp import Camera, GaussianCloud, Scene, rasterize, rasterize_backward
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.raster import rasterizer
+from beam_warp.raster import forward, rasterizer
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -164,8 +164,8 @@ def test_a_frame_that_is_refused_cannot_be_drawn_again(rng, monkeypatch):
     arrays = upload_gaussians(cloud(rng), drawer.device)
     drawer.draw(arrays)
     with monkeypatch.context() as limits:
-        limits.setattr(rasterizer, "MAX_ROW_PAIRS", 1)
-        limits.setattr(rasterizer, "MAX_BAND_PAIRS", 1)
+        limits.setattr(forward, "MAX_ROW_PAIRS", 1)
+        limits.setattr(forward, "MAX_BAND_PAIRS", 1)
         with pytest.raises(InvalidArrayError, match="cover a row of tiles at most 1 times, got"):
             drawer.draw(arrays)
     for call in (drawer.redraw, drawer.redraw_values, drawer.backward):
@@ -214,7 +214,7 @@ def test_bands_change_no_image_and_hardly_a_gradient(device, rng, monkeypatch):
     cameras = [around(50, 70), around(20, 40, 80.0)]
     found = []
     for limit in (2**24, 300):
-        monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+        monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
         drawer = Rasterizer(200, cameras, value_count=3, device=device)
         drawer.draw(upload_gaussians(made, drawer.device, values=values))
         filled(np.random.default_rng(1), drawer)
@@ -250,7 +250,7 @@ def test_redraw_follows_contents_and_cameras(device, rng):
 @pytest.mark.parametrize("limit", [2**24, 300])
 def test_values_are_redrawn_alone(device, rng, monkeypatch, limit):
     """The bits of a frame drawn anew, and the gradients of what is shown now; also where there are bands."""
-    monkeypatch.setattr(rasterizer, "MAX_BAND_PAIRS", limit)
+    monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
     made = cloud(rng)
     values, others = rng.uniform(0, 1, (2, 200, 3)).astype(np.float32)
     cameras = [around(50, 40), around(20, 40, 80.0)]
