@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from raster_scenes import RasterScene
 from timing import Task, Times, take_turns
 
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 
 GEOMETRY = ("positions", "orientations", "scales", "opacities")
 

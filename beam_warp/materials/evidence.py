@@ -32,10 +32,10 @@ from beam_warp.kernels.materials.view_evidence import (
 )
 from beam_warp.kernels.raster.bin_tiles import TILE
 from beam_warp.kernels.raster.project import RasterView
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -10,9 +10,9 @@ from beam_warp import Camera, GaussianCloud
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.raster.bin_tiles import TILE
 from beam_warp.raster import forward
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 
 LENGTHS = (4, 8, 12, 16)
 

@@ -5,7 +5,8 @@ import pytest
 from reference import rasterizing as reference
 
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
-from beam_warp.raster import forward, gbuffer
+from beam_warp.raster import forward
+from beam_warp.raster.channels import MATERIAL_CHANNELS
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
@@ -234,7 +235,7 @@ def test_channels_are_means_whatever_the_coverage(device, rng):
         normals=np.tile([0.6, 0.0, 0.8], (count, 1)),
     )
     buffer = rasterize(cloud, around(), device=device)
-    assert list(buffer.channels) == list(gbuffer.MATERIAL_CHANNELS)
+    assert list(buffer.channels) == list(MATERIAL_CHANNELS)
     covered = buffer.alpha > 0
     for name, expected in (("base_color", [0.2, 0.4, 0.8]), ("roughness", 0.3), ("normals", [0.6, 0.0, 0.8])):
         np.testing.assert_allclose(buffer.channels[name][covered] - expected, 0.0, atol=WEIGHT_ROUNDING)

@@ -11,9 +11,9 @@ from beam_warp import Camera, GaussianCloud, Scene, rasterize, rasterize_backwar
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster import forward, rasterizer
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.harmonics import sh_color
 
 GRADIENT_ERROR = 1e-5
@@ -387,7 +387,7 @@ def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
     made = cloud(rng, base_color=rng.uniform(0, 1, (200, 3)))
     cameras = [around(10, 20), around(33, 5, 70.0), around(16, 16, 140.0)]
     together = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
-    monkeypatch.setattr("beam_warp.raster.gbuffer.GROUP_PIXELS", 1)
+    monkeypatch.setattr("beam_warp.raster.sources.GROUP_PIXELS", 1)
     apart = rasterize(made, cameras, channels=("base_color", "surface_normals"), device=device)
     assert rasterize(made, [], channels=(), device=device) == []
     for camera, one, other in zip(cameras, together, apart, strict=True):
