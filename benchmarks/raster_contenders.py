@@ -1,4 +1,4 @@
-"""What draws a scene in the raster benchmark, as it is or as a CUDA graph, and how long each takes in turn."""
+"""Contenders of the raster benchmark, drawing as they are or as a CUDA graph, and their times, taken in turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long each stage of a frame takes, forwards and backwards: where the time goes.
+"""Times of the stages of a frame, forwards and backwards.
 
 On the CPU by the wall clock around each launcher. On CUDA by events around them, queued behind other work that keeps
 the device busy, so that the host's launches are ahead of it and no wait for them is counted; sorts and scans, which

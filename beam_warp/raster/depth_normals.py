@@ -1,4 +1,4 @@
-"""Which way the surface faces that a depth image shows, and how that changes with the depth."""
+"""Normals of depth images, and the gradients that they pass on to the depth."""
 
 from __future__ import annotations
 

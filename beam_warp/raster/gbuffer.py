@@ -1,4 +1,4 @@
-"""What cameras see of a cloud: alpha, depth and any channel of every pixel (a G-buffer), and the way back."""
+"""G-buffers of a cloud: alpha, depth and any channel of every pixel, and the gradients of a loss on them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from beam_warp.raster.array_checks import require_cameras
 from beam_warp.raster.channels import MATERIAL_CHANNELS, UNIT_CHANNELS, channel_layers, is_vector
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.sources import GEOMETRY, DrawnSource, require_world_axes, upload_gaussians
+from beam_warp.raster.sources import GEOMETRY, DrawnCloud, require_world_axes, upload_gaussians
 from beam_warp.raster.view_images import ValueImages, ViewImages, host_images, view_images
-from beam_warp.trace.scene import Scene
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud
 
@@ -28,17 +27,17 @@ IMAGES = ("alpha", "depth", "median_depth")
 
 @dataclass(frozen=True, eq=False)
 class GBuffer:
-    """What every pixel of a camera sees.
+    """Alpha, depth and channels of every pixel of a camera.
 
     Attributes:
-        camera: The camera that sees it.
+        camera: The camera.
         alpha: Coverage in [0, 1], ``(H, W)`` float32.
         depth: Expected distance along the optical axis [m], ``(H, W)`` float32.
-        median_depth: Distance of the last splat that more than half of the light passes before [m], ``(H, W)``
-            float32: it jumps where the expected one blurs.
+        median_depth: Distance of the last splat in front of which more than half of the light still passes [m],
+            ``(H, W)`` float32. At edges it jumps where the expected depth blurs.
         gaussian_ids: The last Gaussian that was seen, -1 for none, ``(H, W)`` int32.
-        channels: By name, the mean over what the pixel sees, weighted by visibility and *not* multiplied by alpha:
-            ``(H, W)`` or ``(H, W, C)`` float32 in the units and colour space of the cloud's array of that name.
+        channels: Images by name: the mean over what the pixel sees, weighted by visibility and *not* multiplied by
+            alpha, ``(H, W)`` or ``(H, W, C)`` float32, in the units and colour space of the cloud's array of that name.
             ``normals`` and ``surface_normals`` are of unit length; ``radiance`` is the captured colour towards the
             camera, composited in its own colour space, as viewers do.
 
@@ -55,9 +54,9 @@ class GBuffer:
     def layers(self) -> dict[str, NDArray[np.float32]]:
         """Return alpha, depth and the material channels as the layers of an image file, ``(H, W)`` each.
 
-        Names: ``A``, ``depth``, ``roughness``, ``ambient_occlusion``, ``base_color.R`` …, ``normal.X`` …, and what else
-        was drawn by its own name: ``roughness_error``, ``base_color_error.R`` …; values as they are here, not
-        multiplied by alpha.
+        Names: ``A``, ``depth``, ``roughness``, ``ambient_occlusion``, ``base_color.R`` …, ``normal.X`` …, and
+        every other channel by its own name: ``roughness_error``, ``base_color_error.R`` …; values as they are here,
+        not multiplied by alpha.
         """
         layers = {"A": self.alpha, "depth": self.depth}
         for name, array in self.channels.items():
@@ -67,7 +66,7 @@ class GBuffer:
 
 @overload
 def rasterize(
-    source: GaussianCloud | Scene,
+    cloud: GaussianCloud,
     cameras: Camera,
     *,
     channels: Sequence[str] = ...,
@@ -78,7 +77,7 @@ def rasterize(
 
 @overload
 def rasterize(
-    source: GaussianCloud | Scene,
+    cloud: GaussianCloud,
     cameras: Sequence[Camera],
     *,
     channels: Sequence[str] = ...,
@@ -88,7 +87,7 @@ def rasterize(
 
 
 def rasterize(
-    source: GaussianCloud | Scene,
+    cloud: GaussianCloud,
     cameras: Camera | Sequence[Camera],
     *,
     channels: Sequence[str] = MATERIAL_CHANNELS,
@@ -101,12 +100,11 @@ def rasterize(
     constants of 3DGS: alpha at most 0.99 and at least 1/255. Same device, same input: same bits.
 
     Args:
-        source: Gaussians in the internal world (axes ``rfu``); or a `Scene`, drawn where it is on its device, whose
-            only channels are ``surface_normals`` and, where its cloud has them, ``normals``.
+        cloud: Gaussians in the internal world (axes ``rfu``).
         cameras: A camera, or any number of them, of any sizes.
         channels: What to draw, of `CHANNELS`.
         options: How splats are drawn; see `RasterOptions`.
-        device: Warp device; the first GPU without, or the CPU where there is none. A scene has its own.
+        device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
         What the camera sees; for a sequence of cameras, what each one sees.
@@ -118,7 +116,7 @@ def rasterize(
 
     Source: Zwicker et al. 2001; Kerbl et al. 2023, Section 6; Zhang et al. 2024 (depth and normals).
     """
-    drawn = DrawnSource.of(source, channels, device)
+    drawn = DrawnCloud.of(cloud, channels, device)
     views = [cameras] if isinstance(cameras, Camera) else list(cameras)
     buffers = [
         _mean_images(drawn, rasterizer, view, camera)
@@ -168,8 +166,8 @@ class CloudGradients:
         positions, scales: [1/m].
         orientations: To the quaternions xyzw as given, orthogonal to them.
         opacities: To the opacities.
-        channels: By name, to the arrays of the channels that were drawn; ``surface_normals`` have none of their own,
-            what they say is in ``orientations``, ``scales`` and ``positions``.
+        channels: Derivatives to the arrays of the channels that were drawn, by name. ``surface_normals`` have none of
+            their own: theirs are in ``orientations``, ``scales`` and ``positions``.
     """
 
     positions: NDArray[np.float32]
@@ -188,18 +186,18 @@ def rasterize_backward(
     options: RasterOptions | None = None,
     device: Any = None,
 ) -> CloudGradients:
-    """Return how a loss changes with a cloud, from how it changes with what `rasterize` returns for it.
+    """Return the gradient of a loss with respect to a cloud, given its gradient with respect to the G-buffers.
 
-    The cloud is drawn again: a loop that draws and differentiates holds a `Rasterizer` instead. What is discrete is
-    held still: which splats count, their order, the cap of alpha, the pick of the median. The bits depend on the device
-    alone.
+    The cloud is drawn again: a loop that draws and differentiates holds a `Rasterizer` instead. Discrete decisions
+    are held still: which splats count, their order, the cap of alpha, the pick of the median. The bits depend on the
+    device alone.
 
     Args:
         cloud: See `rasterize`.
         cameras: See `rasterize`.
-        adjoints: By name of an attribute of `GBuffer` (``alpha``, ``depth``, ``median_depth``) or of a channel, the
-            derivatives of the loss to that image; what is left out is 0. One mapping for a camera, as many as cameras
-            for a sequence.
+        adjoints: Derivatives of the loss to the images, by name: of an attribute of `GBuffer` (``alpha``, ``depth``,
+            ``median_depth``) or of a channel. Images left out have derivatives of 0. One mapping for a camera, as
+            many as cameras for a sequence.
         channels: See `rasterize`.
         options: See `rasterize`.
         device: See `rasterize`.
@@ -220,7 +218,7 @@ def rasterize_backward(
             f"adjoints must hold one mapping for each of {len(views)} cameras, got {len(given)}. Pass an empty one "
             "where nothing changes."
         )
-    drawn = DrawnSource.of(cloud, channels, device)
+    drawn = DrawnCloud.of(cloud, channels, device)
     for mapping in given:
         for name in mapping:
             require_choice("adjoints", name, (*IMAGES, *drawn.channels))
@@ -233,12 +231,12 @@ def rasterize_backward(
     return CloudGradients(**{name: totals.pop(name) for name in GEOMETRY}, channels=totals)
 
 
-def _mean_images(source: DrawnSource, rasterizer: Rasterizer, view: ViewImages, camera: Camera) -> GBuffer:
+def _mean_images(cloud: DrawnCloud, rasterizer: Rasterizer, view: ViewImages, camera: Camera) -> GBuffer:
     """Turn one view's sums into means."""
     images = host_images(view, rasterizer.value_channels.stop)
     alpha = images.alpha
     drawn = {}
-    for name, place in source.places(rasterizer).items():
+    for name, place in cloud.places(rasterizer).items():
         layer = images.values[..., place]
         if name in UNIT_CHANNELS:
             layer = _quotient(layer, np.linalg.norm(layer, axis=-1, keepdims=True))
@@ -252,7 +250,7 @@ def _mean_images(source: DrawnSource, rasterizer: Rasterizer, view: ViewImages, 
     )
 
 
-def _set_adjoints(source: DrawnSource, rasterizer: Rasterizer, place: int, given: Mapping[str, ArrayLike]) -> None:
+def _set_adjoints(cloud: DrawnCloud, rasterizer: Rasterizer, place: int, given: Mapping[str, ArrayLike]) -> None:
     """Turn derivatives to the means of one view into those to its sums, and write them where they are read."""
     camera = rasterizer.cameras[place]
     shape = (camera.height, camera.width)
@@ -264,7 +262,7 @@ def _set_adjoints(source: DrawnSource, rasterizer: Rasterizer, place: int, given
         arrays[name] = array
     to_sums = np.zeros(drawn.values.shape)
     alpha = drawn.alpha.astype(np.float64)[..., None]
-    for name, columns in source.places(rasterizer).items():
+    for name, columns in cloud.places(rasterizer).items():
         layer = drawn.values[..., columns].astype(np.float64)
         trailing = (layer.shape[-1],) if is_vector(name) else ()
         array = require_array(name, given.get(name, np.zeros(shape + trailing)), shape + trailing, np.float64)

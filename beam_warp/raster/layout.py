@@ -1,4 +1,4 @@
-"""Where views, tiles, pixels and channels of images that are drawn together lie in the device's arrays."""
+"""The layout of views, tiles, pixels and channels in the arrays of images that are drawn together."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ViewLayout:
     """The views of some cameras: their tiles and pixels follow one another, row by row.
 
     Attributes:
-        views: What kernels know of every camera.
+        views: The cameras, for kernels.
         first_pixels: Where each view's pixels begin, and where the last one's end, ``(C + 1,)`` int64.
         first_tiles: Where each row of tiles begins, and where the last one ends, int64.
         tile_views: Which view each tile belongs to, int32.
@@ -58,7 +58,7 @@ class ViewLayout:
 
 
 class ChannelRanges(NamedTuple):
-    """Where each kind of channel is among those of a splat.
+    """The places of colours, normals and values among the channels of a splat.
 
     Attributes:
         colors: The captured colour; empty for none.

@@ -23,7 +23,7 @@ from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterIm
 from beam_warp.world.camera import Camera
 
 MAX_SPLATS = 2**26 - 1
-"""Most splats, Gaussians times cameras: the up to 32 numbers that the way back sums for each are counted in 32 bits."""
+"""Most splats, Gaussians times cameras. The way back sums up to 32 numbers for each, and counts them in 32 bits."""
 
 
 class Rasterizer:
@@ -36,15 +36,15 @@ class Rasterizer:
     Gaussians that are not finite, or whose quaternion is 0, are not drawn; their own gradients may not be finite.
 
     Attributes:
-        device: Where everything is.
+        device: The Warp device of all arrays.
         cameras: Pinhole cameras of any sizes.
         options: How splats are drawn.
-        images: What was drawn last.
+        images: The images drawn last.
         gaussian_ids: The last Gaussian that each pixel saw, -1 for none, ``(P,)`` int.
-        color_channels: Where the captured colour is among the channels; empty for none.
-        normal_channels: Where the normals are, of the surfaces of largest response, in the world and towards the
+        color_channels: The channels of the captured colour; empty for none.
+        normal_channels: The channels of the normals of the surfaces of largest response, in the world and towards the
             camera; empty for none.
-        value_channels: Where the Gaussians' own values are.
+        value_channels: The channels of the Gaussians' own values.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Rasterizer:
         readable: bool = False,
         images_of: Rasterizer | None = None,
     ) -> None:
-        """Allocate what every frame needs.
+        """Allocate the arrays of every frame.
 
         Args:
             gaussian_count: N; times the number of cameras at most `MAX_SPLATS`.
@@ -124,7 +124,7 @@ class Rasterizer:
 
     @property
     def first_pixels(self) -> tuple[int, ...]:
-        """Where each view's pixels begin in the images, and where the last one's end."""
+        """The first pixel of each view in the images, and the end of the last one's."""
         return tuple(self._buffers.layout.first_pixels.tolist())
 
     @property
@@ -140,7 +140,7 @@ class Rasterizer:
         return forward.counted_pairs(self._buffers)
 
     def draw(self, gaussians: GaussianArrays) -> RasterImages:
-        """Draw Gaussians, however much room they take.
+        """Draw Gaussians, and make room for their pairs.
 
         Args:
             gaussians: Arrays on the device, of the shapes and parts this was made for; they are kept for `redraw` and
@@ -208,7 +208,7 @@ class Rasterizer:
     def backward(self) -> GaussianGradients:
         """Return the derivatives to the Gaussians of what was drawn last, from those in `adjoints`.
 
-        What is discrete is held still: which splats count, their order, the cap of alpha, the pick of the median.
+        Discrete decisions are held still: which splats count, their order, the cap of alpha, the pick of the median.
 
         Returns:
             The same arrays every time, overwritten by the next call.
@@ -228,7 +228,7 @@ class Rasterizer:
             return back.resolve(gaussians)
 
     def back_project(self, pixels: wp.array, out: wp.array) -> None:
-        """Carry what pixels hold back to the Gaussians that they saw in the last frame: drawing values, transposed.
+        """Carry the contents of pixels back to the Gaussians of the last frame: the transpose of drawing values.
 
         ``out[v * N + i]`` becomes the sum over the pixels p of view v of w_ip ``pixels[p]``, where w_ip is the weight
         with which `draw` blends Gaussian i into pixel p; zeros for Gaussians that the view does not see.
@@ -265,7 +265,7 @@ class Rasterizer:
         launch_sum_views(rows, out, self.device)
 
     def _backward_buffers(self) -> BackwardBuffers:
-        """Return what the way back needs, made when first asked for."""
+        """Return the buffers of the way back, made when first asked for."""
         if self._back is None:
             self._back = BackwardBuffers(self._buffers)
         return self._back
@@ -279,7 +279,7 @@ class Rasterizer:
             yield band
 
     def _drawn_gaussians(self, caller: str) -> GaussianArrays:
-        """Return what was drawn last."""
+        """Return the Gaussians drawn last."""
         if self._gaussians is None:
             raise InvalidOptionError(f"{caller} must follow draw, got no draw before it. Call draw first.")
         return self._gaussians

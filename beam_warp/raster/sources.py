@@ -1,4 +1,4 @@
-"""Gaussians of a cloud or a scene on a device, drawn with channels for as many cameras at a time as memory allows."""
+"""Gaussians of a cloud on a device, drawn with channels for as many cameras at a time as memory allows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from beam_warp.raster.array_checks import require_cameras
 from beam_warp.raster.channels import CHANNELS, RADIANCE, SURFACE_NORMALS, column_count, own_channels
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterOptions
-from beam_warp.trace.scene import Scene
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
 
@@ -33,7 +32,7 @@ GEOMETRY = ("positions", "orientations", "scales", "opacities")
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnSource:
+class DrawnCloud:
     """Gaussians on a device, and which channels of them are drawn."""
 
     gaussians: GaussianArrays
@@ -41,8 +40,8 @@ class DrawnSource:
     device: Any
 
     @classmethod
-    def of(cls, source: GaussianCloud | Scene, channels: Sequence[str], device: Any) -> DrawnSource:
-        """Bring what is drawn of a cloud to the device; a scene is there already.
+    def of(cls, cloud: GaussianCloud, channels: Sequence[str], device: Any) -> DrawnCloud:
+        """Bring to the device what is drawn of a cloud.
 
         Raises:
             InvalidOptionError: A channel is unknown, or the cloud is in other axes.
@@ -52,18 +51,16 @@ class DrawnSource:
         names = tuple(channels)
         for name in names:
             require_choice("channels", name, CHANNELS)
-        if isinstance(source, Scene):
-            return cls(_scene_arrays(source, names), names, source.device)
-        require_world_axes(source)
+        require_world_axes(cloud)
         target = resolve_device(device)
-        columns = {name: _require_channel(source, name) for name in own_channels(names)}
+        columns = {name: _require_channel(cloud, name) for name in own_channels(names)}
         values = (
-            np.concatenate([c.reshape(len(source), column_count(name)) for name, c in columns.items()], axis=1)
+            np.concatenate([c.reshape(len(cloud), column_count(name)) for name, c in columns.items()], axis=1)
             if columns
             else None
         )
-        radiance = _require_channel(source, RADIANCE) if RADIANCE in names else None
-        return cls(upload_gaussians(source, target, values=values, radiance=radiance), names, target)
+        radiance = _require_channel(cloud, RADIANCE) if RADIANCE in names else None
+        return cls(upload_gaussians(cloud, target, values=values, radiance=radiance), names, target)
 
     def draw_groups(
         self, cameras: Sequence[Camera], options: RasterOptions | None
@@ -142,22 +139,6 @@ def upload_gaussians(
         None if values is None else upload(values, float, device),
         None if radiance is None else upload(radiance, wp.vec3, device),
     )
-
-
-def _scene_arrays(scene: Scene, channels: Sequence[str]) -> GaussianArrays:
-    """Return a scene's arrays as they are on its device."""
-    packed = scene.packed
-    own = own_channels(channels)
-    if RADIANCE in channels or own not in ([], ["normals"]) or (own and not scene.has_normals):
-        raise InvalidArrayError(
-            f"channels of a scene must be of {SURFACE_NORMALS} and, where its cloud has them, normals, got "
-            f"{', '.join(channels)}. Draw the cloud instead."
-        )
-    normals = packed.gaussians.normals
-    values = None
-    if own:
-        values = wp.array(ptr=normals.ptr, shape=(len(normals), 3), dtype=float, device=scene.device)
-    return GaussianArrays(packed.positions, packed.orientations, packed.scales, packed.opacities, values)
 
 
 def require_world_axes(cloud: GaussianCloud) -> None:

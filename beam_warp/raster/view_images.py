@@ -21,7 +21,7 @@ from beam_warp.raster.rasterizer import Rasterizer
 
 @dataclass(frozen=True, eq=False)
 class ViewImages:
-    """What one camera sees, as views of a rasteriser's images: the next draw overwrites them.
+    """The images of one camera in a rasteriser's memory: the next draw overwrites them.
 
     Attributes:
         channels: ``(H, W, K)`` float each, a pass of channels, K 4, 8, 12 or 16, the last padded with zeros. Compact,
@@ -62,10 +62,10 @@ class ViewImages:
 
 
 def view_images(rasterizer: Rasterizer) -> list[ViewImages]:
-    """Return what every camera of a rasteriser sees, without copying.
+    """Return the images of every camera of a rasteriser, without copying.
 
     Args:
-        rasterizer: What draws; the views stay where they are, whatever it draws next.
+        rasterizer: The rasteriser; the images stay where they are, whatever it draws next.
 
     Returns:
         One for each of its cameras, in their order. ``numpy.from_dlpack(view.alpha)``, ``torch.from_dlpack`` and
@@ -83,7 +83,7 @@ def view_images(rasterizer: Rasterizer) -> list[ViewImages]:
 
 
 class ValueImages(NamedTuple):
-    """Sums over what every pixel of a camera sees, weighted by visibility.
+    """Images of one camera on the host: sums over what every pixel sees, weighted by visibility.
 
     Attributes:
         alpha: Sum of the weights, ``(H, W)`` float32; at most 1 but for rounding.

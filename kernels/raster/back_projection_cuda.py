@@ -1,4 +1,4 @@
-"""What pixels hold, carried back to the splats that they see, for CUDA: a tile a block, two pixels a lane.
+"""Back-projection of pixels to the splats that they see on CUDA: a tile a block, two pixels a lane.
 
 A pair of tile and splat gets the sum over the tile's pixels of blending weight times what they hold: the transpose of
 `composite_cuda`, with its weights. The work is shared out as in `composite_adjoint_cuda`, but front to back. No

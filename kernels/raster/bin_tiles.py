@@ -1,4 +1,4 @@
-"""Which splats each tile draws, in depth order: count, emit, sort, find ranges.
+"""Lists of the splats that each tile draws, in depth order: count, emit, sort, find ranges.
 
 Splats are sorted by depth once; their (tile, splat) pairs are emitted in that order and sorted by tile alone with a
 stable sort, which costs half of one sort by (tile, depth) and gives the same order (Schütz et al. 2025, Splatshop).

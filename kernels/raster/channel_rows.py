@@ -1,4 +1,4 @@
-"""What splats carry: a row of channels each, gathered from their Gaussians, and the way back for gradients.
+"""Rows of channels, one a splat, gathered from the Gaussians, and the way back for gradients.
 
 Channels are, in this order: the Gaussian's captured colour towards the view's camera, the normal of its geometry, and
 its own values; each block may be missing. Rows are cut into passes of at most 16.
@@ -13,7 +13,7 @@ from beam_warp.kernels.raster.project import RasterView
 
 @wp.struct
 class ChannelBlocks:
-    """Where the channels of a splat come from."""
+    """Sources of the channels of a splat."""
 
     values: wp.array2d[float]  # of each Gaussian, any number
     colors: wp.array[wp.vec3]  # of each splat, or none

@@ -1,4 +1,4 @@
-"""What each pixel shows: its tile's splats, front to back. One thread a pixel: the readable form, on CPU and CUDA.
+"""Compositing a tile's splats at each pixel, front to back. One thread a pixel: the readable form, on CPU and CUDA.
 
 `composite_cpu` and `composite_cuda` do the same sums in the same order, faster. Channels come as rows of a vector whose
 length is fixed at compile time: four lengths and two modes of depth make eight small modules.
@@ -27,7 +27,7 @@ CHANNEL_COUNTS = (4, 8, 12, 16)
 
 @wp.struct
 class RasterFrame:
-    """What is drawn: splats, the lists of tiles, and the views they are seen from."""
+    """Input of compositing: splats, the lists of tiles, and the views they are seen from."""
 
     splats: Splats
     lists: TileLists
@@ -40,7 +40,7 @@ class RasterFrame:
 
 @wp.struct
 class Images:
-    """What pixels see besides channels, view by view and row by row; depths in metres along the optical axis."""
+    """Images besides channels, view by view and row by row; depths in metres along the optical axis."""
 
     alpha: wp.array[float]  # sum of the weights
     transmittance: wp.array[float]  # what passes all
@@ -54,7 +54,7 @@ class Images:
 
 @wp.struct
 class PixelPlace:
-    """Where a pixel is in its view and in the images; ``index`` -1 for outside."""
+    """Place of a pixel in its view and in the images; ``index`` is -1 outside."""
 
     index: int
     position: wp.vec2

@@ -1,4 +1,4 @@
-"""How pixels change with the splats that they see: one splat at one pixel.
+"""The adjoint of compositing: one splat at one pixel.
 
 With f_k a splat's channels, z_k its depth, T_k what passes before it and w_k = alpha_k T_k, a loss that is linear in
 the sums has s_k = f_k . v_f + z_k v_z + v_a, and back to front (Kerbl et al. 2023, Section 6)
@@ -58,7 +58,7 @@ class Adjoints:
 
 @wp.struct
 class PixelState:
-    """What is known of a pixel on the way through its splats, back to front."""
+    """State of a pixel on the way through its splats, back to front."""
 
     transmittance: float  # what passes before the splats still to come
     behind: float  # the sum R of those behind them

@@ -1,4 +1,4 @@
-"""How pixels change with the splats that they see, for the CPU: a tile's splats back to front, on their pixels."""
+"""The adjoint of compositing on the CPU: a tile's splats back to front, each on the pixels that it reaches."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
+from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_pixels
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, row_reach, sight_of, squared_extent
 
@@ -40,7 +40,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        box = tile_box(view, tile)
+        box = tile_pixels(view, tile)
         listed_range = frame.lists.ranges[listed]
         end = listed_range[0]
         for y in range(box[1], box[3]):

@@ -1,4 +1,4 @@
-"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
+"""The adjoint of compositing on CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
 
 The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
 pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
@@ -60,7 +60,7 @@ class OwnPixel:
 
 @wp.func
 def own_pixel(place: PixelPlace, images: Images, adjoints: Adjoints) -> OwnPixel:
-    """What a pixel is before its last splat."""
+    """The pixel before its splats are gone through."""
     pixel = OwnPixel()
     pixel.index = place.index
     pixel.position = place.position

@@ -1,4 +1,4 @@
-"""What each pixel shows, for CUDA: 8 x 4 pixels a warp, a lane for each.
+"""Compositing on CUDA: 8 x 4 pixels a warp, a lane for each.
 
 The lanes look at 32 splats of the tile's list at once, a lane for each: which of them reach the warp's pixels? Those go
 to shared memory, and the warp composites them one after the other on all its pixels. It is done when all pixels are.

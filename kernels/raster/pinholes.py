@@ -1,4 +1,4 @@
-"""Where a camera has a point of the world: in its own axes, in its image, and whether that is inside the image."""
+"""Points of the world in a camera's axes and in its image."""
 
 import warp as wp
 
@@ -21,7 +21,7 @@ def image_point(view: RasterView, p: wp.vec3) -> wp.vec2:
 
 @wp.func
 def room_around(view: RasterView, pixel: wp.vec2) -> float:
-    """How far a place is inside the image [pixel]: to its nearest edge, negative outside; NaN is not positive."""
+    """Distance of a place to the nearest edge of the image [pixel], negative outside; NaN for NaN."""
     x = wp.min(pixel[0], float(view.width) - pixel[0])
     y = wp.min(pixel[1], float(view.height) - pixel[1])
     return wp.min(x, y)

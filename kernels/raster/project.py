@@ -1,4 +1,4 @@
-"""From Gaussians in the world to splats on the image plane: elliptical weighted averaging with a low-pass filter.
+"""Projection of Gaussians to splats on the image plane: elliptical weighted averaging with a low-pass filter.
 
 Source: Zwicker et al. 2001, EWA Volume Splatting; Kerbl et al. 2023 for the constants. Both square forms are kept as
 factors, so that nothing cancels: with T = J M (2 x 3; M the scaled axes in camera space), det(T T^T) = |t0 x t1|^2 is a
@@ -46,7 +46,7 @@ class RasterView:
 
 @wp.struct
 class Projection:
-    """How Gaussians become splats."""
+    """Options of the projection."""
 
     low_pass: float  # variance [pixel^2] of the pixel filter that every splat is widened by
     near: float  # depth [m] before which a Gaussian's centre is not drawn

@@ -78,7 +78,7 @@ def reach_columns(shape: wp.vec4, squared: float, top: float, bottom: float) -> 
 
 @wp.struct
 class RowReach:
-    """What the pixels that a splat reaches in a row of pixels follow from, the same for all rows."""
+    """Numbers, the same for all rows of pixels, from which the pixels that a splat reaches in a row follow."""
 
     lean: float  # x of their middle over y, both from the centre
     widest: float  # square of half their extent in the centre's row
@@ -164,7 +164,7 @@ def log_alpha_of(center: wp.vec4, e: wp.vec2) -> float:
 
 @wp.func
 def sight_of(center: wp.vec4, shape: wp.vec4, position: wp.vec2) -> Sight:
-    """What a pixel at a position sees of a splat."""
+    """The splat as a pixel at a position sees it."""
     sight = Sight()
     sight.offset = offset_from(center, position)
     sight.e = whiten(shape, sight.offset)
