@@ -19,8 +19,8 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.demo.capture import dome_cameras
 from beam_warp.light.prepared import MaterialLight
 from beam_warp.materials.images import crop_to_subject
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
 from beam_warp.trace.denoise import chosen_denoiser

@@ -54,14 +54,14 @@ CASES = {"RGB and depth": 3, "11 channels and depth": 11}
 """Channels of the comparison with gsplat; 3 are the captured colour."""
 
 PARTS = ("forward", "backward", "training")
-"""What is timed of a training step: drawing, the way back, and both one after the other."""
+"""Timed parts of a training step: drawing, the way back, and both one after the other."""
 
 FLIP = 1e-4
 """A larger difference is a decision that fell the other way: a splat at the cut of alpha, the stop, the order of two,
 the pick of the median. Rounding stays below."""
 
 ROUNDING = 2e-6
-"""What CPU and CUDA may differ by in a channel where nothing was decided otherwise."""
+"""Largest difference between CPU and CUDA in a channel where nothing was decided otherwise."""
 
 OPAQUE = 0.5
 """Depths are compared where alpha is above: elsewhere they are means over little."""
@@ -78,7 +78,7 @@ PEER_NOTES = (
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """Extent of a measurement.
 
     Attributes:
         gaussians: Of every measurement but growth.

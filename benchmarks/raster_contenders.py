@@ -1,4 +1,4 @@
-"""What draws a scene in the raster benchmark, as it is or as a CUDA graph, and how long each takes in turn."""
+"""Contenders of the raster benchmark, drawing as they are or as a CUDA graph, and their times, taken in turn."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from raster_scenes import RasterScene
 from timing import Task, Times, take_turns
 
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 
 GEOMETRY = ("positions", "orientations", "scales", "opacities")
 

@@ -41,7 +41,7 @@ COLUMNS = 3
 
 
 class View(NamedTuple):
-    """What one way of drawing shows, ``(H, W)`` or ``(H, W, 3)``; normals of directions, colour for a display."""
+    """Images of one way of drawing, ``(H, W)`` or ``(H, W, 3)``; normals of directions, colour for a display."""
 
     color: NDArray[np.float32]
     alpha: NDArray[np.float32]

@@ -19,10 +19,10 @@ from raster_stages import BACKWARD, FORWARD, REST
 HERE = Path(__file__).parent
 
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
-"""What is timed in growth rows, and how it is called."""
+"""Timed parts in growth rows, and their titles."""
 
 COLORS = [f"C{number}" for number in (0, 1, 2, 3, 4, 5, 6, 9)]
-"""Of stages in their order: all but the greys, which are the rest's."""
+"""Colours of stages in their order; greys are left to the rest."""
 
 
 class Way(NamedTuple):

@@ -23,15 +23,15 @@ BUMP = 0.06
 FIELD_OF_VIEW = 35.0
 """Angle between the top and bottom edges of the image [degree]."""
 FIGURE_SHARE = 0.26
-"""Of an image, which a figure covers."""
+"""Share of an image that a figure covers."""
 CUBE_DISTANCE = 1.2
-"""From the camera to the middle of a cube of side 1, whose front then fills an image of up to 16 to 9 [m]."""
+"""Distance of the camera from the middle of a cube of side 1 [m]: its front then fills an image of up to 16 to 9."""
 VALUE_COUNT = 11
 """Channels of `RasterScene.values`."""
 
 
 class RasterScene(NamedTuple):
-    """What is drawn, and from where; the cloud is relightable and has captured colour."""
+    """A cloud and the camera that sees it; the cloud is relightable and has captured colour."""
 
     name: str
     cloud: GaussianCloud

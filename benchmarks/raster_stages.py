@@ -1,4 +1,4 @@
-"""How long each stage of a frame takes, forwards and backwards: where the time goes.
+"""Times of the stages of a frame, forwards and backwards.
 
 On the CPU by the wall clock around each launcher. On CUDA by events around them, queued behind other work that keeps
 the device busy, so that the host's launches are ahead of it and no wait for them is counted; sorts and scans, which
@@ -27,7 +27,7 @@ from raster_contenders import (
     seconds_between,
 )
 
-from beam_warp.raster import rasterizer
+from beam_warp.raster import backward, forward, rasterizer
 
 STAGES = {
     "launch_project": "project",
@@ -76,7 +76,7 @@ BUSY_SECONDS = 0.05
 
 
 class StageClock:
-    """Marks when stages begin and end, for rasterisers made within `watching`."""
+    """Marks when stages begin and end."""
 
     def __init__(self, device: Any) -> None:
         self.device = device
@@ -87,10 +87,11 @@ class StageClock:
         """Wrap the rasteriser's launchers, sorts and scans."""
         with ExitStack() as patches:
             for name, stage in STAGES.items():
-                self._wrap(patches, rasterizer, name, stage)
+                owner = next(module for module in (forward, backward, rasterizer) if hasattr(module, name))
+                self._wrap(patches, owner, name, stage)
             self._wrap(patches, wp.utils, "radix_sort_pairs", None)
             self._wrap(patches, wp.utils, "array_scan", SCAN)
-            self._wrap(patches, rasterizer._BackwardBuffers, "zero_", CLEAR)
+            self._wrap(patches, backward.BackwardBuffers, "begin", CLEAR)
             yield
 
     def frame(self, work: Callable[[], Any]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What some pixels see in float64, by brute force: every Gaussian, covariances and their inverses, no tiles."""
+"""Some pixels in float64 by brute force: every Gaussian, covariances and their inverses, no tiles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REACH = 3.0
 
 
 class Truth(NamedTuple):
-    """What pixels see; both kinds of depth, of the tangent plane and of the largest response on the ray [m].
+    """Images at some pixels; both kinds of depth, of the tangent plane and of the largest response on the ray [m].
 
     Attributes:
         values: Sums ``(M, K)``.

@@ -25,7 +25,8 @@ from beam_warp.light.prefiltered import EnvironmentLighting
 from beam_warp.materials.job import ESTIMATE, OverviewOptions, Progress, RunOptions, RunResult, run
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
-from beam_warp.raster.gbuffer import RADIANCE, SURFACE_NORMALS, rasterize
+from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions, LearningRates

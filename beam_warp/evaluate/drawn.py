@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.image.metrics import block_means
-from beam_warp.raster.gbuffer import MATERIAL_CHANNELS, RADIANCE, UNIT_CHANNELS, rasterize
+from beam_warp.raster.channels import MATERIAL_CHANNELS, RADIANCE, UNIT_CHANNELS
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import seen_radiance
 from beam_warp.world.camera import Camera

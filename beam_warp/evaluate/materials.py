@@ -19,7 +19,7 @@ from beam_warp.evaluate.relighters import RELIGHTERS, Relighter, RelitImage
 from beam_warp.evaluate.steadiness import TemporalScores, gaussian_deviation, surface_scores
 from beam_warp.image.files import Image
 from beam_warp.image.metrics import SOLID_ALPHA, Compared, angles_between, as_compared, least_squares_scale
-from beam_warp.raster.gbuffer import MATERIAL_CHANNELS
+from beam_warp.raster.channels import MATERIAL_CHANNELS
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.axes import change_axes
 from beam_warp.world.environment import EnvironmentMap

@@ -21,7 +21,7 @@ from beam_warp.world.camera import Camera
 import torch  # noqa: TID251  # pyright: ignore[reportMissingImports]
 
 KEPT_RASTERIZERS = 4
-"""How many rasterisers `rasterization` keeps for the next call: such as training and evaluation, upright and wide."""
+"""Number of rasterisers that `rasterization` keeps for the next call: of training and evaluation, upright and wide."""
 
 MAX_DEGREE = 4
 """Highest degree of spherical harmonics."""
@@ -52,7 +52,8 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "rolling_shutter": ("GLOBAL", "Take each camera at one moment"),
     "viewmats_rs": (None, "Take each camera at one moment"),
 }
-"""gsplat's arguments that change what is drawn and have no counterpart: what means that nothing is asked, and a way."""
+"""gsplat's arguments that change the image and have no counterpart here: the value that asks for nothing, and what to
+do instead."""
 
 _kept: OrderedDict[tuple[Any, ...], TorchRasterizer] = OrderedDict()
 

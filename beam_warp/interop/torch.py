@@ -33,7 +33,7 @@ except ImportError as error:
 
 
 class TorchImages(NamedTuple):
-    """What cameras see, in new tensors: all views' pixels, one view after the other and row by row.
+    """Images of all cameras in new tensors, one view after the other and row by row.
 
     Attributes:
         colors: Sum of the captured colour, weighted by visibility, ``(P, 3)``; None where none is drawn.
@@ -56,7 +56,7 @@ class TorchImages(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Ticket:
-    """One draw; the last one's is what the rasteriser's state belongs to."""
+    """Identity of a draw: the rasteriser's state belongs to the last draw's ticket."""
 
     cameras: tuple[Camera, ...]
 
@@ -69,7 +69,7 @@ class TorchRasterizer:
     several threads at once.
 
     Attributes:
-        cameras: What a draw sees that is given no others.
+        cameras: The cameras of a draw that is given no others.
         device: The torch device.
     """
 
@@ -171,7 +171,10 @@ class TorchRasterizer:
         """
         views = self.cameras if cameras is None else tuple(cameras)
         given = (positions, orientations, scales, opacities, values, radiance)
-        tensors = [self._require(name, tensor) for name, tensor in zip(self._shapes, given, strict=True)]
+        tensors = [
+            _require_tensor(name, tensor, shape, self.device)
+            for (name, shape), tensor in zip(self._shapes.items(), given, strict=True)
+        ]
         return TorchImages(*_Draw.apply(self, _Ticket(views), *tensors))
 
     def view_images(self) -> list[ViewImages]:
@@ -182,26 +185,6 @@ class TorchRasterizer:
         if self._stream is not None:  # whatever reads is ordered behind Warp's stream, so that goes behind torch's
             self._warp_device.stream.wait_stream(wp.stream_from_torch(self._stream))
         return view_images(self._rasterizer)
-
-    def _require(self, name: str, tensor: Any) -> torch.Tensor | None:
-        """Refuse a tensor that kernels would misread, and bring its rows together."""
-        shape = self._shapes[name]
-        if shape is None:
-            if tensor is not None:
-                raise InvalidArrayError(
-                    f"{name} must be left out of what draws none, got a tensor. Make another TorchRasterizer."
-                )
-            return None
-        if not isinstance(tensor, torch.Tensor):
-            raise InvalidArrayError(
-                f"{name} must be a torch tensor of shape {shape}, got {type(tensor).__name__}. Pass torch.as_tensor."
-            )
-        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device != self.device:
-            raise InvalidArrayError(
-                f"{name} must be a tensor of float32 of shape {shape} on {self.device}, got {tensor.dtype} of shape "
-                f"{tuple(tensor.shape)} on {tensor.device}. Convert, reshape or move it."
-            )
-        return tensor if tensor.ndim == 1 or tensor.stride(-1) == 1 else tensor.contiguous()
 
     @contextmanager
     def _torch_stream(self) -> Iterator[None]:
@@ -277,7 +260,7 @@ class TorchRasterizer:
         return held[1]
 
     def _blocks(self) -> tuple[range, range, range]:
-        """Where colours, normals and values are among the channels."""
+        """The channels of colours, normals and values."""
         drawn = self._rasterizer
         return drawn.color_channels, drawn.normal_channels, drawn.value_channels
 
@@ -300,6 +283,26 @@ class _Draw(torch.autograd.Function):
     def backward(ctx: Any, *upstream: torch.Tensor | None) -> Any:
         """Differentiate; torch refuses tensors that were written to since."""
         return None, None, *ctx.owner._backward(ctx.ticket, ctx.saved_tensors, upstream, ctx.needs_input_grad[2:])
+
+
+def _require_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device: torch.device) -> torch.Tensor | None:
+    """Refuse a tensor that kernels would misread, and bring its rows together; a shape of None wants no tensor."""
+    if shape is None:
+        if tensor is not None:
+            raise InvalidArrayError(
+                f"{name} must be left out of what draws none, got a tensor. Make another TorchRasterizer."
+            )
+        return None
+    if not isinstance(tensor, torch.Tensor):
+        raise InvalidArrayError(
+            f"{name} must be a torch tensor of shape {shape}, got {type(tensor).__name__}. Pass torch.as_tensor."
+        )
+    if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device != device:
+        raise InvalidArrayError(
+            f"{name} must be a tensor of float32 of shape {shape} on {device}, got {tensor.dtype} of shape "
+            f"{tuple(tensor.shape)} on {tensor.device}. Convert, reshape or move it."
+        )
+    return tensor if tensor.ndim == 1 or tensor.stride(-1) == 1 else tensor.contiguous()
 
 
 def _cuts(channels: range) -> Iterator[tuple[int, slice, slice]]:

@@ -31,11 +31,11 @@ from beam_warp.kernels.materials.view_evidence import (
     launch_write_pixels,
 )
 from beam_warp.kernels.raster.bin_tiles import TILE
-from beam_warp.kernels.raster.project import View
-from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -158,7 +158,7 @@ def view_evidence(
                 gaussians.positions,
                 gaussians.radiance,
                 drawn.display_srgb,
-                wp.array(views, dtype=View, device=target),
+                wp.array(views, dtype=RasterView, device=target),
                 part.start,
                 colors,
                 directions,

@@ -51,8 +51,8 @@ from beam_warp.materials.residues import (
     surface_residues,
     view_surfaces,
 )
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.denoise import (
     DENOISERS,
     Denoiser,

@@ -1,4 +1,4 @@
-"""Whether the depth images of several views agree: how far, where, and which pixels only one view believes in."""
+"""Agreement of the depth images of several views: how far, where, and which pixels no other view confirms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLERANCE = 2.0
 
 @dataclass(frozen=True)
 class ViewConsistency:
-    """How one view's depth fits the others'.
+    """Agreement of one view's depth with the others'.
 
     Attributes:
         pixel_count: Pixels that show a surface and are neither grazing nor at an edge.
@@ -38,7 +38,7 @@ class ViewConsistency:
 
 @dataclass(frozen=True, eq=False)
 class DepthConsistency:
-    """What `depth_consistency` found; arrays are on the device, of all views' pixels, one view after the other.
+    """Result of `depth_consistency`; arrays are on the device, of all views' pixels, one view after the other.
 
     Attributes:
         confirmed: How many other views show a surface at the point of each pixel, -1 where it has no

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.array_checks import device_array
@@ -64,7 +65,9 @@ class DepthImages:
         origin: Where positions on the device are counted from [m], ``(3,)`` float64.
         views: Cameras for kernels.
         pixels: Inverse depth, slope, weight (see ``kernels/mesh/depth_pixels.py``), one view after the other, ``(P,)``
-        vec3. colors: Straight, ``(P,)`` vec3; empty without. color_space: What they mean; None without.
+            vec3.
+        colors: Straight, ``(P,)`` vec3; empty without.
+        color_space: The colour space of ``colors``; None without.
     """
 
     def __init__(self, cameras: Sequence[Camera], *, color_space: str | None = None, device: Any = None) -> None:
@@ -95,7 +98,10 @@ class DepthImages:
             )
         # Between the cameras and in whole metres: the same for all frames of a capture, and near enough for floats.
         self.origin = np.rint(np.mean([camera.position for camera in self.cameras], axis=0))
-        self._views = [self._view(index) for index in range(len(self.cameras))]
+        self._views = [
+            depth_camera(camera, self.origin, int(first))
+            for camera, first in zip(self.cameras, self._first, strict=False)
+        ]
         self.views = wp.array(self._views, dtype=DepthCamera, device=self.device)
         self.pixels = wp.zeros(total, dtype=wp.vec3, device=self.device)
         self.colors = wp.zeros(total if color_space else 0, dtype=wp.vec3, device=self.device)
@@ -146,7 +152,7 @@ class DepthImages:
 
     @property
     def first_pixels(self) -> tuple[int, ...]:
-        """Where each view's pixels begin, and where the last one's end."""
+        """The first pixel of each view, and the end of the last one's."""
         return tuple(self._first.tolist())
 
     def view(self, index: int) -> DepthCamera:
@@ -191,18 +197,18 @@ class DepthImages:
             )
         return require_number("footprint", float(np.median(joined)), 1e-9, 1e9)
 
-    def _view(self, index: int) -> DepthCamera:
-        """Return a camera in single precision, counted from the origin."""
-        camera = self.cameras[index]
-        matrix = camera.world_to_camera
-        view = DepthCamera()
-        view.rotation = wp.mat33(matrix[:3, :3].astype(np.float32))
-        view.translation = wp.vec3((matrix[:3, :3] @ self.origin + matrix[:3, 3]).astype(np.float32))
-        view.focal = wp.vec2(camera.focal_x, camera.focal_y)
-        view.center = wp.vec2(camera.center_x, camera.center_y)
-        view.width, view.height = camera.width, camera.height
-        view.first_pixel = int(self._first[index])
-        return view
+
+def depth_camera(camera: Camera, origin: NDArray[np.float64], first_pixel: int = 0) -> DepthCamera:
+    """Return a camera for kernels, in single precision, with positions counted from ``origin`` [m]."""
+    matrix = camera.world_to_camera
+    view = DepthCamera()
+    view.rotation = wp.mat33(matrix[:3, :3].astype(np.float32))
+    view.translation = wp.vec3((matrix[:3, :3] @ origin + matrix[:3, 3]).astype(np.float32))
+    view.focal = wp.vec2(camera.focal_x, camera.focal_y)
+    view.center = wp.vec2(camera.center_x, camera.center_y)
+    view.width, view.height = camera.width, camera.height
+    view.first_pixel = first_pixel
+    return view
 
 
 def _flat(name: str, value: Any, shape: tuple[int, int], device: Any) -> wp.array:

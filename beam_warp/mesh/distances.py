@@ -1,4 +1,4 @@
-"""How far two surfaces are apart where cameras see them: the Chamfer distance of a reconstruction to its truth."""
+"""Distances between two surfaces where cameras see them: the Chamfer distance of a reconstruction to its truth."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ class SurfaceTree:
 
 @dataclass(frozen=True)
 class SurfaceDistances:
-    """How far a reconstructed surface and its truth are apart.
+    """Distances between a reconstructed surface and its truth.
 
     Attributes:
         chamfer_mm: Mean of the two directed means [mm].

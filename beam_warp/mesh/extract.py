@@ -14,9 +14,9 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.mesh.consistency import depth_consistency
 from beam_warp.mesh.depths import DepthImages, DepthView
 from beam_warp.mesh.fusion import SMALLEST_PART, fuse_depths
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera, bulk
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from warp.geometry import sparse_marching_cubes_from_cells
 
-from beam_warp.checks import require_count, require_number
+from beam_warp.checks import require_number
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.kernels.mesh.tsdf import (
@@ -33,7 +33,7 @@ from beam_warp.mesh.depths import DepthImages, DepthView
 from beam_warp.mesh.topology import face_parts
 
 MAX_BLOCKS = 2**18
-"""Most blocks of 8^3 voxels: 2.1 GB of distances, weights and flags."""
+"""Most blocks of 8^3 voxels, 8 kB each: 2.1 GB of distances, weights and flags."""
 
 COARSER = 1.25
 """An automatic voxel that needs too many blocks grows by this until they fit; their number falls with its square."""
@@ -47,7 +47,6 @@ def fuse_depths(
     *,
     voxel: float | None = None,
     smallest_part: float = SMALLEST_PART,
-    max_blocks: int = MAX_BLOCKS,
     device: Any = None,
 ) -> trimesh.Trimesh:
     """Fuse depth images into a surface.
@@ -62,9 +61,8 @@ def fuse_depths(
     Args:
         views: Depth images; once on a device, they can be fused again with another voxel.
         voxel: Edge of a voxel [m]. None takes the median width of a pixel at the surface, and a larger one if that
-            needs more than ``max_blocks``: details smaller than a pixel were not seen.
+            needs more than `MAX_BLOCKS`: details smaller than a pixel were not seen.
         smallest_part: Connected parts with less area than this share of the largest one's are left out; in [0, 1].
-        max_blocks: Most blocks of 8^3 voxels, 8 kB each.
         device: Warp device of ``views`` that are not on one yet.
 
     Returns:
@@ -73,27 +71,26 @@ def fuse_depths(
 
     Raises:
         InvalidArrayError: Nothing is seen, or the distances have no surface.
-        InvalidOptionError: ``voxel`` needs more than ``max_blocks``, or an option is out of range.
+        InvalidOptionError: ``voxel`` needs more than `MAX_BLOCKS`, or an option is out of range.
 
     Source: Curless and Levoy 1996; blocks as in Nießner et al. 2013, sorted instead of hashed; marching cubes of Warp.
     """
     images = views if isinstance(views, DepthImages) else DepthImages.of(views, device=device)
     require_number("smallest_part", smallest_part, 0.0, 1.0)
-    require_count("max_blocks", max_blocks, 1, 2**31 // VOXELS - 1)
     width = images.footprint() if voxel is None else require_number("voxel", voxel, 1e-9, 1e9)
     with wp.ScopedDevice(images.device):
-        keys = _find_blocks(images, width, max_blocks)
-        while len(keys) > max_blocks and voxel is None:
+        keys = _find_blocks(images, width)
+        while len(keys) > MAX_BLOCKS and voxel is None:
             width *= COARSER
-            keys = _find_blocks(images, width, max_blocks)
+            keys = _find_blocks(images, width)
         if not len(keys):
             raise InvalidArrayError(
                 "depth must be seen in some view, got no pixel that counts. Check cameras, alpha and consistency."
             )
-        if len(keys) > max_blocks:
+        if len(keys) > MAX_BLOCKS:
             raise InvalidOptionError(
-                f"voxel must need at most {max_blocks} blocks of {SIDE}^3 voxels, got {voxel:g} m, which needs "
-                f"at least {len(keys)}. Choose a larger voxel, or raise max_blocks (8 kB each)."
+                f"voxel must need at most {MAX_BLOCKS} blocks of {SIDE}^3 voxels, got {voxel:g} m, which needs "
+                f"at least {len(keys)}. Choose a larger voxel."
             )
         points, faces = _extract(images, keys, width)
         points, faces = _largest_parts(points, faces, smallest_part)
@@ -103,10 +100,10 @@ def fuse_depths(
     return mesh
 
 
-def _find_blocks(images: DepthImages, voxel: float, max_blocks: int) -> wp.array:
+def _find_blocks(images: DepthImages, voxel: float) -> wp.array:
     """Return the sorted keys of all blocks within the truncation of a surface point.
 
-    Where the surface itself lies in more than ``max_blocks``, only those, since these are too many already.
+    Where the surface itself lies in more than `MAX_BLOCKS`, only those, since these are too many already.
     """
     found = []
     largest = max(camera.width * camera.height for camera in images.cameras)
@@ -116,7 +113,7 @@ def _find_blocks(images: DepthImages, voxel: float, max_blocks: int) -> wp.array
         launch_find_pixel_keys(images.pixels, images.view(index), voxel, keys, flags, images.device)
         found.append(_unique(_kept(keys, flags, count)))
     lowest = _unique(_joined(found))
-    if not len(lowest) or len(lowest) > max_blocks:
+    if not len(lowest) or len(lowest) > MAX_BLOCKS:
         return lowest
     if int(lowest[-1:].numpy()[0]) == NO_KEY:
         raise InvalidOptionError(

@@ -1,4 +1,4 @@
-"""Whether a triangle mesh is closed and manifold, where it is open, and of how many parts it is."""
+"""Topology of a triangle mesh: closed or open, manifold or not, its holes and parts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What a mesh is made of; vertices are told apart by their numbers, not by where they are.
+    """Counts of a mesh's elements and defects; vertices are told apart by their numbers, not by where they are.
 
     Attributes:
         vertices: How many.

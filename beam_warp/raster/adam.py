@@ -1,4 +1,4 @@
-"""How parameters follow their gradients: Adam over groups of arrays that share their rows."""
+"""The Adam optimiser over groups of arrays that share their rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from beam_warp.checks import require_array, require_choice, require_count, require_number, require_same_length
+from beam_warp.checks import require_array, require_choice, require_number, require_same_length
 from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -18,8 +18,6 @@ from beam_warp.kernels.raster.adam import (
     ParameterGroup,
     launch_clear_rows,
     launch_clear_steps,
-    launch_gather_rows,
-    launch_gather_steps,
     launch_step,
 )
 
@@ -29,7 +27,7 @@ MOST_FLOATS = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """One attribute of every row.
+    """One group of parameters: an attribute of every row, its gradients and its learning rate.
 
     Attributes:
         values: Moved in place: N floats, vectors or quaternions, or ``(N, K)`` floats; contiguous unless the latter.
@@ -43,7 +41,7 @@ class Parameters:
 
 
 class Adam:
-    """Adam with a learning rate for each group, that leaves rows without a gradient alone.
+    """Adam with a learning rate for each group; rows that are not visible in a step stay as they are.
 
     With every row visible this is Kingma and Ba's method. A row that is not visible in a step keeps its values, its
     moments and its count of steps, instead of drifting on by its momentum ("selective Adam"). Steps are counted row by
@@ -177,68 +175,6 @@ class Adam:
             launch_clear_rows(marks, group.means, self.device)
             launch_clear_rows(marks, group.squares, self.device)
         launch_clear_steps(marks, self._steps, self.device)
-
-    def gather(self, indices: Any, *, fresh_from: int | None = None) -> Adam:
-        """Return an optimiser of some of the rows: how rows are dropped, repeated and added.
-
-        Values, moments and counts of steps are copied, learning rates are the present ones, gradients are 0; arrays
-        are new ones, found in its ``parameters``, whose ``learning_rate`` is what this optimiser began with. Steps
-        captured in a graph stay with the old arrays.
-
-        Args:
-            indices: The row that each new row is a copy of, ``(M,)`` int32, NumPy or a warp array on the device. One
-                outside 0 … N - 1 stands for a row without a past: its values are 0, for the caller to fill in.
-            fresh_from: New rows from this one on have no moments and no steps, but the values of what they copy;
-                every row keeps them without.
-
-        Raises:
-            InvalidArrayError: ``indices`` has another type, shape or device.
-            InvalidOptionError: ``fresh_from`` is out of range.
-        """
-        if isinstance(indices, wp.array):
-            if indices.dtype is not wp.int32 or indices.ndim != 1 or indices.device != self.device:
-                raise InvalidArrayError(
-                    f"indices must be a one-dimensional warp array of int32 on {self.device}, got dtype "
-                    f"{indices.dtype.__name__}, {indices.ndim} dimensions, on {indices.device}. Convert it."
-                )
-            rows = indices
-        else:
-            rows = upload(require_array("indices", indices, (None,), np.int32), int, self.device)
-        count = rows.shape[0]
-        kept = count if fresh_from is None else require_count("fresh_from", fresh_from, 0, count)
-        parameters = {
-            name: Parameters(
-                gather_rows(group.values, rows),
-                wp.zeros((count, *group.gradients.shape[1:]), dtype=group.gradients.dtype, device=self.device),
-                group.learning_rate,
-            )
-            for name, group in self.parameters.items()
-        }
-        options = self._options
-        result = Adam(parameters, beta1=options.beta1, beta2=options.beta2, epsilon=options.epsilon)
-        wp.copy(result._rates, self._rates)
-        if not kept:  # Warp cuts no array down to nothing
-            return result
-        for old, new in zip(self._groups, result._groups, strict=True):
-            launch_gather_rows(old.means, rows[:kept], new.means[:kept], self.device)
-            launch_gather_rows(old.squares, rows[:kept], new.squares[:kept], self.device)
-        launch_gather_steps(self._steps, rows[:kept], result._steps[:kept], self.device)
-        return result
-
-
-def gather_rows(array: wp.array, indices: wp.array) -> wp.array:
-    """Return the rows of an array that ``indices`` name, in that order; an index of no row gives one of zeros.
-
-    Args:
-        array: As `Parameters.values`.
-        indices: ``(M,)`` int32 warp array on the same device.
-
-    Raises:
-        InvalidArrayError: ``array`` is not made of float32.
-    """
-    result = wp.empty((indices.shape[0], *array.shape[1:]), dtype=array.dtype, device=array.device)
-    launch_gather_rows(float_rows(array), indices, float_rows(result), array.device)
-    return result
 
 
 def _rows(name: str, array: Any, count: int, device: Any) -> wp.array:

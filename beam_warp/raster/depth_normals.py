@@ -1,4 +1,4 @@
-"""Which way the surface faces that a depth image shows, and how that changes with the depth."""
+"""Normals of depth images, and the gradients that they pass on to the depth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import warp as wp
 from beam_warp.checks import require_number
 from beam_warp.device.array_checks import device_array, require_device_array
 from beam_warp.device.arrays import resolve_device
-from beam_warp.kernels.raster.depth_normals import DepthView, launch_add_depth_gradients, launch_write_depth_normals
+from beam_warp.kernels.raster.depth_normals import (
+    DepthNormalCamera,
+    launch_add_depth_gradients,
+    launch_write_depth_normals,
+)
 from beam_warp.world.camera import Camera
 
 
@@ -50,7 +54,7 @@ class DepthNormals:
         self.camera = camera
         self.device = resolve_device(device)
         self._shape = (camera.height, camera.width)
-        view = DepthView()
+        view = DepthNormalCamera()
         view.camera_to_world = wp.mat33(camera.camera_to_world[:3, :3].astype(np.float32))
         view.focal = wp.vec2(camera.focal_x, camera.focal_y)
         view.center = wp.vec2(camera.center_x, camera.center_y)

@@ -1,10 +1,10 @@
-"""Where views, tiles, pixels and channels of images that are drawn together lie in the device's arrays."""
+"""The layout of views, tiles, pixels and channels in the arrays of images that are drawn together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beam_warp.kernels.raster.bin_tiles import TILE
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, channel_vector
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.world.camera import Camera
 
 
@@ -21,13 +21,13 @@ class ViewLayout:
     """The views of some cameras: their tiles and pixels follow one another, row by row.
 
     Attributes:
-        views: What kernels know of every camera.
+        views: The cameras, for kernels.
         first_pixels: Where each view's pixels begin, and where the last one's end, ``(C + 1,)`` int64.
         first_tiles: Where each row of tiles begins, and where the last one ends, int64.
         tile_views: Which view each tile belongs to, int32.
     """
 
-    views: list[View]
+    views: list[RasterView]
     first_pixels: NDArray[np.int64]
     first_tiles: NDArray[np.int64]
     tile_views: NDArray[np.int32]
@@ -39,7 +39,7 @@ class ViewLayout:
         tile = pixel = 0
         pixels = [0]
         for i, camera in enumerate(cameras):
-            view = View()
+            view = RasterView()
             view.world_to_camera = wp.mat33(camera.world_to_camera[:3, :3].astype(np.float32))
             view.position = wp.vec3(*camera.position)
             view.focal = wp.vec2(camera.focal_x, camera.focal_y)
@@ -55,6 +55,32 @@ class ViewLayout:
             pixel += camera.width * camera.height
             pixels.append(pixel)
         return cls(views, np.array(pixels), np.array([*rows, tile]), np.concatenate(tile_views))
+
+
+class ChannelRanges(NamedTuple):
+    """The places of colours, normals and values among the channels of a splat.
+
+    Attributes:
+        colors: The captured colour; empty for none.
+        normals: The normals of the surfaces of largest response; empty for none.
+        values: The Gaussians' own values.
+    """
+
+    colors: range
+    normals: range
+    values: range
+
+    @classmethod
+    def of(cls, *, radiance: bool, normals: bool, value_count: int) -> ChannelRanges:
+        """Lay out what is drawn: colour first, then normals, then values."""
+        colors_end = 3 * radiance
+        normals_end = colors_end + 3 * normals
+        return cls(range(colors_end), range(colors_end, normals_end), range(normals_end, normals_end + value_count))
+
+    @property
+    def count(self) -> int:
+        """Number of channels."""
+        return self.values.stop
 
 
 @dataclass(frozen=True, eq=False)

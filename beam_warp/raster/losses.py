@@ -1,4 +1,4 @@
-"""How far a picture is from what it should be, and how every pixel should change: terms of a training loss.
+"""Terms of a training loss on images, and their gradients: absolute difference, structural similarity, normals.
 
 A term belongs to one size of image and holds the buffers for it. Called, it adds its gradient to an array that other
 terms add to as well, and returns its value in an array of one element that it owns: valid until its next call. Values
@@ -29,9 +29,21 @@ from beam_warp.world.camera import MAX_PIXELS, MAX_SIDE
 
 
 class _Term:
-    """What every term has: a size, a device, what its threads add, and its value."""
+    """Size, device, buffers of a sum and value, which every term has."""
 
-    def __init__(self, height: int, width: int, channels: int, device: Any) -> None:
+    def __init__(self, height: int, width: int, channels: int = 3, *, device: Any = None) -> None:
+        """Make buffers for images of one size.
+
+        Args:
+            height: Rows.
+            width: Columns.
+            channels: Channels, C.
+            device: Warp device; the first GPU without, or the CPU where there is none.
+
+        Raises:
+            InvalidOptionError: A size is out of range.
+            DeviceError: The device is not there.
+        """
         self.shape = (
             require_count("height", height, 1, MAX_SIDE),
             require_count("width", width, 1, MAX_SIDE),
@@ -45,6 +57,11 @@ class _Term:
         self.device = resolve_device(device)
         self._value = wp.zeros(1, dtype=float, device=self.device)
         self._sums = SumBuffers(self.device)
+        self._allocate(height, width, channels)
+
+    def _allocate(self, height: int, width: int, channels: int) -> None:
+        """Allocate what the threads of the term write: one number a pixel."""
+        self._terms = wp.empty(height * width, dtype=float, device=self.device)
 
     def _input(self, name: str, value: Any) -> wp.array:
         return device_array(name, value, self.shape, self.device)
@@ -61,23 +78,7 @@ class _Term:
 
 
 class L1Loss(_Term):
-    """Mean absolute difference."""
-
-    def __init__(self, height: int, width: int, channels: int = 3, *, device: Any = None) -> None:
-        """Make buffers for images of one size, 4 bytes a pixel.
-
-        Args:
-            height: Rows.
-            width: Columns.
-            channels: Channels, C.
-            device: Warp device; the first GPU without, or the CPU where there is none.
-
-        Raises:
-            InvalidOptionError: A size is out of range.
-            DeviceError: The device is not there.
-        """
-        super().__init__(height, width, channels, device)
-        self._terms = wp.empty(height * width, dtype=float, device=self.device)
+    """Mean absolute difference. Its buffers take 4 bytes a pixel."""
 
     def __call__(
         self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
@@ -115,23 +116,13 @@ class SsimLoss(_Term):
     Windows are Gaussian, 11 x 11 pixels with a standard deviation of 1.5, and everything beyond the image is 0, as in
     3DGS (Kerbl et al. 2023): only 5 pixels and more from the border does it equal `beam_warp.image.metrics.ssim`'s map.
 
+    Channels are compared one by one. Buffers take about 12 bytes a pixel and channel.
+
     Source: Wang et al. 2004, Eq. 13.
     """
 
-    def __init__(self, height: int, width: int, channels: int = 3, *, device: Any = None) -> None:
-        """Make buffers for images of one size, about 12 bytes a pixel and channel.
-
-        Args:
-            height: Rows.
-            width: Columns.
-            channels: Channels, C; each is compared alone.
-            device: Warp device; the first GPU without, or the CPU where there is none.
-
-        Raises:
-            InvalidOptionError: A size is out of range.
-            DeviceError: The device is not there.
-        """
-        super().__init__(height, width, channels, device)
+    def _allocate(self, height: int, width: int, channels: int) -> None:
+        """Allocate a number for every strip of pixels, and three slopes for every pixel and channel."""
         self._terms = wp.empty(strip_count(height, width, channels), dtype=float, device=self.device)
         self._slopes = wp.empty((3, height, width, channels), dtype=float, device=self.device)
 
@@ -180,8 +171,7 @@ class NormalLoss(_Term):
             InvalidOptionError: A size is out of range.
             DeviceError: The device is not there.
         """
-        super().__init__(height, width, 3, device)
-        self._terms = wp.empty(height * width, dtype=float, device=self.device)
+        super().__init__(height, width, device=device)
 
     def __call__(
         self,

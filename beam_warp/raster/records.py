@@ -1,4 +1,4 @@
-"""What the rasteriser is given and what it gives: options, Gaussians, images, gradients; arrays are on a device."""
+"""Input and output of the rasteriser: options, Gaussians, images and gradients, with arrays on a device."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DepthMode = Literal["plane", "exact"]
 
 @dataclass(frozen=True)
 class RasterOptions:
-    """How splats are drawn.
+    """Options of drawing splats.
 
     Attributes:
         antialiased: Keep a splat's total opacity when the low-pass widens it. For clouds trained that way, and for
@@ -48,19 +48,19 @@ class RasterOptions:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> RasterOptions:
-        """Return how a sequence says that its Gaussians are to be drawn; the defaults where it says nothing.
+        """Return the options that a sequence states for drawing its Gaussians; the defaults where it states none.
 
         Args:
-            metadata: Of a `beam_warp.world.gaussians.GaussianSequence`.
+            metadata: The metadata of a `beam_warp.world.gaussians.GaussianSequence`.
 
         Raises:
-            InvalidOptionError: It says something else than a filter.
+            InvalidOptionError: The sequence states something else than a filter.
         """
         antialiased, low_pass = stated_raster(metadata) or UNSTATED_RASTER
         return cls(antialiased=antialiased, low_pass=low_pass)
 
     def as_metadata(self) -> dict[str, str]:
-        """Return what states that Gaussians were fitted so; near and depth are whoever draws them's to choose."""
+        """Return the metadata that states the filter that Gaussians were fitted with; near and depth are not stated."""
         return raster_metadata(self.antialiased, self.low_pass)
 
 
@@ -72,7 +72,7 @@ class GaussianArrays(NamedTuple):
         orientations: ``(N,)`` quat xyzw; normalised where they are used.
         scales: ``(N,)`` vec3 [m].
         opacities: ``(N,)`` float in [0, 1].
-        values: ``(N, K)`` float: whatever is to be composited; None for nothing.
+        values: ``(N, K)`` float, to be composited; None for nothing.
         radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B of `COEFFICIENT_COUNTS`, another one in
             every draw if need be; None for none.
     """
@@ -94,7 +94,7 @@ class RasterImages:
             8, 12 or 16, padded with zeros.
         alpha: Sum of the weights, ``(P,)`` float, at most 1 but for rounding.
         depth: Mean depth along the optical axis [m], ``(P,)``; 0 where nothing is seen.
-        median_depth: Depth of the last splat that more than half of the light passes before [m], ``(P,)``.
+        median_depth: Depth of the last splat in front of which more than half of the light still passes [m], ``(P,)``.
     """
 
     channels: tuple[wp.array, ...]

@@ -1,14 +1,18 @@
-"""Each view's images as they lie in a rasteriser's memory, for every library that reads DLPack.
+"""Each view's images: in a rasteriser's memory, for every library that reads DLPack, or copied to the host.
 
-Nothing is copied and nothing is waited for: a Warp array hands its memory over by ``__dlpack__``, and what reads it on
-a GPU is ordered behind Warp's stream. This converts only: who reads the images differentiates nothing through them.
+`view_images` copies nothing and waits for nothing: a Warp array hands its memory over by ``__dlpack__``, and what reads
+it on a GPU is ordered behind Warp's stream. This converts only: libraries that read the images differentiate nothing
+through them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from beam_warp.device.array_checks import pixel_channels
 from beam_warp.errors import InvalidOptionError
@@ -17,7 +21,7 @@ from beam_warp.raster.rasterizer import Rasterizer
 
 @dataclass(frozen=True, eq=False)
 class ViewImages:
-    """What one camera sees, as views of a rasteriser's images: the next draw overwrites them.
+    """The images of one camera in a rasteriser's memory: the next draw overwrites them.
 
     Attributes:
         channels: ``(H, W, K)`` float each, a pass of channels, K 4, 8, 12 or 16, the last padded with zeros. Compact,
@@ -58,10 +62,10 @@ class ViewImages:
 
 
 def view_images(rasterizer: Rasterizer) -> list[ViewImages]:
-    """Return what every camera of a rasteriser sees, without copying.
+    """Return the images of every camera of a rasteriser, without copying.
 
     Args:
-        rasterizer: What draws; the views stay where they are, whatever it draws next.
+        rasterizer: The rasteriser; the images stay where they are, whatever it draws next.
 
     Returns:
         One for each of its cameras, in their order. ``numpy.from_dlpack(view.alpha)``, ``torch.from_dlpack`` and
@@ -76,3 +80,29 @@ def view_images(rasterizer: Rasterizer) -> list[ViewImages]:
         passes = tuple(pixel_channels(rows[first:end], *shape, 0, rows.shape[1]) for rows in images.channels)
         views.append(ViewImages(passes, *(image[first:end].reshape(shape) for image in flat)))
     return views
+
+
+class ValueImages(NamedTuple):
+    """Images of one camera on the host: sums over what every pixel sees, weighted by visibility.
+
+    Attributes:
+        alpha: Sum of the weights, ``(H, W)`` float32; at most 1 but for rounding.
+        depth: Mean depth [m], ``(H, W)`` float32; 0 where nothing is seen.
+        median_depth: See `beam_warp.raster.gbuffer.GBuffer`.
+        gaussian_ids: See `beam_warp.raster.gbuffer.GBuffer`.
+        values: Sums of values, ``(H, W, K)`` float32.
+    """
+
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    median_depth: NDArray[np.float32]
+    gaussian_ids: NDArray[np.int32]
+    values: NDArray[np.float32]
+
+
+def host_images(view: ViewImages, channel_count: int) -> ValueImages:
+    """Bring one view's images to the host; of its channels the first ones, without padding."""
+    passes = [image.numpy() for image in view.channels]
+    values = passes[0] if len(passes) == 1 else np.concatenate(passes, axis=-1)
+    flat = (image.numpy() for image in (view.alpha, view.depth, view.median_depth, view.gaussian_ids))
+    return ValueImages(*flat, values[..., :channel_count])

@@ -16,7 +16,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_array, require_count, require_finite
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.reconstruction.silhouettes import launch_measure_silhouette
 from beam_warp.kernels.reconstruction.visual_hull import (
     BLOCK,
@@ -266,7 +266,7 @@ class _Cones:
                 f"masks must have at most {2**31 - 1} pixels in all, got {pixels}. Reduce the views."
             )
         self.records = ViewLayout.of(cameras).views
-        self.views = wp.array(self.records, dtype=View, device=device)
+        self.views = wp.array(self.records, dtype=RasterView, device=device)
         self.distances = wp.empty(pixels, dtype=float, device=device)
         for mask, record in zip(masks, self.records, strict=True):
             column_gaps, row_gaps = (wp.empty(mask.shape, dtype=float, device=device) for _ in range(2))
@@ -354,7 +354,7 @@ def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
     left = np.zeros(len(views), np.int64)
     cones.tolerance, cones.quorum = 0, len(views) - 1
     for i in range(len(views) if len(views) > 2 else 0):
-        cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=View, device=cones.device)
+        cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=RasterView, device=cones.device)
         left[i] = np.count_nonzero(cones.judge(box[0], size, count) != OUTSIDE)
     # Blocks are judged with a margin: those along one cone's side may be left without any view.
     blamed = [view.name for view, blocks in zip(views, left, strict=True) if blocks > 0.5 * left.max()]

@@ -14,7 +14,8 @@ from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import Panel, lay_out, over_background
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
-from beam_warp.raster.gbuffer import RADIANCE, SURFACE_NORMALS, rasterize
+from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud

@@ -11,7 +11,7 @@ from beam_warp.checks import require_number
 from beam_warp.device.array_checks import require_device_array
 from beam_warp.device.arrays import resolve_device, upload_vectors
 from beam_warp.errors import InvalidOptionError
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.reconstruction.sampling_limits import launch_write_sampling_limits
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.world.camera import Camera
@@ -57,7 +57,7 @@ class SamplingLimits:
         self.device = resolve_device(device)
         self.near = require_number("near", near, 1e-9, 1e9)
         self.margin = require_number("margin", margin, 0.0, 1e3)
-        self._views = wp.array(ViewLayout.of(cameras).views, dtype=View, device=self.device)
+        self._views = wp.array(ViewLayout.of(cameras).views, dtype=RasterView, device=self.device)
 
     def write(self, positions: wp.array, limits: wp.array) -> None:
         """Write sqrt(0.2) times the least depth / focal length of the views that see each Gaussian; 0 if none does.

@@ -16,7 +16,8 @@ from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileErr
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
 from beam_warp.image.metrics import SOLID_ALPHA, Score, angles_between, block_means, compare, psnr, ssim
 from beam_warp.mesh.distances import SAMPLE_COUNT, SurfaceDistances, surface_distances
-from beam_warp.raster.gbuffer import RADIANCE, SURFACE_NORMALS, GBuffer, rasterize
+from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
+from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud

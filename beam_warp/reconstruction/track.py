@@ -21,8 +21,8 @@ from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.fit import (
     FIT_RASTER,
     NO_PSNR,

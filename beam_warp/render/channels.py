@@ -15,7 +15,8 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import display_image
 from beam_warp.image.panels import BACKGROUND, over_background
-from beam_warp.raster.gbuffer import CHANNELS, RADIANCE, UNIT_CHANNELS, channel_layers, rasterize, rasterize_values
+from beam_warp.raster.channels import CHANNELS, RADIANCE, UNIT_CHANNELS, channel_layers
+from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, Observability

@@ -12,7 +12,7 @@ from beam_warp.device.arrays import upload
 from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.metrics import block_means
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_mesh import launch_blend_mesh, launch_shade_mesh
 from beam_warp.kernels.render.deferred_pixels import launch_average_samples, launch_shade_gaussians
 from beam_warp.raster.layout import ViewLayout
@@ -87,7 +87,7 @@ class DeferredFrame:
                 wp.zeros(self._count, dtype=float),
                 wp.zeros((self._count, value_count), dtype=float),
             )
-            self._views = wp.array(ViewLayout.of([camera]).views, dtype=View)
+            self._views = wp.array(ViewLayout.of([camera]).views, dtype=RasterView)
             self.samples = wp.zeros(camera.width * camera.height, dtype=wp.vec4)
             self.pixels = self.samples
             if options.samples > 1:

@@ -23,7 +23,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.device.arrays import upload
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.shadow_maps import ShadowMaps, launch_cast_mesh, launch_gather_texels
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
@@ -205,7 +205,7 @@ class ShadowDrawer:
         self._mesh_depth = wp.zeros(0, dtype=float, device=device)
         self._mesh: Any = None
         self.maps = ShadowMaps()
-        self.maps.views = wp.array(ViewLayout.of(self.cameras).views, dtype=View, device=device)
+        self.maps.views = wp.array(ViewLayout.of(self.cameras).views, dtype=RasterView, device=device)
         self.maps.texels = wp.zeros(texel_count, dtype=wp.vec4, device=device)
         self.maps.radii = wp.zeros(len(views), dtype=float, device=device)
         self.maps.fronts = wp.zeros(len(views), dtype=float, device=device)
@@ -219,7 +219,7 @@ class ShadowDrawer:
         self.cameras = [view.camera for view in views]
         for rasterizer, group in zip(self._rasterizers, self._groups, strict=True):
             rasterizer.set_cameras([self.cameras[k] for k in group])
-        self.maps.views.assign(wp.array(ViewLayout.of(self.cameras).views, dtype=View, device=self._device))
+        self.maps.views.assign(wp.array(ViewLayout.of(self.cameras).views, dtype=RasterView, device=self._device))
         self._set(views, subject)
 
     def _set(self, views: Sequence[ShadowView], subject: Subject) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from beam_warp.raster.gbuffer import ERROR_CHANNELS, rasterize
+from beam_warp.raster.channels import ERROR_CHANNELS
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions

@@ -16,9 +16,9 @@ from beam_warp.checks import require_array, require_count
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.mesh import vertex_normals

@@ -19,7 +19,7 @@ from beam_warp.checks import (
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.mesh.channels import MeshChannels, launch_trace_channels
-from beam_warp.kernels.mesh.paths import launch_trace_outgoing, launch_trace_pixels
+from beam_warp.kernels.mesh.paths import LitMesh, launch_trace_outgoing, launch_trace_pixels, lit_mesh
 from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.sampled import environment_distribution
@@ -131,9 +131,7 @@ def trace_radiance(
     rgb = wp.zeros(pixels, dtype=wp.vec3, device=mesh.device)
     alpha = wp.zeros(pixels, dtype=float, device=mesh.device)
     launch_trace_pixels(
-        mesh.surface,
-        environment_distribution(environment, mesh.device),
-        upload(specular_albedo_table(), wp.vec2, mesh.device),
+        _lit(mesh, environment),
         pixel_rays(camera),
         seed,
         sample_count,
@@ -233,9 +231,7 @@ def outgoing_radiance(
         raise InvalidArrayError("directions must have unit length, got other lengths. Normalise them.")
     out = wp.zeros(away.shape[:2], dtype=wp.vec3, device=mesh.device)
     launch_trace_outgoing(
-        mesh.surface,
-        environment_distribution(environment, mesh.device),
-        upload(specular_albedo_table(), wp.vec2, mesh.device),
+        _lit(mesh, environment),
         upload(where, int, mesh.device),
         upload(corner_weights, wp.vec3, mesh.device),
         upload(away, wp.vec3, mesh.device),
@@ -245,3 +241,9 @@ def outgoing_radiance(
         out,
     )
     return out.numpy()
+
+
+def _lit(mesh: TracedMesh, environment: EnvironmentMap) -> LitMesh:
+    """Put a mesh and its light together for kernels."""
+    distribution = environment_distribution(environment, mesh.device)
+    return lit_mesh(mesh.surface, distribution, upload(specular_albedo_table(), wp.vec2, mesh.device))

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,7 +68,7 @@ def mark_surfaces_kernel(first: int, images: SurfaceImages, least_alpha: float, 
 def gather_surfaces_kernel(
     first: int,
     images: SurfaceImages,
-    view: View,
+    view: RasterView,
     marks: wp.array[int],
     ends: wp.array[int],
     out_surfaces: PixelSurfaces,
@@ -105,7 +105,9 @@ def launch_mark_surfaces(images: Any, least_alpha: float, out_marks: Any, device
     launch(mark_surfaces_kernel, len(images.alpha), inputs=[images, least_alpha], outputs=[out_marks], device=device)
 
 
-def launch_gather_surfaces(images: Any, view: View, marks: Any, ends: Any, out_surfaces: Any, device: Any) -> None:
+def launch_gather_surfaces(
+    images: Any, view: RasterView, marks: Any, ends: Any, out_surfaces: Any, device: Any
+) -> None:
     """Write the point of every marked pixel to its row; ``ends`` are the inclusive sums of ``marks``."""
     launch(
         gather_surfaces_kernel,

@@ -8,7 +8,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.spherical_harmonics import captured_radiance, srgb_to_linear
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +43,7 @@ class CapturedPixels:
 @wp.kernel
 def write_pixels_kernel(
     first: int,
-    view: View,
+    view: RasterView,
     drawn: SurfacePixels,
     captured: CapturedPixels,
     origin: wp.vec3,
@@ -99,7 +99,7 @@ def observe_kernel(
     positions: wp.array[wp.vec3],
     radiance: wp.array2d[wp.vec3],
     display_srgb: int,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     first_view: int,
     out_colors: wp.array2d[wp.vec4],
     out_directions: wp.array2d[wp.vec3],

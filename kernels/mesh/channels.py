@@ -1,4 +1,4 @@
-"""What a pixel sees of a mesh besides light: material, normal, depth and cosine-weighted visibility."""
+"""Channels of a mesh at each pixel besides light: material, normal, depth and cosine-weighted visibility."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""How far the depth images of several views agree about the points that one of them shows.
+"""Agreement of the depth images of several views about the points that one of them shows.
 
 Another view confirms a point where it shows a surface at it, within a tolerance; it contradicts it where it looks
 through it, at something behind or at nothing; where something is in front of the point, or where the point is outside

@@ -1,4 +1,4 @@
-"""What the fusion of depth images reads of a pixel, and how a point of the world finds it.
+"""Pixels of depth images as fusion reads them, and how a point of the world finds its pixel.
 
 A pixel is three numbers: inverse depth [1/m], slope and weight. Inverse depth is linear over the image of a plane, so
 that interpolating it is exact there. Slope turns a difference of depth into a distance from the plane that the pixel

@@ -25,11 +25,18 @@ PAIRS_PER_VERTEX = wp.constant(3)
 """Pairs of random numbers at a vertex of a path: light, BRDF direction, choice of lobe."""
 
 
+@wp.struct
+class LitMesh:
+    """A mesh, the environment that lights it, and the table that its shading reads."""
+
+    surface: MeshSurface
+    environment: EnvironmentDistribution
+    albedo_table: wp.array2d[wp.vec2]  # directional albedo of the specular lobe
+
+
 @wp.func
 def path_radiance(
-    surface: MeshSurface,
-    environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[wp.vec2],
+    lit: LitMesh,
     start: SurfacePoint,
     start_view: wp.vec3,
     stream: wp.uint32,
@@ -42,14 +49,14 @@ def path_radiance(
     point = start
     view = start_view
     for bounce in range(bounce_count + 1):
-        shading = shading_of(point.normal, view, point.base_color, point.roughness, albedo_table)
+        shading = shading_of(point.normal, view, point.base_color, point.roughness, lit.albedo_table)
         frame = tangent_frame(shading.normal)
         pair = 1 + bounce * PAIRS_PER_VERTEX
 
         at = sample_pair(sample, stream, pair)
-        light = square_to_environment(environment, at[0], at[1])
+        light = square_to_environment(lit.environment, at[0], at[1])
         if light.pdf > 0.0 and wp.dot(shading.normal, light.direction) > 0.0:
-            if is_open(surface, point.origin, light.direction):
+            if is_open(lit.surface, point.origin, light.direction):
                 weight = power_heuristic(light.pdf, brdf_pdf(shading, frame, light.direction))
                 total += wp.cw_mul(
                     wp.cw_mul(throughput, brdf_cosine(shading, light.direction)), light.radiance * (weight / light.pdf)
@@ -62,14 +69,14 @@ def path_radiance(
             break
         pdf = brdf_pdf(shading, frame, direction)
         throughput = wp.cw_mul(throughput, brdf_cosine(shading, direction)) / pdf
-        hit = closest_hit(surface, point.origin, direction)
+        hit = closest_hit(lit.surface, point.origin, direction)
         if not hit.found:
-            weight = power_heuristic(pdf, square_to_environment_pdf(environment, direction))
-            total += wp.cw_mul(throughput, environment_radiance(environment, direction)) * weight
+            weight = power_heuristic(pdf, square_to_environment_pdf(lit.environment, direction))
+            total += wp.cw_mul(throughput, environment_radiance(lit.environment, direction)) * weight
             break
         if not hit.front:  # inside: a mesh that is closed shows its back only through rounding at an edge
             break
-        point = surface_point(surface, hit.face, hit.weights)
+        point = surface_point(lit.surface, hit.face, hit.weights)
         view = -direction
     return total
 
@@ -77,9 +84,7 @@ def path_radiance(
 @wp.kernel
 def trace_pixels_kernel(
     first: int,
-    surface: MeshSurface,
-    environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[wp.vec2],
+    lit: LitMesh,
     rays: PixelRays,
     seed: wp.uint32,
     sample_count: int,
@@ -93,14 +98,12 @@ def trace_pixels_kernel(
     covered = int(0)
     for sample in range(sample_count):
         direction = pixel_direction(rays, pixel, sample_pair(sample, stream, 0))
-        hit = closest_hit(surface, rays.origin, direction)
+        hit = closest_hit(lit.surface, rays.origin, direction)
         if hit.found:
             covered += 1
             if hit.front:
-                point = surface_point(surface, hit.face, hit.weights)
-                total += path_radiance(
-                    surface, environment, albedo_table, point, -direction, stream, sample, bounce_count
-                )
+                point = surface_point(lit.surface, hit.face, hit.weights)
+                total += path_radiance(lit, point, -direction, stream, sample, bounce_count)
     out_radiance[pixel] = total / float(sample_count)
     out_alpha[pixel] = float(covered) / float(sample_count)
 
@@ -108,9 +111,7 @@ def trace_pixels_kernel(
 @wp.kernel
 def trace_outgoing_kernel(
     first: int,
-    surface: MeshSurface,
-    environment: EnvironmentDistribution,
-    albedo_table: wp.array2d[wp.vec2],
+    lit: LitMesh,
     faces: wp.array[int],
     weights: wp.array[wp.vec3],
     directions: wp.array2d[wp.vec3],
@@ -122,31 +123,27 @@ def trace_outgoing_kernel(
     """A point's directions share one sample set, so that what is averaged over them is stratified as a whole."""
     index = first + wp.tid()
     stream = stream_of(seed, wp.uint32(1), wp.uint32(index))
-    point = surface_point(surface, faces[index], weights[index])
+    point = surface_point(lit.surface, faces[index], weights[index])
     for d in range(directions.shape[1]):
         total = wp.vec3(0.0)
         for sample in range(sample_count):
-            total += path_radiance(
-                surface,
-                environment,
-                albedo_table,
-                point,
-                directions[index, d],
-                stream,
-                d * sample_count + sample,
-                bounce_count,
-            )
+            total += path_radiance(lit, point, directions[index, d], stream, d * sample_count + sample, bounce_count)
         out_radiance[index, d] = total / float(sample_count)
 
 
-def launch_trace_pixels(
-    surface, environment, albedo_table, rays, seed, sample_count, bounce_count, out_radiance, out_alpha
-):
+def lit_mesh(surface, environment, albedo_table) -> LitMesh:
+    """Put together what paths read."""
+    lit = LitMesh()
+    lit.surface, lit.environment, lit.albedo_table = surface, environment, albedo_table
+    return lit
+
+
+def launch_trace_pixels(lit, rays, seed, sample_count, bounce_count, out_radiance, out_alpha):
     """Estimate premultiplied radiance and coverage of every pixel."""
     launch(
         trace_pixels_kernel,
         len(out_alpha),
-        inputs=[surface, environment, albedo_table, rays, wp.uint32(seed), sample_count, bounce_count],
+        inputs=[lit, rays, wp.uint32(seed), sample_count, bounce_count],
         outputs=[out_radiance, out_alpha],
         device=out_alpha.device,
         block_dim=64,
@@ -154,24 +151,12 @@ def launch_trace_pixels(
     )
 
 
-def launch_trace_outgoing(
-    surface, environment, albedo_table, faces, weights, directions, seed, sample_count, bounce_count, out_radiance
-):
+def launch_trace_outgoing(lit, faces, weights, directions, seed, sample_count, bounce_count, out_radiance):
     """Estimate the radiance that leaves every point in each of its directions."""
     launch(
         trace_outgoing_kernel,
         len(faces),
-        inputs=[
-            surface,
-            environment,
-            albedo_table,
-            faces,
-            weights,
-            directions,
-            wp.uint32(seed),
-            sample_count,
-            bounce_count,
-        ],
+        inputs=[lit, faces, weights, directions, wp.uint32(seed), sample_count, bounce_count],
         outputs=[out_radiance],
         device=faces.device,
         block_dim=64,

@@ -1,4 +1,4 @@
-"""How far rays go until they meet a triangle mesh."""
+"""Distances along rays to a triangle mesh."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""How far points are from a triangle mesh, and which points of a mesh cameras see."""
+"""Closest points of a triangle mesh, and the points of a mesh that cameras see."""
 
 import warp as wp
 

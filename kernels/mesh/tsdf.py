@@ -142,7 +142,7 @@ def spread_keys_kernel(first: int, keys: wp.array[wp.int64], out_keys: wp.array[
 
 @wp.kernel
 def find_neighbors_kernel(first: int, keys: wp.array[wp.int64], out_neighbors: wp.array[int]):
-    """For each block, itself and the seven above it, as a cell's corners are counted; -1 where there is none."""
+    """Find each block and the seven above it, as a cell's corners are counted; -1 where there is none."""
     i = first + wp.tid()
     key = key_of(block_of(keys[i / 8]) + corner_of(i % 8))
     place = wp.lower_bound(keys, key)

@@ -89,32 +89,6 @@ def move_parameters_kernel(
 
 
 @wp.kernel
-def gather_rows_kernel(
-    first: int,
-    rows: wp.array2d[float],
-    indices: wp.array[int],
-    out_rows: wp.array2d[float],
-):
-    item = first + wp.tid()
-    width = out_rows.shape[1]
-    index = indices[item / width]
-    value = float(0.0)
-    if index >= 0 and index < rows.shape[0]:
-        value = rows[index, item % width]
-    out_rows[item / width, item % width] = value
-
-
-@wp.kernel
-def gather_steps_kernel(first: int, steps: wp.array[int], indices: wp.array[int], out_steps: wp.array[int]):
-    item = first + wp.tid()
-    index = indices[item]
-    step = int(0)
-    if index >= 0 and index < steps.shape[0]:
-        step = steps[index]
-    out_steps[item] = step
-
-
-@wp.kernel
 def clear_rows_kernel(first: int, marks: wp.array[bool], out_rows: wp.array2d[float]):
     item = first + wp.tid()
     width = out_rows.shape[1]
@@ -154,16 +128,6 @@ def launch_step(
         outputs=[],  # through the groups
         device=device,
     )
-
-
-def launch_gather_rows(rows: Any, indices: Any, out_rows: Any, device: Any) -> None:
-    """Copy rows by index; those without one are 0."""
-    launch(gather_rows_kernel, out_rows.size, inputs=[rows, indices], outputs=[out_rows], device=device)
-
-
-def launch_gather_steps(steps: Any, indices: Any, out_steps: Any, device: Any) -> None:
-    """Copy counts by index; those without one are 0."""
-    launch(gather_steps_kernel, out_steps.size, inputs=[steps, indices], outputs=[out_steps], device=device)
 
 
 def launch_clear_rows(marks: Any, out_rows: Any, device: Any) -> None:

@@ -1,4 +1,4 @@
-"""What pixels hold, carried back to the splats that they see, for the CPU: a tile's splats one after the other.
+"""Back-projection of pixels to the splats that they see on the CPU: a tile's splats one after the other.
 
 A pair of tile and splat gets the sum over the tile's pixels of blending weight times what they hold: the transpose of
 `composite_cpu`, with its weights.
@@ -9,8 +9,8 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
-from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
+from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_pixels
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
 
@@ -22,12 +22,12 @@ def back_project_cpu_kernel(channel_count: int):
 
     @wp.kernel(enable_backward=False, module="unique")
     def back_project_tiles_kernel(
-        first: int, frame: Frame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
+        first: int, frame: RasterFrame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
     ):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        box = tile_box(view, tile)
+        box = tile_pixels(view, tile)
         listed_range = frame.lists.ranges[listed]
         if listed_range[0] == listed_range[1]:
             return

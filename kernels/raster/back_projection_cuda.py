@@ -1,4 +1,4 @@
-"""What pixels hold, carried back to the splats that they see, for CUDA: a tile a block, two pixels a lane.
+"""Back-projection of pixels to the splats that they see on CUDA: a tile a block, two pixels a lane.
 
 A pair of tile and splat gets the sum over the tile's pixels of blending weight times what they hold: the transpose of
 `composite_cuda`, with its weights. The work is shared out as in `composite_adjoint_cuda`, but front to back. No
@@ -24,7 +24,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
 from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
@@ -40,7 +40,7 @@ def back_project_cuda_kernel(channel_count: int):
 
     @wp.kernel(enable_backward=False, module="unique")
     def back_project_blocks_kernel(
-        first: int, frame: Frame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
+        first: int, frame: RasterFrame, images: Images, pixels: wp.array[Channels], out_pairs: wp.array[Channels]
     ):
         item = first + wp.tid()
         thread = item % THREADS

@@ -1,4 +1,4 @@
-"""Which splats each tile draws, in depth order: count, emit, sort, find ranges.
+"""Lists of the splats that each tile draws, in depth order: count, emit, sort, find ranges.
 
 Splats are sorted by depth once; their (tile, splat) pairs are emitted in that order and sorted by tile alone with a
 stable sort, which costs half of one sort by (tile, depth) and gives the same order (Schütz et al. 2025, Splatshop).
@@ -14,7 +14,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.project import Splats, View
+from beam_warp.kernels.raster.project import RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
     RELATIVE_MARGIN,
@@ -53,8 +53,26 @@ class TileLists:
     slots: wp.array[int]  # where each pair was emitted
 
 
+@wp.struct
+class SplatOrder:
+    """All splats of all views, nearest first, and how many pairs of a band each one has."""
+
+    splats: wp.array[int]
+    counts: wp.array[int]
+    ends: wp.array[int]  # end of each splat's pairs among those of the band
+
+
+@wp.struct
+class PairList:
+    """The (tile, splat) pairs of a band: emitted splat by splat, then sorted by tile."""
+
+    tiles: wp.array[int]  # counted from the band's first; sorted together with ``slots``
+    slots: wp.array[int]  # where each pair was emitted
+    owners: wp.array[int]  # the splat of the pair that was emitted at each slot
+
+
 @wp.func
-def tile_box(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec4i:
+def tile_box(center: wp.vec4, shape: wp.vec4, view: RasterView, band: Band) -> wp.vec4i:
     """First column, first row, end column and end row of the tiles of a band that a splat's box reaches."""
     if not (center[2] > -wp.inf):
         return wp.vec4i(0, 0, 0, 0)
@@ -74,7 +92,7 @@ def tile_box(center: wp.vec4, shape: wp.vec4, view: View, band: Band) -> wp.vec4
 
 
 @wp.func
-def tile_columns(center: wp.vec4, shape: wp.vec4, view: View, box: wp.vec4i, row: int) -> wp.vec2i:
+def tile_columns(center: wp.vec4, shape: wp.vec4, view: RasterView, box: wp.vec4i, row: int) -> wp.vec2i:
     """First and end column of the tiles of a row that a splat's ellipse reaches.
 
     Where the box is one tile wide or high, an ellipse, which touches all its sides, reaches all of it.
@@ -107,7 +125,7 @@ def count_pairs_kernel(
     first: int,
     order: wp.array[int],
     splats: Splats,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     gaussian_count: int,
     band: Band,
     out_counts: wp.array[int],
@@ -128,25 +146,21 @@ def count_pairs_kernel(
 @wp.kernel
 def emit_pairs_kernel(
     first: int,
-    order: wp.array[int],
-    counts: wp.array[int],
-    ends: wp.array[int],
+    order: SplatOrder,
     splats: Splats,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     gaussian_count: int,
     band: Band,
-    out_tiles: wp.array[int],
-    out_slots: wp.array[int],
-    out_owners: wp.array[int],
+    out_pairs: PairList,
 ):
     """Ends beyond the range of integers come out negative: such pairs, like those beyond the capacity, are left out."""
     place = first + wp.tid()
-    count = counts[place]
+    count = order.counts[place]
     if count <= 0:
         return
-    end = wp.min(ends[place], out_owners.shape[0])
-    slot = ends[place] - count
-    splat = order[place]
+    end = wp.min(order.ends[place], out_pairs.owners.shape[0])
+    slot = order.ends[place] - count
+    splat = order.splats[place]
     center = load_row(splats.centers, splat)
     shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
@@ -155,30 +169,28 @@ def emit_pairs_kernel(
         columns = tile_columns(center, shape, view, box, row)
         for column in range(columns[0], columns[1]):
             if slot >= 0 and slot < end:
-                out_tiles[slot] = view.first_tile - band.first_tile + row * view.columns + column
-                out_slots[slot] = slot
-                out_owners[slot] = splat
+                out_pairs.tiles[slot] = view.first_tile - band.first_tile + row * view.columns + column
+                out_pairs.slots[slot] = slot
+                out_pairs.owners[slot] = splat
                 slot += 1
 
 
 @wp.kernel
 def find_ranges_kernel(
     first: int,
-    tiles: wp.array[int],
-    slots: wp.array[int],
-    owners: wp.array[int],
+    pairs: PairList,
     tile_count: int,
     out_splats: wp.array[int],
     out_ranges: wp.array[wp.vec2i],
 ):
     i = first + wp.tid()
-    tile = tiles[i]
+    tile = pairs.tiles[i]
     if tile >= tile_count:  # room that no pair took
         return
-    out_splats[i] = owners[slots[i]]
-    if i == 0 or tiles[i - 1] != tile:
+    out_splats[i] = pairs.owners[pairs.slots[i]]
+    if i == 0 or pairs.tiles[i - 1] != tile:
         out_ranges[tile][0] = i
-    if i == owners.shape[0] - 1 or tiles[i + 1] != tile:
+    if i == pairs.owners.shape[0] - 1 or pairs.tiles[i + 1] != tile:
         out_ranges[tile][1] = i + 1
 
 
@@ -198,23 +210,23 @@ def launch_count_pairs(order, splats, views, gaussian_count, band, counts, devic
     )
 
 
-def launch_emit_pairs(order, counts, ends, splats, views, gaussian_count, band, tiles, slots, owners, device):
+def launch_emit_pairs(order, splats, views, gaussian_count, band, out_pairs, device):
     """Write the tile, slot and splat of every pair, in depth order."""
     launch(
         emit_pairs_kernel,
         len(splats.centers),
-        inputs=[order, counts, ends, splats, views, gaussian_count, band],
-        outputs=[tiles, slots, owners],
+        inputs=[order, splats, views, gaussian_count, band],
+        outputs=[out_pairs],
         device=device,
     )
 
 
-def launch_find_ranges(tiles, slots, owners, tile_count, lists, device):
+def launch_find_ranges(pairs, tile_count, lists, device):
     """Write each tile's range among the sorted pairs, and the pairs' splats."""
     launch(
         find_ranges_kernel,
-        len(owners),
-        inputs=[tiles, slots, owners, tile_count],
+        len(pairs.owners),
+        inputs=[pairs, tile_count],
         outputs=[lists.splats, lists.ranges],
         device=device,
     )

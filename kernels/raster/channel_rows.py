@@ -1,4 +1,4 @@
-"""What splats carry: a row of channels each, gathered from their Gaussians, and the way back for gradients.
+"""Rows of channels, one a splat, gathered from the Gaussians, and the way back for gradients.
 
 Channels are, in this order: the Gaussian's captured colour towards the view's camera, the normal of its geometry, and
 its own values; each block may be missing. Rows are cut into passes of at most 16.
@@ -8,12 +8,12 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
 from beam_warp.kernels.common.spherical_harmonics import seen_color
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 
 @wp.struct
 class ChannelBlocks:
-    """Where the channels of a splat come from."""
+    """Sources of the channels of a splat."""
 
     values: wp.array2d[float]  # of each Gaussian, any number
     colors: wp.array[wp.vec3]  # of each splat, or none
@@ -25,7 +25,7 @@ def evaluate_colors_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     radiance: wp.array2d[wp.vec3],
-    views: wp.array[View],
+    views: wp.array[RasterView],
     out_colors: wp.array[wp.vec3],
 ):
     """Colour of every Gaussian towards every view's camera. The module has an adjoint, which Warp makes."""

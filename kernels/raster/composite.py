@@ -1,4 +1,4 @@
-"""What each pixel shows: its tile's splats, front to back. One thread a pixel: the readable form, on CPU and CUDA.
+"""Compositing a tile's splats at each pixel, front to back. One thread a pixel: the readable form, on CPU and CUDA.
 
 `composite_cpu` and `composite_cuda` do the same sums in the same order, faster. Channels come as rows of a vector whose
 length is fixed at compile time: four lengths and two modes of depth make eight small modules.
@@ -10,7 +10,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE, Band, TileLists
-from beam_warp.kernels.raster.project import LOG_CUT, Splats, View
+from beam_warp.kernels.raster.project import LOG_CUT, RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
@@ -26,12 +26,12 @@ CHANNEL_COUNTS = (4, 8, 12, 16)
 
 
 @wp.struct
-class Frame:
-    """What is drawn: splats, the lists of tiles, and the views they are seen from."""
+class RasterFrame:
+    """Input of compositing: splats, the lists of tiles, and the views they are seen from."""
 
     splats: Splats
     lists: TileLists
-    views: wp.array[View]
+    views: wp.array[RasterView]
     tile_views: wp.array[int]  # which view each tile belongs to
     band: Band
     gaussian_count: int
@@ -40,7 +40,7 @@ class Frame:
 
 @wp.struct
 class Images:
-    """What pixels see besides channels, view by view and row by row; depths in metres along the optical axis."""
+    """Images besides channels, view by view and row by row; depths in metres along the optical axis."""
 
     alpha: wp.array[float]  # sum of the weights
     transmittance: wp.array[float]  # what passes all
@@ -54,14 +54,14 @@ class Images:
 
 @wp.struct
 class PixelPlace:
-    """Where a pixel is in its view and in the images; ``index`` -1 for outside."""
+    """Place of a pixel in its view and in the images; ``index`` is -1 outside."""
 
     index: int
     position: wp.vec2
 
 
 @wp.func
-def pixel_place(view: View, tile: int, within: int) -> PixelPlace:
+def pixel_place(view: RasterView, tile: int, within: int) -> PixelPlace:
     """Place of a tile's pixel, counted row by row."""
     local = tile - view.first_tile
     x = (local % view.columns) * SIDE + within % SIDE
@@ -88,7 +88,11 @@ def composite_kernel(channel_count: int, exact: bool):
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_pixels_kernel(
-        first: int, frame: Frame, channels: wp.array[Channels], out_channels: wp.array[Channels], out_images: Images
+        first: int,
+        frame: RasterFrame,
+        channels: wp.array[Channels],
+        out_channels: wp.array[Channels],
+        out_images: Images,
     ):
         # Items go tile by tile, so that neighbours walk the same list.
         item = first + wp.tid()

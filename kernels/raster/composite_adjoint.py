@@ -1,4 +1,4 @@
-"""How pixels change with the splats that they see: one splat at one pixel.
+"""The adjoint of compositing: one splat at one pixel.
 
 With f_k a splat's channels, z_k its depth, T_k what passes before it and w_k = alpha_k T_k, a loss that is linear in
 the sums has s_k = f_k . v_f + z_k v_z + v_a, and back to front (Kerbl et al. 2023, Section 6)
@@ -21,6 +21,8 @@ from beam_warp.kernels.raster.composite import Images, channel_vector
 from beam_warp.kernels.raster.splat_rows import (
     ALPHA_CAP,
     SMALLEST_FACING,
+    Sight,
+    SplatRow,
     bend_at,
     depth_function,
     facing_at,
@@ -52,6 +54,15 @@ class Adjoints:
     alpha: wp.array[float]
     depth: wp.array[float]
     median_depth: wp.array[float]
+
+
+@wp.struct
+class PixelState:
+    """State of a pixel on the way through its splats, back to front."""
+
+    transmittance: float  # what passes before the splats still to come
+    behind: float  # the sum R of those behind them
+    adjoint: wp.vec3  # derivatives to the sums of weights and of weighted depths, and to the median depth
 
 
 @wp.func
@@ -106,8 +117,8 @@ def depth_adjoint_function(exact: bool):
 def add_pixel_function(channel_count: int, exact: bool):
     """Return the function that adds one pixel's part to a pair's moments and channels.
 
-    It takes the pixel's state, what passes before the splats still to come and the sum R of those behind them, and
-    gives both as they are in front of this splat. A splat that the pixel does not see has an alpha of 0.
+    The state that it returns is the pixel's in front of this splat. A splat that the pixel does not see has an alpha
+    of 0.
     """
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
@@ -118,29 +129,25 @@ def add_pixel_function(channel_count: int, exact: bool):
     @wp.func
     def add_pixel(
         total: Pair,
-        transmittance: float,
-        behind: float,
+        state: PixelState,
+        to_channels: Channels,
+        splat: SplatRow,
+        row: Channels,
+        near: float,
+        sight: Sight,
         alpha: float,
         is_median: bool,
-        adjoint: wp.vec3,
-        to_channels: Channels,
-        center: wp.vec4,
-        shape: wp.vec4,
-        slope: wp.vec4,
-        bend: float,
-        near: float,
-        offset: wp.vec2,
-        e: wp.vec2,
-        row: Channels,
     ):
+        adjoint = state.adjoint
+        e = sight.e
         open_share = 1.0 - alpha
-        before = quick_divide(transmittance, open_share)
+        before = quick_divide(state.transmittance, open_share)
         weight = alpha * before
-        z = depth_at(center, shape, slope, bend, near, offset)
+        z = depth_at(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset)
         s = wp.dot(row, to_channels) + z * adjoint[1] + adjoint[0]
-        d = wp.where(alpha < ALPHA_CAP, alpha * (before * s - quick_divide(behind, open_share)), 0.0)
+        d = wp.where(alpha < ALPHA_CAP, alpha * (before * s - quick_divide(state.behind, open_share)), 0.0)
         to_depth = weight * adjoint[1] + wp.where(is_median, adjoint[2], 0.0)
-        depth = depth_adjoint(center, shape, slope, bend, near, offset, z, to_depth)
+        depth = depth_adjoint(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset, z, to_depth)
         d0 = d * e[0]
         d1 = d * e[1]
         total[0] = total[0] + d
@@ -164,6 +171,10 @@ def add_pixel_function(channel_count: int, exact: bool):
             total[wp.static(bend_start + 2)] = total[wp.static(bend_start + 2)] + b0 * e[0]
             total[wp.static(bend_start + 3)] = total[wp.static(bend_start + 3)] + b0 * e[1]
             total[wp.static(bend_start + 4)] = total[wp.static(bend_start + 4)] + b1 * e[1]
-        return total, before, behind + weight * s
+        nearer = PixelState()
+        nearer.transmittance = before
+        nearer.behind = state.behind + weight * s
+        nearer.adjoint = adjoint
+        return total, nearer
 
     return add_pixel

@@ -1,20 +1,21 @@
-"""How pixels change with the splats that they see, for the CPU: a tile's splats back to front, on their pixels."""
+"""The adjoint of compositing on the CPU: a tile's splats back to front, each on the pixels that it reaches."""
 
 from functools import cache
 
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
+    PixelState,
     add_pixel_function,
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_box
+from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_pixels
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
+from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, row_reach, sight_of, squared_extent
 
 
 @cache
@@ -27,7 +28,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_adjoint_kernel(
         first: int,
-        frame: Frame,
+        frame: RasterFrame,
         channels: wp.array[Channels],
         images: Images,
         channel_adjoints: wp.array[Channels],
@@ -39,7 +40,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        box = tile_box(view, tile)
+        box = tile_pixels(view, tile)
         listed_range = frame.lists.ranges[listed]
         end = listed_range[0]
         for y in range(box[1], box[3]):
@@ -53,48 +54,45 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         for back in range(end - listed_range[0]):
             k = end - 1 - back
             splat = frame.lists.splats[k]
-            center = frame.splats.centers[splat]
-            shape = frame.splats.shapes[splat]
-            slope = frame.splats.slopes[splat]
-            bend = frame.splats.bends[splat]
+            drawn = SplatRow()
+            drawn.center = frame.splats.centers[splat]
+            drawn.shape = frame.splats.shapes[splat]
+            drawn.slope = frame.splats.slopes[splat]
+            drawn.bend = frame.splats.bends[splat]
             row = channels[splat]
             total = Pair()
-            rows = rows_in(box, center, shape)
-            reach = row_reach(shape, squared_extent(center[2]))
+            rows = rows_in(box, drawn.center, drawn.shape)
+            reach = row_reach(drawn.shape, squared_extent(drawn.center[2]))
             for y in range(rows[0], rows[1]):
-                columns = columns_in(box, center, reach, y)
+                columns = columns_in(box, drawn.center, reach, y)
                 for x in range(columns[0], columns[1]):
                     pixel = view.first_pixel + y * view.width + x
                     if k >= images.ends[pixel]:
                         continue
-                    offset = offset_from(center, wp.vec2(float(x) + 0.5, float(y) + 0.5))
-                    e = whiten(shape, offset)
-                    log_alpha = log_alpha_of(center, e)
-                    if not (log_alpha >= -LOG_CUT):
+                    sight = sight_of(drawn.center, drawn.shape, wp.vec2(float(x) + 0.5, float(y) + 0.5))
+                    if not (sight.log_alpha >= -LOG_CUT):
                         continue
-                    state = images.states[pixel]
+                    known = images.states[pixel]
                     is_median = k == images.medians[pixel]
                     to_median = float(0.0)
                     if is_median and adjoints.median_depth.shape[0] > 0:
                         to_median = adjoints.median_depth[pixel]
-                    total, before, behind = add_pixel(
+                    state = PixelState()
+                    state.transmittance = known[0]
+                    state.behind = known[1]
+                    state.adjoint = wp.vec3(known[2], known[3], to_median)
+                    total, nearer = add_pixel(
                         total,
-                        state[0],
-                        state[1],
-                        alpha_of(log_alpha),
-                        is_median,
-                        wp.vec3(state[2], state[3], to_median),
+                        state,
                         channel_adjoints[pixel],
-                        center,
-                        shape,
-                        slope,
-                        bend,
-                        frame.near,
-                        offset,
-                        e,
+                        drawn,
                         row,
+                        frame.near,
+                        sight,
+                        alpha_of(sight.log_alpha),
+                        is_median,
                     )
-                    images.states[pixel] = wp.vec4(before, behind, state[2], state[3])
+                    images.states[pixel] = wp.vec4(nearer.transmittance, nearer.behind, known[2], known[3])
             out_pairs[frame.lists.slots[k]] = total
 
     return composite_tiles_adjoint_kernel

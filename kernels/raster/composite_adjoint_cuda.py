@@ -1,4 +1,4 @@
-"""How pixels change with the splats that they see, for CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
+"""The adjoint of compositing on CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
 
 The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
 pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
@@ -25,9 +25,10 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
+    PixelState,
     add_pixel_function,
     pair_length,
     pair_vector,
@@ -35,7 +36,7 @@ from beam_warp.kernels.raster.composite_adjoint import (
 )
 from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, sight_of
 
 PART = wp.constant(8)
 """Side of the pixels of a warp."""
@@ -46,6 +47,56 @@ WARPS = 4
 THREADS = wp.constant(32 * WARPS)
 
 
+@wp.struct
+class OwnPixel:
+    """One of the pixels of a lane; outside the image nothing is seen in it."""
+
+    index: int  # -1 for outside
+    position: wp.vec2
+    end: int  # end of what it looked at, in the lists
+    median: int  # place of the median's splat in the lists
+    state: PixelState
+
+
+@wp.func
+def own_pixel(place: PixelPlace, images: Images, adjoints: Adjoints) -> OwnPixel:
+    """The pixel before its splats are gone through."""
+    pixel = OwnPixel()
+    pixel.index = place.index
+    pixel.position = place.position
+    pixel.end = -1
+    pixel.median = -1
+    if place.index >= 0:
+        pixel.end = images.ends[place.index]
+        pixel.median = images.medians[place.index]
+        pixel.state.adjoint = pixel_adjoint(images, adjoints, place.index)
+        pixel.state.transmittance = images.transmittance[place.index]
+    return pixel
+
+
+@cache
+def share_splat_function(channel_count: int, exact: bool):
+    """Return the function that brings a splat to shared memory, a part of it by each warp."""
+    Channels = channel_vector(channel_count)
+    share_row = share_row_function(4 if exact else 3, 1)
+    share_channels = share_channels_function(Channels, 1)
+
+    @wp.func
+    def share_splat(part: int, lane: int, frame: RasterFrame, channels: wp.array[Channels], splat: int):
+        if part == 0:
+            share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
+        if part == 1:
+            share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
+        if part == 2:
+            share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+        if part == 3:
+            share_channels(1, lane, channels, splat)
+            if wp.static(exact):
+                share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+
+    return share_splat
+
+
 @cache
 def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     """Return the kernel that writes the moments and channels of every pair, a block a tile."""
@@ -54,12 +105,13 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     add_pixel = add_pixel_function(channel_count, exact)
     share_row = share_row_function(4 if exact else 3, 1)
     share_channels = share_channels_function(Channels, 1)
+    share_splat = share_splat_function(channel_count, exact)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_blocks_adjoint_kernel(
         first: int,
-        frame: Frame,
+        frame: RasterFrame,
         channels: wp.array[Channels],
         images: Images,
         channel_adjoints: wp.array[Channels],
@@ -77,33 +129,17 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         corner = (part / 2) * PART * SIDE + (part % 2) * PART
         box = pixel_place(view, tile, corner)
         own = corner + (lane / PART) * SIDE + lane % PART
-        upper = pixel_place(view, tile, own)
-        lower = pixel_place(view, tile, own + SIDE * PART / 2)
-        upper_end = int(-1)
-        lower_end = int(-1)
-        upper_median = int(-1)
-        lower_median = int(-1)
-        upper_adjoint = wp.vec3(0.0, 0.0, 0.0)
-        lower_adjoint = wp.vec3(0.0, 0.0, 0.0)
+        upper = own_pixel(pixel_place(view, tile, own), images, adjoints)
+        lower = own_pixel(pixel_place(view, tile, own + SIDE * PART / 2), images, adjoints)
+        upper_state = upper.state
+        lower_state = lower.state
         to_upper = Channels()
         to_lower = Channels()
-        upper_transmittance = float(0.0)
-        lower_transmittance = float(0.0)
-        upper_behind = float(0.0)
-        lower_behind = float(0.0)
         if upper.index >= 0:
-            upper_end = images.ends[upper.index]
-            upper_median = images.medians[upper.index]
-            upper_adjoint = pixel_adjoint(images, adjoints, upper.index)
             to_upper = channel_adjoints[upper.index]
-            upper_transmittance = images.transmittance[upper.index]
         if lower.index >= 0:
-            lower_end = images.ends[lower.index]
-            lower_median = images.medians[lower.index]
-            lower_adjoint = pixel_adjoint(images, adjoints, lower.index)
             to_lower = channel_adjoints[lower.index]
-            lower_transmittance = images.transmittance[lower.index]
-        own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
+        own_end = greatest_of_lanes(wp.max(upper.end, lower.end))
         end = greatest_of_block(own_end)
         for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
             out_pairs[frame.lists.slots[k]] = Pair()
@@ -114,16 +150,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             if mine >= listed_range[0]:
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
-                if part == 0:
-                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
-                if part == 1:
-                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
-                if part == 2:
-                    share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
-                if part == 3:
-                    share_channels(1, lane, channels, splat)
-                    if wp.static(exact):
-                        share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+                share_splat(part, lane, frame, channels, splat)
             sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
             wait_for_block()
             wanted = int(0)
@@ -140,57 +167,27 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 i = lowest_lane(waiting)
                 waiting = waiting & (waiting - 1)
                 k = end - 1 - i
-                center = share_row(0, CENTER, i, wp.vec4())
-                shape = share_row(0, SHAPE, i, wp.vec4())
-                upper_offset = offset_from(center, upper.position)
-                lower_offset = offset_from(center, lower.position)
-                upper_e = whiten(shape, upper_offset)
-                lower_e = whiten(shape, lower_offset)
-                upper_log_alpha = log_alpha_of(center, upper_e)
-                lower_log_alpha = log_alpha_of(center, lower_e)
-                in_upper = k < upper_end and upper_log_alpha >= -LOG_CUT
-                in_lower = k < lower_end and lower_log_alpha >= -LOG_CUT
+                drawn = SplatRow()
+                drawn.center = share_row(0, CENTER, i, wp.vec4())
+                drawn.shape = share_row(0, SHAPE, i, wp.vec4())
+                above = sight_of(drawn.center, drawn.shape, upper.position)
+                below = sight_of(drawn.center, drawn.shape, lower.position)
+                in_upper = k < upper.end and above.log_alpha >= -LOG_CUT
+                in_lower = k < lower.end and below.log_alpha >= -LOG_CUT
                 if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
                     continue
-                slope = share_row(0, SLOPE, i, wp.vec4())
-                bend = float(0.0)
+                drawn.slope = share_row(0, SLOPE, i, wp.vec4())
                 if wp.static(exact):
-                    bend = share_row(0, BEND, i, wp.vec4())[0]
+                    drawn.bend = share_row(0, BEND, i, wp.vec4())[0]
                 row = share_channels(0, i, channels, 0)
                 total = Pair()
-                total, upper_transmittance, upper_behind = add_pixel(
-                    total,
-                    upper_transmittance,
-                    upper_behind,
-                    wp.where(in_upper, alpha_of(upper_log_alpha), 0.0),
-                    k == upper_median,
-                    upper_adjoint,
-                    to_upper,
-                    center,
-                    shape,
-                    slope,
-                    bend,
-                    frame.near,
-                    upper_offset,
-                    upper_e,
-                    row,
+                upper_alpha = wp.where(in_upper, alpha_of(above.log_alpha), 0.0)
+                lower_alpha = wp.where(in_lower, alpha_of(below.log_alpha), 0.0)
+                total, upper_state = add_pixel(
+                    total, upper_state, to_upper, drawn, row, frame.near, above, upper_alpha, k == upper.median
                 )
-                total, lower_transmittance, lower_behind = add_pixel(
-                    total,
-                    lower_transmittance,
-                    lower_behind,
-                    wp.where(in_lower, alpha_of(lower_log_alpha), 0.0),
-                    k == lower_median,
-                    lower_adjoint,
-                    to_lower,
-                    center,
-                    shape,
-                    slope,
-                    bend,
-                    frame.near,
-                    lower_offset,
-                    lower_e,
-                    row,
+                total, lower_state = add_pixel(
+                    total, lower_state, to_lower, drawn, row, frame.near, below, lower_alpha, k == lower.median
                 )
                 sum_block(ADD_TO_SUMS, i, total, out_pairs)
             wait_for_block()

@@ -1,4 +1,4 @@
-"""What each pixel shows, for the CPU: a tile's splats one after the other, each on the pixels that it reaches.
+"""Compositing on the CPU: a tile's splats one after the other, each on the pixels that it reaches.
 
 A pixel is visited only by splats whose alpha there is at least 1/255 or nearly so, by the interval of each row. What is
 known of it lies in one row of memory: a tile is in the cache while its splats are drawn.
@@ -10,8 +10,8 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector
-from beam_warp.kernels.raster.project import LOG_CUT, View
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
+from beam_warp.kernels.raster.project import LOG_CUT, RasterView
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     TRANSMITTANCE_STOP,
@@ -34,7 +34,7 @@ MIN_TILES = 4
 
 
 @wp.func
-def tile_box(view: View, tile: int) -> wp.vec4i:
+def tile_pixels(view: RasterView, tile: int) -> wp.vec4i:
     """First x, first y, end x and end y of a tile's pixels."""
     local = tile - view.first_tile
     x = (local % view.columns) * SIDE
@@ -68,12 +68,16 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_tiles_kernel(
-        first: int, frame: Frame, channels: wp.array[Channels], out_channels: wp.array[Channels], out_images: Images
+        first: int,
+        frame: RasterFrame,
+        channels: wp.array[Channels],
+        out_channels: wp.array[Channels],
+        out_images: Images,
     ):
         listed = first + wp.tid()
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        box = tile_box(view, tile)
+        box = tile_pixels(view, tile)
         listed_range = frame.lists.ranges[listed]
         # A pixel's state: what passes, the sums of weights and of weighted depths, the median depth.
         for y in range(box[1], box[3]):

@@ -1,4 +1,4 @@
-"""What each pixel shows, for CUDA: 8 x 4 pixels a warp, a lane for each.
+"""Compositing on CUDA: 8 x 4 pixels a warp, a lane for each.
 
 The lanes look at 32 splats of the tile's list at once, a lane for each: which of them reach the warp's pixels? Those go
 to shared memory, and the warp composites them one after the other on all its pixels. It is done when all pixels are.
@@ -18,7 +18,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Frame, Images, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
@@ -70,7 +70,11 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
 
     @wp.kernel(enable_backward=False, module="unique")
     def composite_warps_kernel(
-        first: int, frame: Frame, channels: wp.array[Channels], out_channels: wp.array[Channels], out_images: Images
+        first: int,
+        frame: RasterFrame,
+        channels: wp.array[Channels],
+        out_channels: wp.array[Channels],
+        out_images: Images,
     ):
         item = first + wp.tid()
         lane = item % LANES

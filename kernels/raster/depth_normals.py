@@ -23,7 +23,7 @@ LEAST_DEPTH = wp.constant(1.0e-6)
 
 
 @wp.struct
-class DepthView:
+class DepthNormalCamera:
     """A camera, and which of its pixels have a normal."""
 
     camera_to_world: wp.mat33
@@ -34,7 +34,7 @@ class DepthView:
 
 
 @wp.func
-def is_covered(depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthView, y: int, x: int) -> bool:
+def is_covered(depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthNormalCamera, y: int, x: int) -> bool:
     """Whether a pixel shows a surface; guards are such that NaN fails them."""
     z = depth[y, x]
     return alpha[y, x] > view.minimum_alpha and z > LEAST_DEPTH and z < wp.inf
@@ -42,7 +42,7 @@ def is_covered(depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthVi
 
 @wp.func
 def is_near(
-    depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthView, y: int, x: int, center_depth: float
+    depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthNormalCamera, y: int, x: int, center_depth: float
 ) -> bool:
     """Whether a pixel continues the surface of the pixel beside it."""
     step = wp.abs(depth[y, x] - center_depth)
@@ -50,7 +50,7 @@ def is_near(
 
 
 @wp.func
-def has_normal(depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthView, y: int, x: int) -> bool:
+def has_normal(depth: wp.array2d[float], alpha: wp.array2d[float], view: DepthNormalCamera, y: int, x: int) -> bool:
     """Whether the five pixels of the stencil are inside the image and on one surface."""
     if x < 1 or y < 1 or x + 1 >= depth.shape[1] or y + 1 >= depth.shape[0]:
         return False
@@ -67,7 +67,7 @@ def slope(near: float, far: float) -> float:
 
 
 @wp.func
-def surface_slopes(depth: wp.array2d[float], view: DepthView, y: int, x: int) -> wp.vec2:
+def surface_slopes(depth: wp.array2d[float], view: DepthNormalCamera, y: int, x: int) -> wp.vec2:
     """p and q of the module's formula."""
     return wp.vec2(
         view.focal[0] * slope(depth[y, x - 1], depth[y, x + 1]),
@@ -76,7 +76,7 @@ def surface_slopes(depth: wp.array2d[float], view: DepthView, y: int, x: int) ->
 
 
 @wp.func
-def pixel_tangents(view: DepthView, y: int, x: int) -> wp.vec2:
+def pixel_tangents(view: DepthNormalCamera, y: int, x: int) -> wp.vec2:
     """u and v of a pixel's centre."""
     return wp.vec2(
         (float(x) + 0.5 - view.center[0]) / view.focal[0],
@@ -95,7 +95,7 @@ def write_depth_normals_kernel(
     first: int,
     depth: wp.array2d[float],
     alpha: wp.array2d[float],
-    view: DepthView,
+    view: DepthNormalCamera,
     out_normals: wp.array3d[float],
 ):
     pixel = first + wp.tid()
@@ -111,7 +111,7 @@ def write_depth_normals_kernel(
 
 @wp.func
 def slope_gradients(
-    depth: wp.array2d[float], view: DepthView, normal_gradients: wp.array3d[float], y: int, x: int
+    depth: wp.array2d[float], view: DepthNormalCamera, normal_gradients: wp.array3d[float], y: int, x: int
 ) -> wp.vec2:
     """Gradient with respect to p and q of the normal of a pixel that has one."""
     tangents = pixel_tangents(view, y, x)
@@ -129,7 +129,7 @@ def slope_gradients(
 def depth_share(
     depth: wp.array2d[float],
     alpha: wp.array2d[float],
-    view: DepthView,
+    view: DepthNormalCamera,
     normal_gradients: wp.array3d[float],
     y: int,
     x: int,
@@ -154,7 +154,7 @@ def add_depth_gradients_kernel(
     first: int,
     depth: wp.array2d[float],
     alpha: wp.array2d[float],
-    view: DepthView,
+    view: DepthNormalCamera,
     normal_gradients: wp.array3d[float],
     out_depth_gradients: wp.array2d[float],
 ):
@@ -169,13 +169,13 @@ def add_depth_gradients_kernel(
     out_depth_gradients[y, x] += total
 
 
-def launch_write_depth_normals(depth: Any, alpha: Any, view: DepthView, out_normals: Any, device: Any) -> None:
+def launch_write_depth_normals(depth: Any, alpha: Any, view: DepthNormalCamera, out_normals: Any, device: Any) -> None:
     """Write the normals of every pixel."""
     launch(write_depth_normals_kernel, depth.size, inputs=[depth, alpha, view], outputs=[out_normals], device=device)
 
 
 def launch_add_depth_gradients(
-    depth: Any, alpha: Any, view: DepthView, normal_gradients: Any, out_depth_gradients: Any, device: Any
+    depth: Any, alpha: Any, view: DepthNormalCamera, normal_gradients: Any, out_depth_gradients: Any, device: Any
 ) -> None:
     """Add what gradients of the normals are to every pixel's depth."""
     launch(

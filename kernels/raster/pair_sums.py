@@ -3,37 +3,28 @@
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.raster.bin_tiles import SplatOrder
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS
 from beam_warp.kernels.raster.project import Splats
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class Pairs:
-    """The moments and channels of all pairs of a band; those of a splat lie side by side, splats in depth order."""
-
-    rows: wp.array2d[float]
-    order: wp.array[int]
-    counts: wp.array[int]
-    ends: wp.array[int]
-
-
 @wp.kernel
-def sum_pairs_kernel(first: int, pairs: Pairs, out_sums: wp.array2d[float]):
-    """Add one column of the rows of a splat."""
+def sum_pairs_kernel(first: int, pair_rows: wp.array2d[float], order: SplatOrder, out_sums: wp.array2d[float]):
+    """Add one column of the rows of a splat's pairs, which lie side by side."""
     item = first + wp.tid()
-    length = pairs.rows.shape[1]
+    length = pair_rows.shape[1]
     place = item / length
     column = item % length
-    count = pairs.counts[place]
+    count = order.counts[place]
     if count <= 0:
         return
     total = float(0.0)
     # Ends beyond the range of integers come out negative: what was not listed has no rows.
-    for row in range(wp.max(pairs.ends[place] - count, 0), wp.min(pairs.ends[place], pairs.rows.shape[0])):
-        total += pairs.rows[row, column]
-    splat = pairs.order[place]
+    for row in range(wp.max(order.ends[place] - count, 0), wp.min(order.ends[place], pair_rows.shape[0])):
+        total += pair_rows[row, column]
+    splat = order.splats[place]
     out_sums[splat, column] = out_sums[splat, column] + total
 
 
@@ -76,9 +67,9 @@ def resolve_sums_kernel(
     out_gradients.bends[splat] = out_gradients.bends[splat] + to_bends[2]
 
 
-def launch_sum_pairs(pairs, sums, device):
+def launch_sum_pairs(pair_rows, order, out_sums, device):
     """Add the rows of all pairs to the sums of their splats."""
-    launch(sum_pairs_kernel, len(pairs.counts) * pairs.rows.shape[1], inputs=[pairs], outputs=[sums], device=device)
+    launch(sum_pairs_kernel, out_sums.size, inputs=[pair_rows, order], outputs=[out_sums], device=device)
 
 
 def launch_resolve_sums(sums, splats, channel_count, exact, gradients, device):

@@ -1,4 +1,4 @@
-"""From Gaussians in the world to splats on the image plane: elliptical weighted averaging with a low-pass filter.
+"""Projection of Gaussians to splats on the image plane: elliptical weighted averaging with a low-pass filter.
 
 Source: Zwicker et al. 2001, EWA Volume Splatting; Kerbl et al. 2023 for the constants. Both square forms are kept as
 factors, so that nothing cancels: with T = J M (2 x 3; M the scaled axes in camera space), det(T T^T) = |t0 x t1|^2 is a
@@ -11,8 +11,8 @@ l = 1 + a.b / a.a and e = |a x b|^2 / (a.a)^2: no inverse of a covariance, and f
 that disc e = 0, so that z / l is exact over its whole footprint; for others z / l is the plane through the centre that
 is tangent to the surface of largest response (Zhang et al. 2024, RaDe-GS), and z / (l + e / l) the surface itself.
 
-The module has an adjoint, which Warp makes: the kernel writes nothing but what it is differentiated for, since the
-adjoint writes its outputs again.
+Warp makes the adjoint of this module. The kernel writes only what it is differentiated for, because the adjoint writes
+its outputs again.
 """
 
 import warp as wp
@@ -30,7 +30,7 @@ SMALLEST_SCALE = wp.constant(1.0e-12)
 
 
 @wp.struct
-class View:
+class RasterView:
     """A camera, and where its tiles and pixels are among those of all cameras that are drawn together."""
 
     world_to_camera: wp.mat33
@@ -46,7 +46,7 @@ class View:
 
 @wp.struct
 class Projection:
-    """How Gaussians become splats."""
+    """Options of the projection."""
 
     low_pass: float  # variance [pixel^2] of the pixel filter that every splat is widened by
     near: float  # depth [m] before which a Gaussian's centre is not drawn
@@ -75,19 +75,15 @@ def project_gaussians_kernel(
     orientations: wp.array[wp.quat],
     scales: wp.array[wp.vec3],
     opacities: wp.array[float],
-    views: wp.array[View],
+    views: wp.array[RasterView],
     projection: Projection,
-    out_centers: wp.array[wp.vec4],
-    out_shapes: wp.array[wp.vec4],
-    out_slopes: wp.array[wp.vec4],
-    out_bends: wp.array[float],
-    out_normals: wp.array[wp.vec3],
+    out_splats: Splats,
 ):
     splat = first + wp.tid()
     count = positions.shape[0]
     i = splat % count
     view = views[splat / count]
-    out_centers[splat] = wp.vec4(0.0, 0.0, -wp.inf, 0.0)
+    out_splats.centers[splat] = wp.vec4(0.0, 0.0, -wp.inf, 0.0)
     p = view.world_to_camera * (positions[i] - view.position)
     z = p[2]
     if not (z > projection.near):
@@ -149,34 +145,37 @@ def project_gaussians_kernel(
     c0 = wp.cross(a, b0) / aa
     c1 = wp.cross(a, b1) / aa
     normal = -(axes * wp.cw_mul(inverse, a))
-    out_centers[splat] = wp.vec4(x, y, log_opacity, z)
-    out_shapes[splat] = wp.vec4(1.0 / wp.sqrt(xx), xy / xx, wp.sqrt(xx / det), DEPTH_REACH * largest)
-    out_slopes[splat] = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
-    out_bends[splat] = wp.dot(c1, c1)
-    out_normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
+    out_splats.centers[splat] = wp.vec4(x, y, log_opacity, z)
+    out_splats.shapes[splat] = wp.vec4(1.0 / wp.sqrt(xx), xy / xx, wp.sqrt(xx / det), DEPTH_REACH * largest)
+    out_splats.slopes[splat] = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
+    out_splats.bends[splat] = wp.dot(c1, c1)
+    out_splats.normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
 
 
-def launch_project(gaussians, views, projection, splats, device):
+def launch_project(gaussians, views, projection, out_splats, device):
     """Project every Gaussian into every view; ``gaussians`` are positions, orientations, scales and opacities."""
     launch(
         project_gaussians_kernel,
-        len(splats.centers),
+        len(out_splats.centers),
         inputs=[*gaussians, views, projection],
-        outputs=[splats.centers, splats.shapes, splats.slopes, splats.bends, splats.normals],
+        outputs=[out_splats],
         device=device,
     )
 
 
-def launch_project_adjoint(gaussians, views, projection, splats, splat_gradients, gradients, device):
-    """Add to ``gradients`` (of the four ``gaussians``) what ``splat_gradients`` (of the five outputs) say."""
+def launch_project_adjoint(gaussians, views, projection, splats, out_gradients, device):
+    """Add to ``out_gradients``, of the four ``gaussians``, what the gradients of ``splats`` say.
+
+    The arrays of ``splats`` carry their gradients as Warp's ``grad``: Warp reads none from a struct of its own.
+    """
     count = len(gaussians[0])
     for view in range(len(views)):  # one view at a time: each Gaussian is then added to once a launch, in this order
         launch_adjoint(
             project_gaussians_kernel,
             range(view * count, (view + 1) * count),
             inputs=[*gaussians, views, projection],
-            outputs=[splats.centers, splats.shapes, splats.slopes, splats.bends, splats.normals],
-            input_gradients=[*gradients, None, Projection()],
-            output_gradients=splat_gradients,
+            outputs=[splats],
+            input_gradients=[*out_gradients, None, Projection()],
+            output_gradients=[Splats()],
             device=device,
         )

@@ -24,6 +24,25 @@ SMALLEST_FACING = wp.constant(1.0e-6)
 """Depth at a pixel whose ray runs along a Gaussian's surface, or away from it, is that of the ray that meets it so."""
 
 
+@wp.struct
+class SplatRow:
+    """One of the splats of `beam_warp.kernels.raster.project.Splats`."""
+
+    center: wp.vec4
+    shape: wp.vec4
+    slope: wp.vec4
+    bend: float
+
+
+@wp.struct
+class Sight:
+    """A splat as one pixel sees it."""
+
+    offset: wp.vec2  # from the splat's centre to the pixel [pixel]
+    e: wp.vec2  # the offset in standard deviations
+    log_alpha: float
+
+
 @wp.func
 def squared_extent(log_opacity: float) -> float:
     """Squared number of standard deviations at which alpha falls to 1/255."""
@@ -59,7 +78,7 @@ def reach_columns(shape: wp.vec4, squared: float, top: float, bottom: float) -> 
 
 @wp.struct
 class RowReach:
-    """What the pixels that a splat reaches in a row of pixels follow from, the same for all rows."""
+    """Numbers, the same for all rows of pixels, from which the pixels that a splat reaches in a row follow."""
 
     lean: float  # x of their middle over y, both from the centre
     widest: float  # square of half their extent in the centre's row
@@ -141,6 +160,16 @@ def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
 def log_alpha_of(center: wp.vec4, e: wp.vec2) -> float:
     """Logarithm of opacity times response."""
     return center[2] - 0.5 * (e[0] * e[0] + e[1] * e[1])
+
+
+@wp.func
+def sight_of(center: wp.vec4, shape: wp.vec4, position: wp.vec2) -> Sight:
+    """The splat as a pixel at a position sees it."""
+    sight = Sight()
+    sight.offset = offset_from(center, position)
+    sight.e = whiten(shape, sight.offset)
+    sight.log_alpha = log_alpha_of(center, sight.e)
+    return sight
 
 
 @wp.func

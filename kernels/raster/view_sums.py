@@ -1,4 +1,4 @@
-"""What the views of a scene say of its Gaussians, summed over the views."""
+"""Sums over views of the rows that each view has for every Gaussian."""
 
 import warp as wp
 

@@ -6,7 +6,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.pinholes import camera_point, image_point
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 def write_sampling_limits_kernel(
     first: int,
     positions: wp.array[wp.vec3],
-    views: wp.array[View],
+    views: wp.array[RasterView],
     near: float,
     margin: float,
     factor: float,

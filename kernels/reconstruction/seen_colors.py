@@ -6,7 +6,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,7 +26,7 @@ def sample_colors_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    view: View,
+    view: RasterView,
     color: wp.array[wp.vec3],
     alpha: wp.array[float],
     depth: wp.array[float],

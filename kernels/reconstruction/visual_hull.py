@@ -11,7 +11,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +39,7 @@ INSIDE = wp.constant(2)
 
 
 @wp.func
-def silhouette_distance(view: View, distances: wp.array[float], pixel: wp.vec2) -> float:
+def silhouette_distance(view: RasterView, distances: wp.array[float], pixel: wp.vec2) -> float:
     """Signed distance [pixel] at a place of the image, bilinear between centres; constant beyond the outermost."""
     column = wp.clamp(pixel[0] - 0.5, 0.0, float(view.width - 1))
     row = wp.clamp(pixel[1] - 0.5, 0.0, float(view.height - 1))
@@ -57,13 +57,13 @@ def silhouette_distance(view: View, distances: wp.array[float], pixel: wp.vec2) 
 
 
 @wp.func
-def mean_focal(view: View) -> float:
+def mean_focal(view: RasterView) -> float:
     return 0.5 * (view.focal[0] + view.focal[1])
 
 
 @wp.func
 def hull_depth(
-    point: wp.vec3, views: wp.array[View], distances: wp.array[float], tolerance: int, quorum: int, unseen: float
+    point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], tolerance: int, quorum: int, unseen: float
 ) -> float:
     """Depth [m] in the cones: the least of all views that see the point, up to ``tolerance`` lesser ones left out.
 
@@ -95,7 +95,7 @@ def judge_blocks_kernel(
     origin: wp.vec3,
     size: float,
     count: wp.vec3i,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     distances: wp.array[float],
     tolerance: int,
     quorum: int,
@@ -146,7 +146,7 @@ def fill_blocks_kernel(
     origin: wp.vec3,
     voxel: float,
     count: wp.vec3i,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     distances: wp.array[float],
     tolerance: int,
     quorum: int,

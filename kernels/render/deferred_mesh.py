@@ -8,7 +8,7 @@ from beam_warp.kernels.light.latlong import latlong_bilinear
 from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.mesh.surface import MeshSurface, closest_hit, surface_point
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_pixels import SHADE_CHUNK, arriving_radiance, pixel_ray
 from beam_warp.kernels.render.gaussian_light import RegionShadows, environment_openness, luminance, random_turn
 from beam_warp.kernels.render.surface_lighting import (
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def shade_mesh_kernel(
     first: int,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     surface: MeshSurface,
     catches_shadows: wp.array[wp.bool],
     environment: DistantLight,

@@ -13,7 +13,7 @@ from beam_warp.kernels.light.shading import (
     specular_occlusion,
     view_albedo,
 )
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.gaussian_light import (
     ARRIVING,
     NORMAL,
@@ -34,7 +34,7 @@ SHADE_CHUNK = 256
 
 
 @wp.func
-def pixel_ray(view: View, pixel: int) -> wp.vec3:
+def pixel_ray(view: RasterView, pixel: int) -> wp.vec3:
     """World vector from the camera through a pixel's middle, of depth 1."""
     x = (float(pixel % view.width) + 0.5 - view.center[0]) / view.focal[0]
     y = (float(pixel / view.width) + 0.5 - view.center[1]) / view.focal[1]
@@ -64,7 +64,7 @@ def arriving_radiance(
 @wp.kernel
 def shade_gaussians_kernel(
     first: int,
-    views: wp.array[View],
+    views: wp.array[RasterView],
     channels: wp.array2d[float],
     alpha: wp.array[float],
     depth: wp.array[float],

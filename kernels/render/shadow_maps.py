@@ -17,7 +17,7 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
-from beam_warp.kernels.raster.project import View
+from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,7 +44,7 @@ ROUNDING = wp.constant(4.0e-7)
 class ShadowMaps:
     """Maps of several lights, in one array of texels."""
 
-    views: wp.array[View]
+    views: wp.array[RasterView]
     texels: wp.array[wp.vec4]  # of the Gaussians alpha, median depth, mean depth; depth of the mesh [m]
     radii: wp.array[float]  # of each light's disc, at its view's position [m]
     fronts: wp.array[float]  # depth before which nothing is [m]
@@ -85,7 +85,7 @@ def gather_texels_kernel(
 
 @wp.kernel
 def cast_mesh_kernel(
-    first: int, surface: MeshSurface, views: wp.array[View], texels_of_view: int, out_depth: wp.array[float]
+    first: int, surface: MeshSurface, views: wp.array[RasterView], texels_of_view: int, out_depth: wp.array[float]
 ):
     """Depth of the first triangle along every texel's ray."""
     i = first + wp.tid()
@@ -163,7 +163,7 @@ def first_depth(texel: wp.vec4) -> float:
 
 
 @wp.func
-def texel_at(maps: ShadowMaps, view: View, x: int, y: int) -> wp.vec4:
+def texel_at(maps: ShadowMaps, view: RasterView, x: int, y: int) -> wp.vec4:
     column = wp.clamp(x, 0, view.width - 1)
     row = wp.clamp(y, 0, view.height - 1)
     return load_row(maps.texels, view.first_pixel + row * view.width + column)
@@ -177,12 +177,12 @@ def plane_depth(receiver: Receiver, x: int, y: int) -> float:
 
 
 @wp.func
-def hidden_at(maps: ShadowMaps, view: View, receiver: Receiver, x: int, y: int) -> float:
+def hidden_at(maps: ShadowMaps, view: RasterView, receiver: Receiver, x: int, y: int) -> float:
     return hidden_share(texel_at(maps, view, x, y), plane_depth(receiver, x, y), receiver.bias, maps.thickness)
 
 
 @wp.func
-def hidden_between(maps: ShadowMaps, view: View, receiver: Receiver, place: wp.vec2) -> float:
+def hidden_between(maps: ShadowMaps, view: RasterView, receiver: Receiver, place: wp.vec2) -> float:
     """Bilinear between the comparisons of four texels."""
     x = place[0] - 0.5
     y = place[1] - 0.5
@@ -203,13 +203,13 @@ def turned(tap: wp.vec2, turn: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def disc_kernel(view: View, radius: float, depth: float, blocker: float) -> float:
+def disc_kernel(view: RasterView, radius: float, depth: float, blocker: float) -> float:
     """Radius, in texels at a blocker's depth, of the cone from a point to the light's disc [texel]."""
     return view.focal[0] * radius * wp.max(depth - blocker, 0.0) / (depth * wp.max(blocker, LEAST_DEPTH))
 
 
 @wp.func
-def blocker_depth(maps: ShadowMaps, k: int, view: View, receiver: Receiver, turn: wp.vec2) -> float:
+def blocker_depth(maps: ShadowMaps, k: int, view: RasterView, receiver: Receiver, turn: wp.vec2) -> float:
     """Mean depth of what hides the light's disc, weighted by how much of it; 0 if nothing does."""
     reach = disc_kernel(view, maps.radii[k], receiver.depth, maps.fronts[k])
     reach = wp.clamp(reach, 1.0, maps.largest_kernel)

@@ -109,7 +109,7 @@ class TestScenes:
         assert 0.0 < np.linalg.norm(swayed, axis=1).max() < 0.25  # ten degrees of a radius of 1.06, and 3 cm
 
     def test_moving_writes_the_poses_in_turn(self, bench, device):
-        from beam_warp.raster.gbuffer import upload_gaussians
+        from beam_warp.raster.sources import upload_gaussians
 
         cloud = bench(device).figure().cloud
         gaussians = upload_gaussians(cloud, resolve_device(device))

@@ -14,8 +14,9 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.materials import bake as baking
 from beam_warp.materials.bake import BakeOptions, BakeTarget, bake
-from beam_warp.raster.gbuffer import rasterize_values, upload_gaussians
+from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.sources import upload_gaussians
 
 
 def cameras(cloud, sizes):

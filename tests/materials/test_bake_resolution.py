@@ -11,8 +11,9 @@ from beam_warp import Camera
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.materials.bake import BakeOptions, BakeTarget, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
-from beam_warp.raster.gbuffer import rasterize_values, upload_gaussians
+from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 
 NEAR = 0.01
 

@@ -9,7 +9,8 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.raster.gbuffer import RADIANCE, rasterize
+from beam_warp.raster.channels import RADIANCE
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.trace.scene import Scene
 from beam_warp.world.camera import Camera
 from beam_warp.world.harmonics import SH_C0

@@ -11,7 +11,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, smith_lambda, specular_albedo
 from beam_warp.light.sampled import SampledEnvironment
 from beam_warp.materials.residues import surface_occlusion, surface_residues, view_surfaces
-from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.environment import EnvironmentMap
 

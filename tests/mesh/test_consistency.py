@@ -50,7 +50,7 @@ def test_a_view_that_is_wrong_is_found(device, views):
 
 
 def test_a_plane_hidden_by_a_sphere_is_not_contradicted():
-    """From above a sphere hides a disc of the plane below it; the disc is seen from the side."""
+    """A sphere, seen from above, hides a disc of the plane below it; the disc is seen from the side."""
     above, aside = around((0.0, 0.0, 0.0), width=64, azimuths=1, elevations=(89.0, 40.0))
     floor = plane_view(aside, -0.6)
     found = depth_consistency(DepthImages.of([sphere_view(above, RADIUS), floor], device="cpu"))

@@ -45,7 +45,7 @@ def twin_distances(points, corners):
 
 
 class TestClosest:
-    @pytest.mark.parametrize("count", [1, 255, 256, 257, 700])
+    @pytest.mark.parametrize("count", [1, 255, 257])
     def test_distances_are_those_of_brute_force(self, device, rng, count):
         mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
         vertices = mesh.vertices * (1.0, 0.5, 1.5) + (30.0, -20.0, 4.0)  # far off: rounding must not follow

@@ -44,7 +44,7 @@ def test_charts_do_not_overlap():
     assert (double_areas(flat) > 0.0).all()
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_scale_and_place_do_not_matter(scale):
     mesh = ball()
     far = trimesh.Trimesh(mesh.vertices * scale + 100.0 * scale, mesh.faces, process=False)

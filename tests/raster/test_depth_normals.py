@@ -58,7 +58,7 @@ def bumpy_depth(rng, camera):
 
 
 class TestClosedForm:
-    @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.7, 0.0), (-0.4, 0.9), (1.5, -1.5)])
+    @pytest.mark.parametrize("tilt", [(0.0, 0.0), (1.5, -1.5)])
     def test_plane(self, device, tilt):
         camera = camera_of(37, 29)
         normal = np.array([*tilt, -1.0]) / np.linalg.norm([*tilt, -1.0])
@@ -70,28 +70,19 @@ class TestClosedForm:
         assert np.abs(found - camera.camera_to_world[:3, :3] @ normal).max() <= tolerance
 
     def test_sphere(self, device):
-        camera, center, radius = camera_of(64, 48), np.array([0.1, -0.05, 2.0]), 0.5
-        depth, points = sphere_depth(camera, center, radius)
-        truth = (points - center) / radius
-        found = normals_of(depth, camera, device, alpha=depth > 0.0, largest_jump=0.2) @ camera.camera_to_world[:3, :3]
-        gentle = (depth > 0.0) & (truth[..., 2] < -0.6)
-        assert gentle.sum() > 200
+        center, radius = np.array([0.1, -0.05, 2.0]), 0.5
+        errors = []
+        for camera in (camera_of(64, 48), camera_of(256, 192, focal=320.0)):
+            depth, points = sphere_depth(camera, center, radius)
+            truth = (points - center) / radius
+            found = normals_of(depth, camera, device, alpha=depth > 0.0, largest_jump=0.2)
+            gentle = (depth > 0.0) & (truth[..., 2] < -0.6)
+            assert gentle.sum() > 200
+            errors.append(np.abs(found @ camera.camera_to_world[:3, :3] - truth)[gentle].max())
         # Central differences are wrong by h^2 / 6 of the third derivative: with h = z / f on a sphere whose slope s is
         # below 4/3, |z'''| = 3 s (1 + s^2)^(5/2) / R^2 is below 52 / R^2, and the normal turns by no more than that.
-        step = 2.0 / camera.focal_x
-        assert np.abs(found - truth)[gentle].max() <= 52.0 / 6.0 * (step / radius) ** 2
-        fine = camera_of(256, 192, focal=320.0)
-        fine_depth, fine_points = sphere_depth(fine, center, radius)
-        fine_found = (
-            normals_of(fine_depth, fine, device, alpha=fine_depth > 0.0, largest_jump=0.2)
-            @ fine.camera_to_world[:3, :3]
-        )
-        fine_truth = (fine_points - center) / radius
-        fine_gentle = (fine_depth > 0.0) & (fine_truth[..., 2] < -0.6)
-        error, fine_error = (
-            np.abs(a - b)[s].max() for a, b, s in ((found, truth, gentle), (fine_found, fine_truth, fine_gentle))
-        )
-        assert fine_error < error / 12.0  # second order: a quarter of the step, a sixteenth of the error
+        assert errors[0] <= 52.0 / 6.0 * (2.0 / 80.0 / radius) ** 2
+        assert errors[1] < errors[0] / 12.0  # second order: a quarter of the step, a sixteenth of the error
 
     def test_faces_the_camera_in_world_axes(self, device, rng):
         camera = camera_of(40, 30)
@@ -102,7 +93,7 @@ class TestClosedForm:
         assert np.abs(np.linalg.norm(normals[there], axis=-1) - 1.0).max() <= 8.0 * EPSILON
 
     def test_gradient_of_one_pixel(self, device):
-        """On a wall ahead, n = (p, q, -1) to first order: dn_x / dz_right = f / (2 z)."""
+        """A wall ahead has n = (p, q, -1) to first order: dn_x / dz_right = f / (2 z)."""
         camera = Camera(3, 3, 50.0, 40.0, 1.5, 1.5, np.eye(4))
         upstream = np.zeros((3, 3, 3))
         upstream[1, 1] = 3.0, 5.0, 7.0
@@ -112,7 +103,7 @@ class TestClosedForm:
 
 
 class TestTwin:
-    @pytest.mark.parametrize("size", [(3, 3), (33, 31), (64, 40)])
+    @pytest.mark.parametrize("size", [(3, 3), (33, 31)])
     def test_normals(self, device, rng, size):
         camera = camera_of(*size)
         depth = bumpy_depth(rng, camera)
@@ -194,8 +185,10 @@ class TestMasks:
         wide = np.abs(normals_of(depth, camera, device, largest_jump=np.inf)).max(axis=-1) > 0.0
         assert wide[1:-1, 1:-1].all()
 
-    @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30])
-    @pytest.mark.parametrize("largest_jump", [0.03, np.inf])
+    @pytest.mark.parametrize(
+        ("broken", "largest_jump"),
+        [(np.nan, 0.03), (np.nan, np.inf), (np.inf, np.inf), (-1.0, np.inf), (1e-30, np.inf)],
+    )
     def test_broken_depth_takes_its_stencil_and_no_more(self, device, rng, broken, largest_jump):
         camera = camera_of(12, 12)
         depth = np.full((12, 12), 2.0)
@@ -218,7 +211,7 @@ class TestMasks:
         normals = normals_of(np.full((9, 9), 2.0), camera, device, alpha)
         assert (np.abs(normals).max(axis=-1) > 0.0).sum() == 49 - 5
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2), (2, 9)])
+    @pytest.mark.parametrize("size", [(1, 1), (2, 9), (9, 2)])
     def test_no_interior(self, device, size):
         camera = camera_of(*size)
         depth = np.full((camera.height, camera.width), 2.0)

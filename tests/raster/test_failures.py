@@ -16,10 +16,10 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 
 STABILITY = 10.0
-"""How many times the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""
+"""Factor of the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""
 
 EXPONENTIAL_ULPS = 9.0
-"""Of `kernels.splat_rows.quick_exp` on CUDA: 2 + |1.16 x| (CUDA C++ Programming Guide), with alpha at least 1/255."""
+"""Error of `quick_exp` on CUDA: 2 + |1.16 x| (CUDA C++ Programming Guide), with alpha at least 1/255."""
 
 OUTPUTS = ("alpha", "depth", "median_depth", "channels", "normals")
 
@@ -93,8 +93,7 @@ def remoteness(scene, decisions):
     return max(1.0, float((np.abs(centers - 0.5 * sides) / sides).max()))
 
 
-@pytest.mark.parametrize("depth_mode", ["plane", "exact"])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(("antialiased", "depth_mode"), [(False, "plane"), (True, "exact")])
 @pytest.mark.parametrize("name", HAZARDS)
 def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
     """Images and gradients."""
@@ -149,8 +148,8 @@ def test_one_depth_is_drawn_in_the_order_of_rows(device, rng, name):
     np.testing.assert_allclose(second[clear], replay(other, decisions).channels[clear], atol=40 * 2 * ROUNDING)
 
 
-@pytest.mark.parametrize("name", HAZARDS)
-def test_every_hazard_has_the_same_bits_again(device, rng, name, monkeypatch):
+@pytest.mark.parametrize("name", ["needles", "around_the_camera", "at_one_depth", "many_layers"])
+def test_hazards_have_the_same_bits_again(device, rng, name, monkeypatch):
     scene = HAZARDS[name](rng)
     upstream = random_upstream(rng, scene, decide(scene))
     found = []
@@ -202,7 +201,7 @@ def test_a_hundred_thousand_splats_on_one_tile(device, rng):
         assert not array[order[seen:]].any()
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 70), (70, 1), (7, 9), (16, 8), (17, 16), (65, 3)])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 70), (16, 8), (17, 16), (65, 3)])
 def test_images_of_every_shape(device, rng, width, height):
     """Splats around every pixel, edge and corner."""
     x, y = (rng.uniform(-4.0, side + 4.0, 80) for side in (width, height))
@@ -220,7 +219,7 @@ def test_images_of_every_shape(device, rng, width, height):
 
 
 def test_every_camera_of_a_batch_sees_what_it_sees_alone(device, rng):
-    """Of four sizes and lenses, every output, bit for bit; and gradients are the sum."""
+    """Four sizes and lenses: every output, bit for bit, and gradients are the sum."""
     scene = HAZARDS["balls"](rng)
     cameras = [ahead(13, 9), ahead(1, 1), ahead(40, 17, 55.0), ahead(8, 8, 20.0)]
     arrays = [scene.arrays()[name].astype(np.float32) for name in ("positions", "orientations", "scales", "opacities")]
@@ -259,7 +258,7 @@ def test_every_camera_of_a_batch_sees_what_it_sees_alone(device, rng):
         assert np.abs(rest).max() <= 8 * ROUNDING * size[name], name  # four sums
 
 
-@pytest.mark.parametrize("length", [1e-3, 2.0, 1e3])
+@pytest.mark.parametrize("length", [1e-3, 1e3])
 def test_the_length_of_a_quaternion_does_not_matter(device, rng, length):
     """Images are the same, and the gradient falls as the length grows."""
     scene = HAZARDS["discs_without_thickness"](rng)

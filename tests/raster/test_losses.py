@@ -120,9 +120,7 @@ class TestSsim:
         # moments: 22 roundings of squares below 1, over a variance and C2 of above 1e-3, averaged over 690 windows
         assert value(loss) == pytest.approx((1.0 - similar[inside]).sum() / image.size, abs=22.0 * EPSILON / 1e-3 / 26)
 
-    @pytest.mark.parametrize(
-        "shape", [(1, 1, 1), (1, 9, 3), (9, 1, 2), (15, 6, 1), (16, 12, 2), (17, 11, 1), (33, 9, 1)]
-    )
+    @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 9, 3), (15, 6, 1), (17, 11, 2)])
     def test_twin(self, device, rng, shape):
         image, target = images(rng, *shape)
         mask = rng.uniform(size=shape[:2]).astype(np.float32)
@@ -142,16 +140,6 @@ class TestSsim:
         assert value(loss) == pytest.approx(twin.ssim(image, target, mask), rel=1e-6)
         expected = twin.slope(lambda moved: twin.ssim(moved, target, mask), image)
         assert relative_error(gradient.numpy(), expected) <= 2e-6
-
-    def test_descent_finds_the_target(self, device, rng):
-        image, target = images(rng, 24, 24, 1)
-        loss, now, gradient = SsimLoss(24, 24, 1, device=device), upload(image, device), zeros((24, 24, 1), device)
-        first = value(loss(now, target))
-        for _ in range(60):
-            gradient.zero_()
-            loss(now, target, gradient=gradient)
-            now = upload(now.numpy() - 0.3 * gradient.numpy(), device)
-        assert value(loss(now, target)) < 0.1 * first
 
 
 class TestNormal:

@@ -30,7 +30,7 @@ UP = [0.0, 0.0, 0.0, 1.0]
 
 
 def ahead(width=16, height=12, focal=20.0):
-    """At the origin, camera axes for world axes."""
+    """A camera at the origin, its axes those of the world."""
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(4))
 
 
@@ -135,9 +135,9 @@ def test_what_is_not_seen():
     assert draw(RasterScene(*(np.zeros((0, *s)) for s in ((3,), (4,), (3,), ())), camera)).channels.shape == (12, 16, 0)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
+@pytest.mark.parametrize("tilt", [0.0, 1.2])
 def test_a_disc_is_its_plane_and_has_its_normal(tilt):
-    """In both modes, in a turned camera: the normal comes in world axes."""
+    """Both modes, in a turned camera: the normal comes in world axes."""
     camera = Camera.orbit((0, 0, 0), 2.0, 30.0, 10.0, width=24, height=24, vertical_fov=50.0)
     to_world = camera.camera_to_world[:3, :3]
     turn = rotations(np.array([[np.sin(0.5 * tilt), 0.0, 0.0, np.cos(0.5 * tilt)]]))[0]
@@ -291,8 +291,7 @@ def test_gradients_of_a_ball_by_hand():
     np.testing.assert_allclose(got["orientations"], 0.0, atol=1e-11)  # a ball does not turn
 
 
-@pytest.mark.parametrize("depth_mode", ["plane", "exact"])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(("depth_mode", "antialiased"), [("plane", True), ("exact", False)])
 def test_gradients_of_all_splats_at_once_are_those_of_each_entry(rng, depth_mode, antialiased):
     """Against the whole image, replayed for one moved entry at a time."""
     scene = make_scene(rng, 40, 20, depth_mode=depth_mode, antialiased=antialiased)
@@ -401,6 +400,7 @@ def test_depths_too_close_to_sort_are_known():
         assert decide(scene).near_jump[0, 0] == tied
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_mode", ["plane", "exact"])
 @pytest.mark.parametrize("name", HAZARDS)
 def test_gradients_are_plain_differences_in_hazards(rng, name, depth_mode):

@@ -85,9 +85,9 @@ def test_channels_of_two_passes_are_selected_from_each(device, rng):
         view.select(rasterizer.value_channels)
 
 
-@pytest.mark.parametrize("room", ["interop", "interop_torch"])
+@pytest.mark.parametrize("room", ["interop", "interop.torch"])
 def test_rooms_of_torch_say_what_to_install(monkeypatch, room):
-    for name in [n for n in sys.modules if n.partition(".")[0] == "torch" or n.startswith("beam_warp.interop.gsplat")]:
+    for name in [n for n in sys.modules if n.partition(".")[0] == "torch" or n.startswith("beam_warp.interop.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
     with pytest.raises(

@@ -162,7 +162,7 @@ def ray_forms(scene, splats, i, pixels):
 
 
 def inverse_depth(scene, splats, i, forms, behind):
-    """Of the plane (Zhang et al. 2024), or of the point of largest response on the ray, z* = z r.A.c / r.A.r."""
+    """Inverse depth of the plane (Zhang et al. 2024), or of the largest response on the ray, z* = z r.A.c / r.A.r."""
     along, square = forms
     if scene.depth_mode == "plane":
         return along / splats.depth[i]

@@ -6,7 +6,7 @@ import warp as wp
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.render.shadow_maps import ShadowMaps, face_towards, visible_share
-from beam_warp.raster.gbuffer import upload_gaussians
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.render import shadow_maps
 from beam_warp.render.shadow_maps import FAR, ROOM, ShadowDrawer, Subject, disc_taps, distant_view, light_views
 from beam_warp.trace.mesh_paths import TracedMesh

@@ -15,7 +15,7 @@ def hazard(make):
 
 
 def ahead(width=29, height=21, focal=30.0):
-    """At the origin, camera axes for world axes; no side is a multiple of a tile's."""
+    """A camera at the origin, its axes those of the world; no side is a multiple of a tile's."""
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(4))
 
 
@@ -117,7 +117,7 @@ def through_the_near_plane(rng):
 
 @hazard
 def around_the_camera(rng):
-    """It stands inside splats of a hundred metres; those with centres behind it are not drawn."""
+    """The camera stands inside splats of a hundred metres; those with centres behind it are not drawn."""
     return make(rng, rng.normal(0.0, 2.0, (20, 3)), np.exp(rng.normal(3.0, 1.0, (20, 3))), opacities=0.3)
 
 

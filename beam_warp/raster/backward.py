@@ -1,0 +1,121 @@
+"""The way back: from derivatives to images, and from what pixels hold, to the Gaussians that were drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import warp as wp
+
+from beam_warp.kernels.raster.back_projection_cpu import launch_back_project_cpu
+from beam_warp.kernels.raster.back_projection_cuda import launch_back_project_cuda
+from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors_adjoint, launch_scatter_channels
+from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
+from beam_warp.kernels.raster.composite_adjoint import MOMENTS, Adjoints, pair_length
+from beam_warp.kernels.raster.composite_adjoint_cpu import launch_composite_adjoint_cpu
+from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adjoint_cuda
+from beam_warp.kernels.raster.pair_sums import launch_resolve_sums, launch_sum_pairs
+from beam_warp.kernels.raster.project import Splats, launch_project_adjoint
+from beam_warp.raster.buffers import FrameBuffers, zero_splats
+from beam_warp.raster.layout import Rows, channel_rows
+from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterImages
+
+
+class BackwardBuffers:
+    """Arrays that differentiating a frame needs besides those that it was drawn from.
+
+    Attributes:
+        images: Derivatives to the images, for callers to fill.
+        gaussians: Derivatives to the Gaussians.
+    """
+
+    def __init__(self, drawn: FrameBuffers) -> None:
+        """Allocate for what a frame draws."""
+        self._drawn = drawn
+        count, splat_count, pixel_count = drawn.gaussian_count, drawn.splat_count, drawn.pixel_count
+        with wp.ScopedDevice(drawn.device):
+            self._adjoints = channel_rows(pixel_count, drawn.channels.count, drawn.device)
+            flat = [wp.zeros(pixel_count, dtype=float) for _ in range(3)]
+            self.images = RasterImages(tuple(rows.matrix for rows in self._adjoints), *flat)
+            lengths = [pair_length(rows.length, drawn.exact) for rows in self._adjoints]
+            self._sums = [wp.zeros((splat_count, length), dtype=float) for length in lengths]
+            self._splats = zero_splats(splat_count)
+            self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
+            self.gaussians = GaussianGradients(
+                wp.zeros(count, dtype=wp.vec3),
+                wp.zeros(count, dtype=wp.quat),
+                wp.zeros(count, dtype=wp.vec3),
+                wp.zeros(count, dtype=float),
+                self._blocks.values if drawn.channels.values else None,
+                None,
+            )
+        self._tracked = _with_gradients(drawn.splats, self._splats)
+
+    def begin(self, gaussians: GaussianArrays) -> None:
+        """Begin a new sum, with room for as many coefficients of captured colour as the Gaussians have."""
+        if self._drawn.channels.colors and gaussians.radiance is not None:
+            held = self.gaussians.radiance
+            if held is None or held.shape != gaussians.radiance.shape:
+                self.gaussians = replace(self.gaussians, radiance=wp.zeros_like(gaussians.radiance))
+        found, splats = self.gaussians, self._splats
+        summed = (found.positions, found.orientations, found.scales, found.opacities, found.radiance)
+        for array in (*summed, splats.centers, splats.shapes, splats.slopes, splats.bends, *self._sums):
+            if array is not None:
+                array.zero_()
+
+    def add_band(self) -> None:
+        """Add what the band listed last says to the gradients of splats and of their rows."""
+        drawn = self._drawn
+        if not drawn.pair_capacity:
+            return
+        differentiate = launch_composite_adjoint_cuda if drawn.device.is_cuda else launch_composite_adjoint_cpu
+        upstream = Adjoints()
+        upstream.alpha, upstream.depth = self.images.alpha, self.images.depth
+        upstream.median_depth = self.images.median_depth
+        for rows, adjoint, sums in zip(drawn.rows, self._adjoints, self._sums, strict=True):
+            pairs = drawn.pair_rows(sums.shape[1])
+            arguments = (drawn.frame, rows.vectors, drawn.exact, drawn.drawn, adjoint.vectors, upstream)
+            differentiate(*arguments, pairs.vectors, drawn.device)
+            upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
+            launch_sum_pairs(pairs.matrix, drawn.order, sums, drawn.device)
+
+    def resolve(self, gaussians: GaussianArrays) -> GaussianGradients:
+        """Turn sums over pairs into the gradients of Gaussians."""
+        drawn, found, splats, device = self._drawn, self.gaussians, self._splats, self._drawn.device
+        for i, (rows, sums) in enumerate(zip(drawn.rows, self._sums, strict=True)):
+            launch_resolve_sums(sums, drawn.splats, rows.length, int(drawn.exact), splats, device)
+            columns = range(MOMENTS, MOMENTS + rows.length)
+            launch_scatter_channels(sums, columns, i * CHANNEL_COUNTS[-1], drawn.view_count, self._blocks, device)
+        if drawn.channels.colors:
+            launch_evaluate_colors_adjoint(
+                gaussians.positions,
+                gaussians.radiance,
+                drawn.views,
+                drawn.blocks.colors,
+                self._blocks.colors,
+                found.positions,
+                found.radiance,
+                device,
+            )
+        gradients = [found.positions, found.orientations, found.scales, found.opacities]
+        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, gradients, device)
+        return found
+
+
+def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> None:
+    """Add what pixels hold to the rows of the splats of the band listed last, weighted as they were blended."""
+    if not drawn.pair_capacity:
+        return
+    back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu
+    pairs = drawn.pair_rows(pixels.shape[1])
+    back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)
+    launch_sum_pairs(pairs.matrix, drawn.order, out, drawn.device)
+
+
+def _with_gradients(splats: Splats, gradients: Splats) -> Splats:
+    """Return splats in the same memory whose arrays carry gradients, as `launch_project_adjoint` reads them."""
+    tracked = Splats()
+    for name in ("centers", "shapes", "slopes", "bends", "normals"):
+        array = getattr(splats, name)
+        array.grad = getattr(gradients, name)
+        setattr(tracked, name, array)
+    return tracked

@@ -1,0 +1,193 @@
+"""The arrays that frames are drawn from and into: allocated once, kept from frame to frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from beam_warp.errors import InvalidOptionError
+from beam_warp.kernels.raster.bin_tiles import PairList, SplatOrder, TileLists
+from beam_warp.kernels.raster.channel_rows import ChannelBlocks
+from beam_warp.kernels.raster.composite import Images, RasterFrame
+from beam_warp.kernels.raster.project import Projection, RasterView, Splats
+from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_rows
+from beam_warp.raster.records import RasterImages, RasterOptions
+from beam_warp.world.camera import Camera
+
+
+class FrameBuffers:
+    """Everything a frame is drawn from and into, on one device.
+
+    Attributes:
+        gaussian_count: N.
+        view_count: V, the number of cameras.
+        layout: Where views, tiles and pixels lie.
+        channels: Where colour, normals and values are among the channels.
+        device: Where all arrays are.
+        exact: Whether depth is that of the largest response on every ray.
+        views: The cameras, ``(V,)`` `RasterView`.
+        projection: How Gaussians become splats.
+        splats: The splats of every view, V * N of them.
+        rows: The splats' channels, a pass each.
+        blocks: Where the channels of a splat come from.
+        keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs.
+        order: The splats in depth order, and where each one's pairs end.
+        pairs: The (tile, splat) pairs of a band.
+        frame: What compositing reads, for kernels.
+        drawn: Images besides channels, for kernels.
+        channel_images: Images of channels, a pass each.
+        images: The same images for callers.
+    """
+
+    def __init__(
+        self,
+        gaussian_count: int,
+        cameras: Sequence[Camera],
+        channels: ChannelRanges,
+        options: RasterOptions,
+        device: wp.Device,
+        images_of: FrameBuffers | None,
+    ) -> None:
+        """Allocate everything, without room for pairs.
+
+        Raises:
+            InvalidOptionError: ``images_of`` has other channels, too few pixels, or another device.
+        """
+        self.gaussian_count = gaussian_count
+        self.view_count = len(cameras)
+        self.layout = ViewLayout.of(cameras)
+        self.channels = channels
+        self.device = device
+        self.exact = options.depth == "exact"
+        if images_of is not None:
+            self._require_room(images_of)
+        with wp.ScopedDevice(device):
+            self._allocate_splats()
+            self._allocate_images(images_of)
+            self._describe_frame(options)
+        self.reserve(0)
+
+    @property
+    def splat_count(self) -> int:
+        """Number of splats, V * N."""
+        return self.gaussian_count * self.view_count
+
+    @property
+    def pixel_count(self) -> int:
+        """Number of pixels of all views."""
+        return int(self.layout.first_pixels[-1])
+
+    @property
+    def pair_capacity(self) -> int:
+        """Number of pairs there is room for."""
+        return len(self.pairs.owners)
+
+    def reserve(self, capacity: int) -> None:
+        """Make room for pairs."""
+        with wp.ScopedDevice(self.device):
+            self.pairs = PairList()
+            self.pairs.tiles = wp.zeros(2 * capacity, dtype=int)  # the sort wants room for as many again
+            self.pairs.slots = wp.zeros(2 * capacity, dtype=int)
+            self.pairs.owners = wp.zeros(capacity, dtype=int)
+            self.listed_tiles = self.pairs.tiles[:capacity] if capacity else self.pairs.tiles
+            lists = TileLists()
+            lists.ranges = wp.zeros(int(self.layout.first_tiles[-1]), dtype=wp.vec2i)
+            lists.splats = wp.zeros(capacity, dtype=int)
+            lists.slots = self.pairs.slots
+        self.frame.lists = lists
+        self._pair_rows: dict[int, Rows] = {}
+
+    def pair_rows(self, length: int) -> Rows:
+        """Return rows of that length for all pairs, allocated when first asked for and shared by all that use them."""
+        if length not in self._pair_rows:
+            self._pair_rows[length] = Rows.zeros(self.pair_capacity, length, self.device)
+        return self._pair_rows[length]
+
+    def zero_blocks(self, value_count: int, normals: wp.array) -> ChannelBlocks:
+        """Return where channels come from or their gradients go: values and colours of their own, normals if drawn."""
+        blocks = ChannelBlocks()
+        blocks.values = wp.zeros((self.gaussian_count if value_count else 0, value_count), dtype=float)
+        blocks.colors = wp.zeros(self.splat_count if self.channels.colors else 0, dtype=wp.vec3)
+        blocks.normals = normals if self.channels.normals else wp.zeros(0, dtype=wp.vec3)
+        return blocks
+
+    def _require_room(self, other: FrameBuffers) -> None:
+        """Refuse buffers whose images cannot hold this frame's."""
+        found = other.pixel_count, other.channels.count, other.device
+        needed = self.pixel_count, self.channels.count, self.device
+        if found[0] < needed[0] or found[1:] != needed[1:]:
+            raise InvalidOptionError(
+                f"images_of must have at least {needed[0]} pixels of {needed[1]} channels on {needed[2]}, got "
+                f"{found[0]} of {found[1]} on {found[2]}. Make the rasteriser of the most pixels first."
+            )
+
+    def _allocate_splats(self) -> None:
+        """Allocate splats, their channels and their order."""
+        count = self.splat_count
+        self.splats = zero_splats(count)
+        self.rows = channel_rows(count, self.channels.count, self.device)
+        self.blocks = self.zero_blocks(0, self.splats.normals)
+        self.keys = wp.zeros(2 * count, dtype=int)
+        self.order = SplatOrder()
+        self.order.splats = wp.zeros(2 * count, dtype=int)
+        self.order.counts = wp.zeros(count, dtype=int)
+        self.order.ends = wp.zeros(count, dtype=int)
+
+    def _allocate_images(self, images_of: FrameBuffers | None) -> None:
+        """Allocate images, or take the first pixels of another frame's."""
+        if images_of is None:
+            self.drawn = _zero_images(self.pixel_count, has_states=not self.device.is_cuda)
+            self.channel_images = channel_rows(self.pixel_count, self.channels.count, self.device)
+        else:
+            self.drawn = _first_pixels_of(images_of.drawn, self.pixel_count)
+            self.channel_images = [Rows.of(rows.matrix[: self.pixel_count]) for rows in images_of.channel_images]
+        self.images = RasterImages(
+            tuple(image.matrix for image in self.channel_images),
+            self.drawn.alpha,
+            self.drawn.depth,
+            self.drawn.median_depth,
+        )
+
+    def _describe_frame(self, options: RasterOptions) -> None:
+        """Tell kernels how splats are made and what is composited."""
+        self.views = wp.array(self.layout.views, dtype=RasterView)
+        self.projection = Projection()
+        self.projection.low_pass = options.low_pass
+        self.projection.near = options.near
+        self.projection.antialiased = int(options.antialiased)
+        self.frame = RasterFrame()
+        self.frame.splats = self.splats
+        self.frame.views = self.views
+        self.frame.tile_views = wp.array(self.layout.tile_views, dtype=int)
+        self.frame.gaussian_count = self.gaussian_count
+        self.frame.near = options.near
+
+
+def zero_splats(count: int) -> Splats:
+    """Allocate splats on the current device."""
+    splats = Splats()
+    for name, dtype in (("centers", wp.vec4), ("shapes", wp.vec4), ("slopes", wp.vec4), ("bends", float)):
+        setattr(splats, name, wp.zeros(count, dtype=dtype))
+    splats.normals = wp.zeros(count, dtype=wp.vec3)
+    return splats
+
+
+def _zero_images(pixel_count: int, *, has_states: bool) -> Images:
+    """Allocate images on the current device."""
+    images = Images()
+    for name in ("alpha", "transmittance", "depth", "median_depth"):
+        setattr(images, name, wp.zeros(pixel_count, dtype=float))
+    for name in ("gaussians", "ends", "medians"):
+        setattr(images, name, wp.zeros(pixel_count, dtype=int))
+    images.states = wp.zeros(pixel_count if has_states else 0, dtype=wp.vec4)
+    return images
+
+
+def _first_pixels_of(images: Images, pixel_count: int) -> Images:
+    """Return the beginning of images, in the same memory."""
+    part = Images()
+    for name in ("alpha", "transmittance", "depth", "median_depth", "gaussians", "ends", "medians", "states"):
+        whole = getattr(images, name)
+        setattr(part, name, whole[:pixel_count] if len(whole) else whole)
+    return part

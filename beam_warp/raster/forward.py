@@ -1,0 +1,129 @@
+"""Drawing a frame, step by step: project, sort, list the splats of every tile, composite."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from beam_warp.errors import InvalidArrayError
+from beam_warp.kernels.raster.bin_tiles import (
+    Band,
+    launch_count_pairs,
+    launch_emit_pairs,
+    launch_find_ranges,
+    launch_key_splats,
+)
+from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors, launch_gather_channels
+from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, launch_composite_pixels
+from beam_warp.kernels.raster.composite_cpu import launch_composite_cpu
+from beam_warp.kernels.raster.composite_cuda import launch_composite_cuda
+from beam_warp.kernels.raster.project import launch_project
+from beam_warp.raster.buffers import FrameBuffers
+from beam_warp.raster.records import GaussianArrays
+
+MAX_BAND_PAIRS = 2**24
+"""Most (tile, splat) pairs held at a time: 24 bytes each, and on the way back up to 128 more for each length of rows.
+Images that need more are drawn in bands of tile rows."""
+
+MAX_ROW_PAIRS = 2**29
+"""Most pairs in one row of tiles, the least that can be drawn: with `SPARE_CAPACITY`, and as much again for sorting, a
+list's length is still a 32-bit integer."""
+
+SPARE_CAPACITY = 1.25
+"""Room for pairs over what the first frame needs: the next ones need a little more."""
+
+
+def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
+    """Make splats of the Gaussians, their rows of channels and their order in depth."""
+    launch_project(gaussians[:4], buffers.views, buffers.projection, buffers.splats, buffers.device)
+    if buffers.channels.colors:
+        launch_evaluate_colors(
+            gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors, buffers.device
+        )
+    if buffers.channels.values:
+        buffers.blocks.values = gaussians.values
+    gather_channels(buffers)
+    launch_key_splats(buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
+    if buffers.splat_count:
+        wp.utils.radix_sort_pairs(buffers.keys, buffers.order.splats, buffers.splat_count)
+
+
+def gather_channels(buffers: FrameBuffers) -> None:
+    """Write every splat's row of channels."""
+    for i, rows in enumerate(buffers.rows):
+        launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
+
+
+def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
+    """Cut the tiles into runs of rows whose pairs fit, usually one, and make room for the largest.
+
+    Raises:
+        InvalidArrayError: A row of tiles alone has too many pairs.
+    """
+    first_tiles = buffers.layout.first_tiles
+    bands, most = [], 0
+    waiting = [(0, len(first_tiles) - 1)]
+    while waiting:
+        first, end = waiting.pop()
+        band = (int(first_tiles[first]), int(first_tiles[end]))
+        count_pairs(buffers, band)
+        pairs = counted_pairs(buffers)
+        if pairs > MAX_BAND_PAIRS and end - first > 1:
+            middle = (first + end) // 2
+            waiting += [(middle, end), (first, middle)]
+            continue
+        if pairs > MAX_ROW_PAIRS:
+            raise InvalidArrayError(
+                f"positions and scales must cover a row of tiles at most {MAX_ROW_PAIRS} times, got {pairs} "
+                f"at tile row {first}. Drop Gaussians that are larger than the scene."
+            )
+        bands.append(band)
+        most = max(most, pairs)
+    if most > buffers.pair_capacity:
+        buffers.reserve(int(SPARE_CAPACITY * most))
+    return bands
+
+
+def count_pairs(buffers: FrameBuffers, tiles: tuple[int, int]) -> None:
+    """Count the pairs of a band of tiles, splat by splat in depth order, and sum the counts up."""
+    band = Band()
+    band.first_tile, band.end_tile = tiles
+    buffers.frame.band = band
+    order = buffers.order
+    launch_count_pairs(
+        order.splats, buffers.splats, buffers.views, buffers.gaussian_count, band, order.counts, buffers.device
+    )
+    if buffers.splat_count:
+        wp.utils.array_scan(order.counts, order.ends, inclusive=True)
+
+
+def counted_pairs(buffers: FrameBuffers) -> int:
+    """Return how many pairs the band that was counted last has; waits for the device."""
+    if not buffers.splat_count:
+        return 0
+    if buffers.splat_count * int(buffers.layout.first_tiles[-1]) < 2**31:
+        return int(buffers.order.ends[-1:].numpy()[0])
+    return int(buffers.order.counts.numpy().sum(dtype=np.int64))  # the ends may be beyond the range of integers
+
+
+def list_pairs(buffers: FrameBuffers) -> None:
+    """List the splats of every tile of the band that was counted last."""
+    frame, pairs = buffers.frame, buffers.pairs
+    band = frame.band
+    tile_count = band.end_tile - band.first_tile
+    frame.lists.ranges.zero_()
+    if not buffers.pair_capacity:
+        return
+    buffers.listed_tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
+    launch_emit_pairs(buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band, pairs, buffers.device)
+    wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
+    launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
+
+
+def composite(buffers: FrameBuffers, *, readable: bool) -> None:
+    """Draw the tiles of the band that was listed last."""
+    draw = launch_composite_cuda if buffers.device.is_cuda else launch_composite_cpu
+    if readable:
+        draw = launch_composite_pixels
+    for rows, image in zip(buffers.rows, buffers.channel_images, strict=True):
+        draw(buffers.frame, rows.vectors, buffers.exact, image.vectors, buffers.drawn, buffers.device)

@@ -1,0 +1,21 @@
+"""Random clouds and cameras around them, for tests of the rasteriser."""
+
+import numpy as np
+
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+
+
+def around(width=40, height=36, azimuth=20.0):
+    return Camera.orbit((0, 0, 0), 2.5, azimuth, 10.0, width=width, height=height, vertical_fov=50.0)
+
+
+def cloud(rng, count=200, **more):
+    orientations = rng.normal(size=(count, 4))
+    return GaussianCloud(
+        positions=rng.uniform(-1, 1, (count, 3)),
+        orientations=orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
+        scales=np.exp(rng.normal(-2.5, 0.6, (count, 3))),
+        opacities=rng.uniform(0.05, 0.95, count),
+        **more,
+    )
