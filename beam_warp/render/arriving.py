@@ -25,12 +25,12 @@ from beam_warp.kernels.render.gaussian_light import RegionShadows, launch_light_
 from beam_warp.kernels.render.shadow_maps import ShadowMaps
 from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows
 from beam_warp.kernels.trace.incident_light import LightMoments
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import NO_LIGHT, PreparedEnvironments
 from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.raster.records import GaussianArrays
 from beam_warp.render.options import DeferredOptions
-from beam_warp.render.shadow_maps import ShadowDrawer, ShadowView, Subject, distant_view, light_views
+from beam_warp.render.shadow_maps import ShadowCasters, ShadowDrawer, ShadowView, distant_view, light_views
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.lights import Light
 
@@ -39,32 +39,6 @@ CLUSTER_COUNT = 1024
 
 LIGHT_TAPS, REGION_TAPS = (16, 32), (8, 12)
 """Taps that search, and that filter: of a light's map, and of a region's, whose errors are averaged over regions."""
-
-KEPT_ENVIRONMENTS = 8
-"""How many environments made ready are kept."""
-
-NO_LIGHT = EnvironmentMap.constant((0.0, 0.0, 0.0), height=4)
-"""What stands for no environment."""
-
-
-class PreparedEnvironments:
-    """Environments made ready on a device, the last few that were asked for."""
-
-    def __init__(self, region_count: int, device: Any) -> None:
-        """Begin without any; ``region_count`` 0 cuts none."""
-        self._region_count, self._device = region_count, device
-        self._kept: dict[EnvironmentMap, tuple[EnvironmentLighting, EnvironmentRegions | None]] = {}
-
-    def of(self, environment: EnvironmentMap) -> tuple[EnvironmentLighting, EnvironmentRegions | None]:
-        """Return what was made of an environment; it is made if it is not the same object as one of the last few."""
-        if environment not in self._kept:
-            lighting = EnvironmentLighting.from_environment(environment, device=str(self._device))
-            lit = self._region_count and environment is not NO_LIGHT
-            regions = EnvironmentRegions.of(environment, self._region_count) if lit else None
-            self._kept[environment] = (lighting, regions)
-            if len(self._kept) > KEPT_ENVIRONMENTS:
-                del self._kept[next(iter(self._kept))]
-        return self._kept[environment]
 
 
 class ArrivingLight:
@@ -113,22 +87,23 @@ class ArrivingLight:
             wp.copy(self._clusters.order, items, count=self._count)
 
     def set_environment(
-        self, environment: EnvironmentMap | None, degrees: float, subject: Subject, *, moved: bool
+        self, environment: EnvironmentMap | None, degrees: float, casters: ShadowCasters, *, moved: bool
     ) -> None:
         """Take an environment, as turned about z; ``moved`` says that what casts shadows is another."""
-        shown = environment or NO_LIGHT
+        shown = self._environments.of(environment)
         if (shown, degrees) == self._shown and not moved:
             return
-        lighting, regions = self._environments.of(shown)
         if self._shown is None or shown is not self._shown[0]:
-            self.distant.light = lighting.light
+            self.distant.light = shown.blurred
             self.generation += 1
+        count = 0 if shown.environment is NO_LIGHT else self._options.environment_shadows
+        regions = shown.regions(count).turned(degrees) if count else None
         angle = np.radians(degrees)
         self.distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
-        self._set_regions(None if regions is None else regions.turned(degrees), subject)
+        self._set_regions(regions, casters)
         self._shown = (shown, degrees)
 
-    def _set_regions(self, regions: EnvironmentRegions | None, subject: Subject) -> None:
+    def _set_regions(self, regions: EnvironmentRegions | None, casters: ShadowCasters) -> None:
         """Bring regions to the device."""
         count = 0 if regions is None else len(regions)
         if self._moments.red is None or len(self._moments.red) != count:
@@ -141,18 +116,18 @@ class ArrivingLight:
                 getattr(self._moments, name).assign(moments.astype(np.float32))
             size = self._options.environment_map_size
             pairs = zip(regions.directions, regions.half_angles, strict=True)
-            views = [distant_view(direction, float(half), subject, size) for direction, half in pairs]
-        self._region_drawer = self._moved(self._region_drawer, views, subject, REGION_TAPS)
+            views = [distant_view(direction, float(half), casters, size) for direction, half in pairs]
+        self._region_drawer = self._moved(self._region_drawer, views, casters, REGION_TAPS)
         self.regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
         self.regions.moments = self._moments
         self._stale["regions"] = True
 
-    def set_lights(self, lights: tuple[Light, ...], subject: Subject, *, moved: bool) -> None:
+    def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
         """Take lights; ``moved`` says that what casts shadows is another."""
         if lights == self._lamps and not moved:
             return
         views = [
-            light_views(light, subject, self._options.light_map_size) if light.casts_shadows else [] for light in lights
+            light_views(light, casters, self._options.light_map_size) if light.casts_shadows else [] for light in lights
         ]
         counts = [len(of_light) for of_light in views]
         uploaded = upload_lights(lights, self._device)
@@ -167,24 +142,24 @@ class ArrivingLight:
             for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
                 wp.copy(getattr(self.lights, name), getattr(uploaded, name))
         self._light_drawer = self._moved(
-            self._light_drawer, [view for of_light in views for view in of_light], subject, LIGHT_TAPS
+            self._light_drawer, [view for of_light in views for view in of_light], casters, LIGHT_TAPS
         )
         self.shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
         self._lamps, self._map_counts = lights, counts
         self._stale["lights"] = True
 
     def _moved(
-        self, drawer: ShadowDrawer | None, views: list[ShadowView], subject: Subject, taps: tuple[int, int]
+        self, drawer: ShadowDrawer | None, views: list[ShadowView], casters: ShadowCasters, taps: tuple[int, int]
     ) -> ShadowDrawer | None:
         """Return what draws some views: the same as before if their number is."""
         if not views:
             return None
         if drawer is None:
             self.generation += 1
-            return ShadowDrawer(self._count, views, subject=subject, taps=taps, device=self._device)
-        if drawer.maps.thickness != np.float32(subject.thickness):
+            return ShadowDrawer(self._count, views, casters=casters, taps=taps, device=self._device)
+        if drawer.maps.thickness != np.float32(casters.thickness):
             self.generation += 1
-        drawer.move(views, subject)
+        drawer.move(views, casters)
         return drawer
 
     def draw(self, gaussians: GaussianArrays, mesh: Any) -> None:

@@ -29,14 +29,13 @@ from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.kernels.render.path_tracing import PathImages, PathLight, launch_trace_paths
 from beam_warp.kernels.render.path_vertices import PathMaterials
 from beam_warp.light.ggx import specular_albedo_table
-from beam_warp.light.sampled import product_tree
+from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.trace.camera_rays import pixel_rays
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
 from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.scene import NOTHING, Scene
 from beam_warp.trace.transmittance import EXACT
-from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
 
@@ -44,7 +43,7 @@ PASS_SAMPLES = 16
 """Samples of a pixel between two looks at its noise; fewer where there are too few in all for `FEWEST_PASSES`."""
 
 FEWEST_PASSES = 4
-"""Before a pixel's noise is believed: fewer passes miss what is rare."""
+"""Passes before a pixel's noise is believed: fewer miss what is rare."""
 
 NOISE_BLOCK = 8
 """Pixels are stopped in squares of this side, when the noisiest of a square is good enough: one alone may look good by
@@ -54,7 +53,8 @@ WARP_TILE = (8, 4)
 """Columns and rows of pixels that the threads of a warp trace."""
 
 DARKEST = 1e-3
-"""Luminance below which noise counts as if there: the square root's slope has no bound at black."""
+"""Luminance that darker pixels are taken to have where their noise is judged:
+the slope of the square root has no bound at black."""
 
 CHECKPOINT_SECONDS = 10.0
 """Time between two checkpoints."""
@@ -130,7 +130,7 @@ class PathRenderer:
         self.options = options or PathOptions()
         self.device = resolve_device(device)
         self._geometry: _Geometry | None = None
-        self._environment: tuple[EnvironmentMap, Any] | None = None
+        self._environments = PreparedEnvironments(self.device)
         self._albedo_table = upload(specular_albedo_table(), wp.vec2, self.device)
 
     def start(self, shot: Shot) -> PathProgress:
@@ -176,19 +176,14 @@ class PathRenderer:
     def _light(self, shot: Shot, geometry: _Geometry) -> PathLight:
         """Bring all that sheds light to the device."""
         light = PathLight()
-        environment = shot.environment or _BLACK
-        if self._environment is None or self._environment[0] is not environment:
-            self._environment = (environment, product_tree(environment, self.device))
-        light.environment = self._environment[1]
-        light.has_environment = int(bool(environment.radiance.any()))
+        shown = self._environments.of(shot.environment)
+        light.environment = shown.product_tree
+        light.has_environment = int(bool(shown.environment.radiance.any()))
         turn = np.radians(shot.environment_rotation)
         light.turn = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
         light.lights = upload_lights(shot.lights, self.device, geometry.scene.origin)
         light.albedo_table = self._albedo_table
         return light
-
-
-_BLACK = EnvironmentMap.constant((0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +346,7 @@ class PathProgress:
         """Write what is done to a file, in one step.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         arrays = {name: getattr(self._images, name).numpy() for name in IMAGES}
         with replacing(path) as temporary, temporary.open("wb") as file:

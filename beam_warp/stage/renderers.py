@@ -1,4 +1,4 @@
-"""Either renderer at work on the frames of a sequence: what it is told of a frame, and what decides its images."""
+"""The renderers of a sequence's frames: each adapts one renderer to frames, and states the options that decide images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beam_warp.stage.jobs import FrameContext
 from beam_warp.world.shot import RenderedImage, Shot
 
 SEED_STEP = 0x9E3779B9
-"""Between the seeds of two frames, modulo 2^32; odd, so that no two frames share one."""
+"""Difference between the seeds of two frames, modulo 2^32. It is odd, so that no two frames share a seed."""
 
 
 class DeferredFrames:

@@ -28,7 +28,7 @@ from beam_warp.light.ggx import (
     smith_lambda,
     specular_albedo,
 )
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
@@ -207,7 +207,7 @@ def sky():
     def on(device):
         if device not in prepared:
             height = 64
-            prepared[device] = EnvironmentLighting.from_environment(
+            prepared[device] = PreparedEnvironment(
                 EnvironmentMap(structured(texel_directions(height, 2 * height)).astype(np.float32)), device=device
             )
         return prepared[device]
@@ -342,7 +342,7 @@ class TestResidues:
     @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
     def test_white_furnace(self, device, rng, roughness):
         """A white open surface under uniform light of radiance 1 sends 1 to every view: L_D share + L_S."""
-        white = EnvironmentLighting.from_environment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
+        white = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
         normals = unit(rng.normal(size=(33, 3)))
         directions, _, visibility = even_rays(normals, 256)
         weights = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)[..., None] * 4.0 * np.ones(3)

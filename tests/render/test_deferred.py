@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.figure_asset import figure_asset
+from support.split_sum import shade
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
-from beam_warp.render.split_sum import relight
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 from beam_warp.world.gaussians import GaussianCloud
@@ -192,14 +192,21 @@ def test_shadows_of_gaussians_on_gaussians(device):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 180.0])
-def test_without_shadows_it_is_relight(device, rng, degrees):
-    """Pixel by pixel, up to rounding: sums of some fifty float32 terms; a half turn of the map is a copy."""
+def test_without_shadows_it_is_the_split_sum(device, rng, degrees):
+    """Pixel by pixel of the G-buffer, to rounding: sums of some fifty float32 terms. Half a turn of the light is half a
+    turn of normals and views, which changes signs."""
     cloud = figure()[0]
     view = figure_camera(cloud)
     light = random_light(rng)
     found = render(Shot(cloud=cloud, camera=view, environment=light, environment_rotation=degrees), device)
-    lighting = EnvironmentLighting.from_environment(light, device=device)
-    expected = relight(rasterize(cloud, view, device=device), lighting if degrees == 0.0 else lighting.turned_around())
+    buffer = rasterize(cloud, view, device=device)
+    turn = 1.0 if degrees == 0.0 else np.array([-1.0, -1.0, 1.0])
+    expected = shade(
+        PreparedEnvironment(light, device),
+        **buffer.channels | {"normals": turn * buffer.channels["normals"]},
+        alpha=buffer.alpha,
+        view_directions=turn * view.directions(),
+    )
     np.testing.assert_allclose(found.rgb, expected, rtol=200 * FLOAT32, atol=200 * FLOAT32 * expected.max())
 
 

@@ -8,7 +8,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.render.shadow_maps import ShadowMaps, face_towards, visible_share
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.render import shadow_maps
-from beam_warp.render.shadow_maps import FAR, ROOM, ShadowDrawer, Subject, disc_taps, distant_view, light_views
+from beam_warp.render.shadow_maps import FAR, ROOM, ShadowCasters, ShadowDrawer, disc_taps, distant_view, light_views
 from beam_warp.trace.mesh_paths import TracedMesh
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
@@ -88,14 +88,14 @@ def square(z, half=0.5, x=0.0):
 def drawn(light, cloud, subject, device, size=128, mesh=None):
     target = resolve_device(device)
     views = light_views(light, subject, size)
-    drawer = ShadowDrawer(len(cloud), views, subject=subject, taps=TAPS, device=target)
+    drawer = ShadowDrawer(len(cloud), views, casters=subject, taps=TAPS, device=target)
     traced = None if mesh is None else TracedMesh.from_mesh(mesh, device=device)
     drawer.draw(upload_gaussians(cloud, target), None if traced is None else traced.surface)
     drawer.kept = traced
     return drawer
 
 
-SUBJECT = Subject(np.zeros(3), 1.0)
+SUBJECT = ShadowCasters(np.zeros(3), 1.0)
 
 
 # ---- where views stand ----------------------------------------------------------------------------------------------
@@ -145,15 +145,15 @@ def test_directions_of_a_distant_view_are_nearly_parallel(rng):
 
 def test_the_subject_is_what_is_there():
     cloud = discs([[0, 0, 0], [2, 0, 0]], UP, 0.01)
-    subject = Subject.of(cloud)
+    subject = ShadowCasters.of(cloud)
     np.testing.assert_allclose(subject.center, [1, 0, 0])
     assert subject.radius == pytest.approx(1.0)
     assert subject.thickness == pytest.approx(0.01)
     vertices = np.array([[0, 0, 0], [0, 0, 4]], np.float32)
-    assert Subject.of(empty(), vertices).radius == pytest.approx(2.0)
-    assert Subject.of(empty()).radius > 0.0
+    assert ShadowCasters.of(empty(), vertices).radius == pytest.approx(2.0)
+    assert ShadowCasters.of(empty()).radius > 0.0
     props = np.array([[1, 1.5, 0], [50, 0, 0]], np.float32)  # one is near
-    assert Subject.of(cloud, props).radius == pytest.approx(1.25)
+    assert ShadowCasters.of(cloud, props).radius == pytest.approx(1.25)
 
 
 def test_taps_are_spread_over_the_disc():
@@ -224,7 +224,7 @@ def test_a_point_light_inside_sees_all_around(device):
     light = PointLight(position=(0.1, 0.0, -0.1), intensity=(1, 1, 1))
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     cloud = discs(np.asarray(light.position) + 0.4 * axes, axes, 0.05)
-    drawer = drawn(light, cloud, Subject(np.zeros(3), 1.0, 0.002), device)
+    drawer = drawn(light, cloud, ShadowCasters(np.zeros(3), 1.0, 0.002), device)
     assert len(drawer.cameras) == 6
     behind = np.asarray(light.position) + 0.9 * axes
     assert visible(drawer, behind, -axes, light).max() < 0.02
@@ -241,7 +241,7 @@ def test_a_point_light_inside_sees_all_around(device):
 def test_a_translucent_layer_lets_the_rest_through(device, opacity):
     """One flat Gaussian of 0.3 m: under its middle, within two texels of 0.017 m, its response is above 1 - 0.013."""
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
-    drawer = drawn(light, discs([[0, 0, 0.5]], UP, 0.3, opacity), Subject(np.zeros(3), 1.0, 0.01), device)
+    drawer = drawn(light, discs([[0, 0, 0.5]], UP, 0.3, opacity), ShadowCasters(np.zeros(3), 1.0, 0.01), device)
     assert visible(drawer, [[0, 0, -0.5]], UP)[0] == pytest.approx(1.0 - opacity, abs=0.015 * opacity)
     assert visible(drawer, [[0, 0, 0.8]], UP)[0] == 1.0
 
@@ -251,7 +251,7 @@ def test_two_layers_of_gaussians(device):
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
     cloud = discs([[0, 0, 0.5], [0, 0, -0.5]], UP, 0.3, 0.99)
     opacities = np.array([0.7, 0.99], np.float32)
-    drawer = drawn(light, cloud.with_arrays(opacities=opacities), Subject(np.zeros(3), 1.0, 0.01), device)
+    drawer = drawn(light, cloud.with_arrays(opacities=opacities), ShadowCasters(np.zeros(3), 1.0, 0.01), device)
     assert visible(drawer, [[0, 0, -0.5]], UP)[0] == pytest.approx(0.3, abs=0.03)
 
 
@@ -265,7 +265,7 @@ def test_a_layer_does_not_shadow_itself(device, rng):
     cloud = discs(positions, normals, 0.0225)  # 6 on top of each other
     for diameter in (0.0, 0.53, 40.0):
         light = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
-        drawer = drawn(light, cloud, Subject.of(cloud), device, size=256)
+        drawer = drawn(light, cloud, ShadowCasters.of(cloud), device, size=256)
         cosine = normals @ -np.asarray(light.direction)
         share = visible(drawer, positions, normals)
         assert share[cosine > 0.3].min() > 0.98
@@ -290,7 +290,7 @@ def test_a_plane_of_triangles_does_not_shadow_itself(device):
 def test_redraw_and_move_are_draw(device):
     """Redrawing gives the same bits; so does moving to a light and back."""
     cloud = discs([[0, 0, 0.5]], UP, 0.3, 0.7)
-    subject = Subject(np.zeros(3), 1.0, 0.01)
+    subject = ShadowCasters(np.zeros(3), 1.0, 0.01)
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
     drawer = drawn(light, cloud, subject, device)
     first = drawer.maps.texels.numpy().copy()
@@ -309,7 +309,7 @@ def test_maps_in_groups_are_the_same_maps(device, monkeypatch):
     """Views that are drawn one after the other, into the same images, make the same texels."""
     light = PointLight(position=(0.1, 0.0, -0.1), intensity=(1, 1, 1))
     cloud = discs(0.5 * np.eye(3), np.eye(3), 0.1)
-    subject = Subject(np.zeros(3), 1.0, 0.002)
+    subject = ShadowCasters(np.zeros(3), 1.0, 0.002)
     whole = drawn(light, cloud, subject, device, mesh=square(-0.5))
     monkeypatch.setattr(shadow_maps, "GROUP_SPLATS", 13)
     grouped = drawn(light, cloud, subject, device, mesh=square(-0.5))

@@ -20,29 +20,20 @@ from beam_warp.stability.relighting import (
     run_relighting_case,
     run_relighting_cases,
 )
-from beam_warp.stability.relighting_cases import (
-    DEFERRED,
-    FIREFLY,
-    GRAZING,
-    PATH,
-    RELIGHTING_CASES,
-    RENDERERS,
-    Demand,
-    Drawn,
-    RelightStress,
-    RelightStudio,
+from beam_warp.stability.relighting_cases import RELIGHTING_CASES
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, RENDERERS, Demand, Drawn, RelightStress
+from beam_warp.stability.relighting_cases.measures import (
     brightness,
     diffuse,
     disc_directions,
-    firefly,
     floor_points,
     in_wall_shadow,
     largest_difference,
     scattered,
     sky_closed_form,
-    white,
     wrong_parts,
 )
+from beam_warp.stability.relighting_cases.scenes import FIREFLY, GRAZING, RelightStudio, firefly, white
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage
