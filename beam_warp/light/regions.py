@@ -31,7 +31,8 @@ class EnvironmentRegions:
 
     Attributes:
         directions: Unit, where each region's power comes from in the mean, ``(K, 3)`` float64.
-        half_angles: Half angle of the disc of even radiance whose directions spread as the region's do [rad], ``(K,)`` float64.
+        half_angles: Half angle of the disc of even radiance whose directions spread as the region's do [rad], ``(K,)``
+            float64.
         moments: Radiance times direction summed over each region, by channel [W/m^2], and half the width that
             `beam_warp.kernels.trace.incident_light.above_horizon` takes, ``(3, K, 4)`` float64.
     """

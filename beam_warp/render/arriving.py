@@ -21,7 +21,7 @@ from beam_warp.kernels.render.cluster_bounces import (
     launch_gather_bounces,
     launch_sum_clusters,
 )
-from beam_warp.kernels.render.gaussian_light import RegionShadows, launch_light_gaussians
+from beam_warp.kernels.render.gaussian_light import RegionShadows, SceneLight, launch_light_gaussians
 from beam_warp.kernels.render.shadow_maps import ShadowMaps
 from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows
 from beam_warp.kernels.trace.incident_light import LightMoments
@@ -45,10 +45,6 @@ class ArrivingLight:
     """Lights and an environment on a device, their shadow maps, and what of them arrives at Gaussians.
 
     Attributes:
-        distant: The environment, for kernels.
-        regions: Its shadows.
-        lights: Other lights.
-        shadows: Theirs.
         generation: Grows whenever what launches are given becomes another: graphs of them must be recorded again.
     """
 
@@ -63,14 +59,14 @@ class ArrivingLight:
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = _zero_clusters(gaussian_count, cluster_count)
             self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
-            self.distant = DistantLight()
-            self.distant.turn = wp.zeros(1, dtype=wp.vec2)
+            self._distant = DistantLight()
+            self._distant.turn = wp.zeros(1, dtype=wp.vec2)
             self._moments = LightMoments()
             self._no_radiosity = wp.zeros(0, dtype=wp.vec3)
         self._no_maps = ShadowMaps()
-        self.regions = RegionShadows()
-        self.lights = Lights()
-        self.shadows = LightShadows()
+        self._regions = RegionShadows()
+        self._lights = Lights()
+        self._shadows = LightShadows()
         self.generation = 0
         self._region_drawer: ShadowDrawer | None = None
         self._light_drawer: ShadowDrawer | None = None
@@ -94,12 +90,12 @@ class ArrivingLight:
         if (shown, degrees) == self._shown and not moved:
             return
         if self._shown is None or shown is not self._shown[0]:
-            self.distant.light = shown.blurred
+            self._distant.light = shown.blurred
             self.generation += 1
         count = 0 if shown.environment is NO_LIGHT else self._options.environment_shadows
         regions = shown.regions(count).turned(degrees) if count else None
         angle = np.radians(degrees)
-        self.distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
+        self._distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
         self._set_regions(regions, casters)
         self._shown = (shown, degrees)
 
@@ -118,8 +114,8 @@ class ArrivingLight:
             pairs = zip(regions.directions, regions.half_angles, strict=True)
             views = [distant_view(direction, float(half), casters, size) for direction, half in pairs]
         self._region_drawer = self._moved(self._region_drawer, views, casters, REGION_TAPS)
-        self.regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
-        self.regions.moments = self._moments
+        self._regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
+        self._regions.moments = self._moments
         self._stale["regions"] = True
 
     def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
@@ -132,19 +128,19 @@ class ArrivingLight:
         counts = [len(of_light) for of_light in views]
         uploaded = upload_lights(lights, self._device)
         if self._lamps is None or counts != self._map_counts:
-            self.lights = uploaded
+            self._lights = uploaded
             starts = np.concatenate([[0], np.cumsum(counts)])[: max(len(lights), 1)]
-            self.shadows.first_maps = upload(starts.astype(np.int32), int, self._device)
-            self.shadows.map_counts = upload(np.array(counts or [0], np.int32), int, self._device)
+            self._shadows.first_maps = upload(starts.astype(np.int32), int, self._device)
+            self._shadows.map_counts = upload(np.array(counts or [0], np.int32), int, self._device)
             self._light_drawer = None
             self.generation += 1
         else:
             for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
-                wp.copy(getattr(self.lights, name), getattr(uploaded, name))
+                wp.copy(getattr(self._lights, name), getattr(uploaded, name))
         self._light_drawer = self._moved(
             self._light_drawer, [view for of_light in views for view in of_light], casters, LIGHT_TAPS
         )
-        self.shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
+        self._shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
         self._lamps, self._map_counts = lights, counts
         self._stale["lights"] = True
 
@@ -191,16 +187,20 @@ class ArrivingLight:
         drawers = (self._region_drawer, self._light_drawer)
         return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
 
+    def scene_light(self) -> SceneLight:
+        """Return what kernels take, as it is now: a struct copies the structs in it."""
+        light = SceneLight()
+        light.environment, light.regions = self._distant, self._regions
+        light.lights, light.shadows = self._lights, self._shadows
+        return light
+
     def _light(self, gaussians: GaussianArrays) -> None:
         """Find what arrives at the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
         launch_light_gaussians(
             gaussians,
-            self.distant,
-            self.regions,
-            self.lights,
-            self.shadows,
+            self.scene_light(),
             self._arriving,
             self._lit,
             self._device,
@@ -212,7 +212,7 @@ class ArrivingLight:
 
     def _bounced(self, gaussians: GaussianArrays) -> wp.array:
         """Return the radiosity of the clusters after all bounces but the last."""
-        launch_sum_clusters(gaussians, self._lit, self.distant.light.albedo_terms, self._clusters, self._device)
+        launch_sum_clusters(gaussians, self._lit, self._distant.light.albedo_terms, self._clusters, self._device)
         radiosity = self._clusters.sent
         for bounce in range(self._options.bounces - 1):
             following = self._radiosity[bounce % 2]

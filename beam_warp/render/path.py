@@ -26,7 +26,7 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.files import replacing
 from beam_warp.kernels.mesh.surface import MeshSurface
-from beam_warp.kernels.render.path_tracing import PathImages, PathLight, launch_trace_paths
+from beam_warp.kernels.render.path_tracing import PathImages, PathLight, PathPass, launch_trace_paths
 from beam_warp.kernels.render.path_vertices import PathMaterials
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.prepared import PreparedEnvironments
@@ -289,6 +289,8 @@ class PathProgress:
         samples = min(wanted, self.options.samples - self.sample_count)
         if self.done:
             return
+        tracing = PathPass()
+        tracing.seed, tracing.samples, tracing.bounces = self.options.seed, samples, self.options.bounces
         launch_trace_paths(
             self._geometry.scene.occluders,
             self._geometry.materials,
@@ -296,9 +298,7 @@ class PathProgress:
             self._light,
             self._rays,
             self._pixels,
-            self.options.seed,
-            samples,
-            self.options.bounces,
+            tracing,
             self._images,
             self._device,
         )

@@ -192,14 +192,12 @@ class DeferredFrame:
 
     def _shade(self) -> None:
         """Light what was drawn."""
-        light, images = self._light, self._rasterizer.images
+        light, images = self._light.scene_light(), self._rasterizer.images
         launch_shade_gaussians(
             self._views,
             images,
             self._options.lights_gaussians,
-            light.distant,
-            light.lights,
-            light.shadows,
+            light,
             self.samples,
             self._device,
         )
@@ -208,10 +206,7 @@ class DeferredFrame:
                 self._views,
                 self._traced.surface,
                 self._catches,
-                light.distant,
-                light.regions,
-                light.lights,
-                light.shadows,
+                light,
                 self._mesh_image,
                 self._mesh_surfaces,
                 self._device,

@@ -1,4 +1,4 @@
-"""The renderers of a sequence's frames: each adapts one renderer to frames, and states the options that decide images."""
+"""Renderers of a sequence's frames: each adapts a renderer, and states the options that decide its images."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ class DirectionalLight:
 
     Attributes:
         direction: World direction in which the light travels, of any length but 0.
-        irradiance: Irradiance on a plane that faces the light [W/m^2], scene-linear Rec.709, in the unit of the environment's
-            radiance times steradian.
+        irradiance: Irradiance on a plane that faces the light [W/m^2], scene-linear Rec.709, in the unit of the
+            environment's radiance times steradian.
         angular_diameter: Angle that the disc of the light takes up [degree], 0 to 90; shadows of 0 are sharp.
         casts_shadows: Whether what is in the way casts a shadow.
 

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import (
-    Demand,
-    RelightStress,
-    relighting_case,
-)
-from beam_warp.stability.relighting_cases.measures import (
-    WRONG_PART,
-    wall_seen,
-    wall_shadow,
-    wrong_parts,
-)
+from beam_warp.stability.relighting_cases.cases import Demand, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.measures import WRONG_PART, wall_seen, wall_shadow, wrong_parts
 from beam_warp.stability.relighting_cases.scenes import (
     GRAZING,
     RADIUS,

@@ -5,14 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.stability.relighting_cases.cases import (
-    DEFERRED,
-    PATH,
-    Demand,
-    Drawn,
-    RelightStress,
-    relighting_case,
-)
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, Drawn, RelightStress, relighting_case
 from beam_warp.stability.relighting_cases.measures import (
     FURNACE,
     brightness,
@@ -20,11 +13,7 @@ from beam_warp.stability.relighting_cases.measures import (
     scattered,
     sky_closed_form,
 )
-from beam_warp.stability.relighting_cases.scenes import (
-    RelightStudio,
-    firefly,
-    white,
-)
+from beam_warp.stability.relighting_cases.scenes import RelightStudio, firefly, white
 from beam_warp.world.lights import SUN_DIAMETER, DirectionalLight
 from beam_warp.world.shot import Shot
 

@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import (
-    Demand,
-    RelightStress,
-    relighting_case,
-)
+from beam_warp.stability.relighting_cases.cases import Demand, RelightStress, relighting_case
 from beam_warp.stability.relighting_cases.measures import (
     FURNACE,
     ROUNDING,

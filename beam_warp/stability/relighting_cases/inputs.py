@@ -6,23 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import (
-    DEFERRED,
-    PATH,
-    Demand,
-    RelightStress,
-    relighting_case,
-)
-from beam_warp.stability.relighting_cases.measures import (
-    ROUNDING,
-    largest_difference,
-)
-from beam_warp.stability.relighting_cases.scenes import (
-    RelightStudio,
-    firefly,
-    sun_at,
-    white,
-)
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.measures import ROUNDING, largest_difference
+from beam_warp.stability.relighting_cases.scenes import RelightStudio, firefly, sun_at, white
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import Shot
 

@@ -94,11 +94,7 @@ def floor_points(camera: Camera) -> NDArray[np.float64]:
     """Return where the middles of pixels see z = 0, ``(H, W, 3)``."""
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     local = np.stack(
-        [
-            (column - camera.center_x) / camera.focal_x,
-            (row - camera.center_y) / camera.focal_y,
-            np.ones_like(row),
-        ],
+        [(column - camera.center_x) / camera.focal_x, (row - camera.center_y) / camera.focal_y, np.ones_like(row)],
         axis=-1,
     )
     directions = local @ camera.camera_to_world[:3, :3].T

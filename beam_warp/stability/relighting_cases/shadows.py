@@ -6,13 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import (
-    DEFERRED,
-    Demand,
-    Drawn,
-    RelightStress,
-    relighting_case,
-)
+from beam_warp.stability.relighting_cases.cases import DEFERRED, Demand, Drawn, RelightStress, relighting_case
 from beam_warp.stability.relighting_cases.measures import (
     ROUNDING,
     WRONG_PART,
@@ -25,15 +19,7 @@ from beam_warp.stability.relighting_cases.measures import (
     wall_shadow,
     wrong_parts,
 )
-from beam_warp.stability.relighting_cases.scenes import (
-    ACNE,
-    GRAZING,
-    RADIUS,
-    THICKNESS,
-    WALL,
-    RelightStudio,
-    sun_at,
-)
+from beam_warp.stability.relighting_cases.scenes import ACNE, GRAZING, RADIUS, THICKNESS, WALL, RelightStudio, sun_at
 from beam_warp.world.lights import PointLight
 from beam_warp.world.shapes import Surface
 from beam_warp.world.shot import Shot
@@ -135,12 +121,7 @@ def acne(studio: RelightStudio) -> RelightStress:
             Shot(cloud=cloud, camera=camera, lights=(replace(sun, casts_shadows=shadows),)) for shadows in (True, False)
         ),
         demands=(
-            Demand(
-                what="falsely shadowed",
-                measure=dark,
-                high=0.0,
-                because="a level floor is open: closed form",
-            ),
+            Demand(what="falsely shadowed", measure=dark, high=0.0, because="a level floor is open: closed form"),
             Demand(
                 what="light that arrives, of all",
                 measure=lambda drawn: float(arriving_part(*drawn.images)[inside].mean()),
