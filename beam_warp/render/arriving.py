@@ -1,8 +1,8 @@
-"""What light arrives where, for deferred shading: shadow maps of lights and of an environment's regions, and bounces.
+"""Light that reaches Gaussians in deferred shading: shadow maps of lights and of an environment's regions, and bounces.
 
-The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. What
-arrives at a Gaussian is the irradiance in closed form times the share that its regions leave, and what surfaces around
-it send (``kernels/render/cluster_bounces.py``); it is blended into pixels like a material.
+The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. A
+Gaussian gets the irradiance in closed form times the share that the regions' shadows leave, and what surfaces around it
+send (``kernels/render/cluster_bounces.py``). Both are blended into pixels like a material.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ LIGHT_TAPS, REGION_TAPS = (16, 32), (8, 12)
 
 
 class ArrivingLight:
-    """Lights and an environment on a device, their shadow maps, and what of them arrives at Gaussians.
+    """Lights and an environment on a device, their shadow maps, and the irradiance that reaches Gaussians.
 
     Attributes:
-        generation: Grows whenever what launches are given becomes another: graphs of them must be recorded again.
+        generation: Grows whenever launches would be given other arrays: CUDA graphs must be recorded again.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class ArrivingLight:
     def set_environment(
         self, environment: EnvironmentMap | None, degrees: float, casters: ShadowCasters, *, moved: bool
     ) -> None:
-        """Take an environment, as turned about z; ``moved`` says that what casts shadows is another."""
+        """Take an environment, turned about z; ``moved`` says that something else casts shadows than before."""
         shown = self._environments.of(environment)
         if (shown, degrees) == self._shown and not moved:
             return
@@ -119,7 +119,7 @@ class ArrivingLight:
         self._stale["regions"] = True
 
     def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
-        """Take lights; ``moved`` says that what casts shadows is another."""
+        """Take lights; ``moved`` says that something else casts shadows than before."""
         if lights == self._lamps and not moved:
             return
         views = [
@@ -147,7 +147,7 @@ class ArrivingLight:
     def _moved(
         self, drawer: ShadowDrawer | None, views: list[ShadowView], casters: ShadowCasters, taps: tuple[int, int]
     ) -> ShadowDrawer | None:
-        """Return what draws some views: the same as before if their number is."""
+        """Return a drawer of some views: the same as before if their number is the same."""
         if not views:
             return None
         if drawer is None:
@@ -183,19 +183,19 @@ class ArrivingLight:
 
     @property
     def capacities(self) -> tuple[int, ...]:
-        """Room for pairs of what draws maps: where it changes, graphs must be recorded again."""
+        """Room for pairs of splats and tiles in the drawers: where it changes, graphs must be recorded again."""
         drawers = (self._region_drawer, self._light_drawer)
         return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
 
     def scene_light(self) -> SceneLight:
-        """Return what kernels take, as it is now: a struct copies the structs in it."""
+        """Return the struct that kernels take. It is made anew each time: a struct copies the structs in it."""
         light = SceneLight()
         light.environment, light.regions = self._distant, self._regions
         light.lights, light.shadows = self._lights, self._shadows
         return light
 
     def _light(self, gaussians: GaussianArrays) -> None:
-        """Find what arrives at the Gaussians."""
+        """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
         launch_light_gaussians(

@@ -24,7 +24,7 @@ from beam_warp.world.shot import RenderedImage, Shot
 
 
 class DeferredRenderer:
-    """Renders shots by deferred shading; see `beam_warp.world.shot.Renderer`.
+    """Renders shots by deferred shading; a `beam_warp.world.shot.Renderer`.
 
     What two shots share is kept from one to the next: environments made ready, arrays on the device if there are as
     many Gaussians and pixels, shadow maps if neither what casts them nor their light changed.

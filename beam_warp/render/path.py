@@ -115,7 +115,7 @@ class PathOptions:
 
 
 class PathRenderer:
-    """Path traces shots; what two shots share, geometry and environment, is made ready once."""
+    """Path traces shots, a `beam_warp.world.shot.Renderer`. What two shots share is prepared once."""
 
     def __init__(self, options: PathOptions | None = None, *, device: str | None = None) -> None:
         """Choose the device.
@@ -134,7 +134,7 @@ class PathRenderer:
         self._albedo_table = upload(specular_albedo_table(), wp.vec2, self.device)
 
     def start(self, shot: Shot) -> PathProgress:
-        """Make a shot ready; nothing is traced yet."""
+        """Prepare a shot; nothing is traced yet."""
         held = self._geometry
         if held is None or held.cloud is not shot.cloud or held.mesh is not shot.mesh:
             self._geometry = held = _Geometry.of(shot.cloud, shot.mesh, self.device)
@@ -174,7 +174,7 @@ class PathRenderer:
         return image
 
     def _light(self, shot: Shot, geometry: _Geometry) -> PathLight:
-        """Bring all that sheds light to the device."""
+        """Bring environment and lights to the device."""
         light = PathLight()
         shown = self._environments.of(shot.environment)
         light.environment = shown.product_tree
@@ -188,7 +188,7 @@ class PathRenderer:
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What paths meet, on a device."""
+    """Everything that paths can meet, on a device."""
 
     cloud: GaussianCloud
     mesh: ShotMesh | None
@@ -307,7 +307,7 @@ class PathProgress:
             self._keep_noisy(self.options.target_error)
 
     def image(self, *, denoiser: Denoiser = "none") -> RenderedImage:
-        """Return what is known by now.
+        """Return the image of the samples so far.
 
         Args:
             denoiser: What takes noise off the radiance, one of `beam_warp.trace.denoise.DENOISERS`.

@@ -1,6 +1,6 @@
-"""What renderers make of subjects and lights on which relighting fails: what was measured, and whether it holds.
+"""Both renderers on the cases on which relighting fails: measured numbers, and whether they hold.
 
-The path tracer draws every case with several seeds: what is measured is the mean over them, with its standard error
+The path tracer draws every case with several seeds: a measured number is the mean over them, with its standard error
 from their spread. A bound is missed if the mean is beyond it by more than chance explains; if chance explains more than
 the bounds leave room for, nothing was shown, and that is a fault too.
 """

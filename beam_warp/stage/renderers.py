@@ -1,4 +1,4 @@
-"""Renderers of a sequence's frames: each adapts a renderer, and states the options that decide its images."""
+"""Either renderer at work on the frames of a sequence: what it is told of a frame, and what decides its images."""
 
 from __future__ import annotations
 

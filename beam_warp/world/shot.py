@@ -1,4 +1,4 @@
-"""What one rendered image is made of, and what a renderer gives back: the same for every renderer."""
+"""A shot, which is everything that one image is rendered from, the rendered image, and the protocol of renderers."""
 
 from __future__ import annotations
 
@@ -99,7 +99,10 @@ class RenderedImage:
 
 
 class Renderer(Protocol):
-    """Renders shots, one after the other; what two shots share is made ready once."""
+    """Renders shots, one after the other. What two shots share is prepared once.
+
+    `beam_warp.render.deferred.DeferredRenderer` and `beam_warp.render.path.PathRenderer` are the renderers.
+    """
 
     def draw(self, shot: Shot) -> RenderedImage:
         """Render one image."""

@@ -108,7 +108,7 @@ def view_albedo(light: EnvironmentLight, normal: wp.vec3, view: wp.vec3, roughne
 
 
 @wp.func
-def environment_radiance(
+def split_sum_radiance(
     light: EnvironmentLight,
     base_color: wp.vec3,
     roughness: float,

@@ -6,10 +6,10 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.light.shading import (
     MIN_N_DOT_V,
-    environment_radiance,
     reflected_radiance,
     seen_normal,
     specular_occlusion,
+    split_sum_radiance,
     view_albedo,
 )
 from beam_warp.kernels.raster.project import View
@@ -100,7 +100,7 @@ def shade_gaussians_kernel(
             toward,
         )
     else:
-        radiance = environment_radiance(
+        radiance = split_sum_radiance(
             light.environment.light,
             base_color,
             roughness,

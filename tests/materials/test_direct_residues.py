@@ -109,7 +109,7 @@ class Points:
         found.specular = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         found.diffuse_share = wp.zeros(shape, dtype=float, device=self.device)
         launch_view_residues(
-            self.batch, self.rays, self.light, sky.light, self.surface, int(diffuse_weight), found, self.device
+            self.batch, self.rays, self.light, sky.blurred, self.surface, int(diffuse_weight), found, self.device
         )
         return found.specular.numpy(), found.diffuse_share.numpy()
 

@@ -1,10 +1,10 @@
-"""The split sum at given surfaces: `environment_radiance`, which the deferred renderer's kernels call, on its own."""
+"""The split sum at given surfaces: `split_sum_radiance`, which the deferred renderer's kernels call, on its own."""
 
 import numpy as np
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.light.shading import EnvironmentLight, environment_radiance
+from beam_warp.kernels.light.shading import EnvironmentLight, split_sum_radiance
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 wp.set_module_options({"enable_backward": False})
@@ -25,7 +25,7 @@ def shade_kernel(
     out: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
-    radiance = environment_radiance(light, base_color[i], numbers[i][0], numbers[i][1], normals[i], -views[i])
+    radiance = split_sum_radiance(light, base_color[i], numbers[i][0], numbers[i][1], normals[i], -views[i])
     out[i] = radiance * numbers[i][2]
 
 

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
+from reference.light_sampling import product_to_square, square_to_product_pdf
 from scipy import stats
 from scipy.stats import qmc
 
@@ -26,9 +27,7 @@ from beam_warp.kernels.light.environment_sampling import radiance_over_pdf
 from beam_warp.kernels.light.product_sampling import (
     EnvironmentBlocks,
     launch_accumulate_block_weights,
-    product_to_square,
     square_to_product,
-    square_to_product_pdf,
 )
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.light.sampled import suited_height
