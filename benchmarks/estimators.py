@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
 from beam_warp.demo.figure import build_figure
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.incident import irradiance
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
@@ -251,7 +251,7 @@ def measure_occlusion(scene: Scene, points: NDArray, normals: NDArray) -> dict:
 def measure_sky(
     scene: Scene, points: NDArray, normals: NDArray, sky: EnvironmentMap, before: int | None, with_curves: bool
 ) -> dict:
-    light = SampledEnvironment.from_environment(sky, scene.device)
+    light = PreparedEnvironment(sky, scene.device)
     truth = irradiance(scene, points, normals, light, sample_count=REFERENCE_RAYS, seed=99)
     floor = np.maximum(truth.value, 0.05 * truth.value.mean())
 

@@ -51,8 +51,7 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.relighters import RELIGHTERS
 from beam_warp.jobs.report import versions
-from beam_warp.light.prepared import MaterialLight
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.raster.records import RasterOptions
@@ -171,10 +170,10 @@ class Bench:
     pictures: Path | None
     say: Callable[[str], None]
 
-    def light_of(self, capture: Capture) -> MaterialLight:
+    def light_of(self, capture: Capture) -> PreparedEnvironment:
         """Return the light of a capture, prepared."""
         assert capture.environment_path is not None
-        return MaterialLight.from_environment(EnvironmentMap.read(capture.environment_path), self.device)
+        return PreparedEnvironment(EnvironmentMap.read(capture.environment_path), self.device)
 
     def picture(self, truth: TruthViews, cloud: Any, found: Materials | None, *words: str) -> str | None:
         """Write a row's picture; returns its file's name."""
@@ -218,7 +217,7 @@ def perfect_light(bench: Bench, perfect: PerfectFrame) -> Row:
     rows = np.random.default_rng(0).permutation(seen)[: effort.light_points]
     found: Row = {}
     for name, environment in bench.lights.items():
-        light = SampledEnvironment.from_environment(environment, bench.device)
+        light = PreparedEnvironment(environment, bench.device)
         reference = light_reference(perfect.scene, points, rows, light, effort.reference_rays)
         mean = float(environment.radiance.mean())
         found[name] = {
@@ -393,7 +392,7 @@ def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthV
     scores = truth.score(cloud, done.materials)
     if row.group == "ladder":
         found = done.materials if done.materials.normals is not None else replace(done.materials, normals=normals)
-        scores["relit"] = {name: truth.score_relit(cloud, found, make()) for name, make in RELIGHTERS.items()}
+        scores["relit"] = {name: truth.score_relit(cloud, found, make) for name, make in RELIGHTERS.items()}
     return {
         "seconds": sum(done.seconds.values()),
         "seconds_per_frame": sum(done.seconds.values()) / done.frames,

@@ -19,7 +19,7 @@ from materials_truth import Materials
 from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
 from beam_warp.materials.evidence import view_evidence
@@ -59,7 +59,7 @@ class Subject:
     name: str
     frames: Sequence[SubjectFrame]
     raster: RasterOptions
-    light: MaterialLight
+    light: PreparedEnvironment
     device: Any
     roughness: Any = None
 
@@ -220,7 +220,7 @@ def by_images(subject: Subject, **options: Any) -> Decomposed:
         scene,
         frame.views,
         subject.rough(frame.cloud),
-        subject.light.sampled,
+        subject.light,
         ImagePathOptions(**options),
         raster_options=subject.raster,
         frame=frame.number,

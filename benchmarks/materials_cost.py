@@ -17,7 +17,7 @@ from materials_truth import SHARP, Row
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.demo.capture import dome_cameras
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.images import crop_to_subject
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.sources import upload_gaussians
@@ -88,7 +88,7 @@ def drawn_views(cloud: GaussianCloud, cameras: Sequence[Camera], device: Any) ->
 
 
 def measure_cost(
-    capture: Capture, light: MaterialLight, scale: Scale, device: Any, say: Callable[[str], None]
+    capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any, say: Callable[[str], None]
 ) -> Iterable[tuple[str, Row]]:
     """Yield the whole's rows and three series, each as soon as it is measured."""
     clouds = {count: figure(capture, count, device) for count in sorted({scale.gaussians, *scale.counts})}

@@ -121,8 +121,12 @@ def draw_ablation(part: Row, device: str, path: Path) -> Path:
 
 
 def _relit(row: Row) -> float:
-    """Return the mean PSNR of traced relighting over lights; NaN where a row was not relit."""
-    return float(row.get("relit", {}).get("traced", {}).get("mean", {}).get("psnr", np.nan))
+    """Return the mean PSNR of path traced relighting over lights; NaN where a row was not relit.
+
+    Results of before the path tracer have light gathered at every Gaussian, ``traced``, in its place.
+    """
+    relit = row.get("relit", {})
+    return float(relit.get("path", relit.get("traced", {})).get("mean", {}).get("psnr", np.nan))
 
 
 def draw_cost(part: Row, device: str, path: Path) -> Path:

@@ -24,7 +24,7 @@ from beam_warp.image.metrics import (
     compare,
     mean_scores,
 )
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.gbuffer import rasterize_values
@@ -37,6 +37,7 @@ from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.shot import Shot
 
 Row = dict[str, Any]
 
@@ -118,7 +119,7 @@ class TruthViews:
     def score_relit(self, cloud: GaussianCloud, found: Materials, relighter: Relighter) -> Row:
         """Return means over views of PSNR and SSIM under every light that the truth has, nothing scaled."""
         lit = relightable(cloud, found)
-        how: dict[str, Any] = {"raster": self.raster, "samples": self.samples, "device": self.device}
+        renderer = relighter(self.raster, self.samples, self.device)
         result: Row = {}
         for name, light in self._lights.items():
             shown = [
@@ -126,7 +127,7 @@ class TruthViews:
                 for record, truth in zip(self.records, self._truths, strict=True)
                 if name in record.relit_paths
             ]
-            images = relighter(lit, light, [camera for camera, _, _ in shown], **how)
+            images = [renderer.draw(Shot(cloud=lit, camera=camera, environment=light)) for camera, _, _ in shown]
             scores = [
                 compare(image.rgb, exact, alpha=image.alpha, truth_alpha=true_alpha, is_color=True, premultiplied=True)
                 for image, (_, true_alpha, exact) in zip(images, shown, strict=True)
@@ -265,7 +266,7 @@ class LightReference:
 
 
 def light_reference(
-    scene: Scene, points: SurfacePoints, rows: NDArray[np.int64], light: SampledEnvironment, rays: int
+    scene: Scene, points: SurfacePoints, rows: NDArray[np.int64], light: PreparedEnvironment, rays: int
 ) -> LightReference:
     """Trace many rays, half by the cosine and half by the light, from where measuring would: lifted points."""
     normals = points.normals.numpy()[rows]
@@ -276,7 +277,7 @@ def light_reference(
     return LightReference(lifted, normals, found.value.astype(np.float64), found.standard_error.astype(np.float64))
 
 
-def light_errors(scene: Scene, reference: LightReference, light: SampledEnvironment, **how: Any) -> Row:
+def light_errors(scene: Scene, reference: LightReference, light: PreparedEnvironment, **how: Any) -> Row:
     """Return relative errors of irradiance estimated with the options given.
 
     ``relative_rmse`` is relative to the irradiance at each point, or to a twentieth of its mean where it is less;

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from beam_warp import Camera, EnvironmentMap, Scene, ambient_occlusion, change_axes, rasterize, read, visibility
-from beam_warp.light.prefiltered import EnvironmentLighting
-from beam_warp.render.split_sum import relight
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import UNSHADOWED
+from beam_warp.world.shot import Shot
 
 DEVICES = ("cpu", "cuda:0")
 
@@ -35,6 +36,7 @@ def main() -> int:
     directions = rng.normal(size=origins.shape) + 2.0 * normals
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     camera = Camera.frame_cloud(cloud.positions, cloud.opacities, azimuth=25.0, elevation=8.0, width=512, height=512)
+    shot = Shot(cloud=cloud, camera=camera, environment=environment)
     found = {}
     for device in DEVICES:
         scene = Scene.from_gaussians(cloud, device)
@@ -45,7 +47,7 @@ def main() -> int:
             "alpha": buffer.alpha,
             "depth": buffer.depth,
             "base_color": buffer.channels["base_color"],
-            "relit": relight(buffer, EnvironmentLighting.from_environment(environment, device=device)),
+            "relit": DeferredRenderer(UNSHADOWED, device=device).draw(shot).rgb,
         }
     result = {"benchmark": "parity", "commit": arguments.commit, "gaussians": len(cloud)}
     for name, values in found[DEVICES[0]].items():

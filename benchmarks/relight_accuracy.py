@@ -1,4 +1,4 @@
-"""How near relit images come to path-traced truth, and what each costs: deferred, gathered per Gaussian, path traced.
+"""How near relit images come to path-traced truth, and what each costs: deferred and path traced.
 
 Geometry is perfect, Gaussians on the true surface with the truth's materials, or that of a decomposed reconstruction.
 The demo figure's materials are known at every point, so that nothing but the renderer is in the way of its truth.
@@ -24,7 +24,6 @@ from beam_warp.capture.capture import Capture
 from beam_warp.capture.matching import match_frames
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
-from beam_warp.evaluate.relighters import TracedRelighter
 from beam_warp.image.metrics import bounding_box, compare
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
@@ -42,7 +41,7 @@ from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.shot import Shot
 
 TARGET_PSNR = 36.0
-"""Of path traced images of perfect geometry against the truth [dB]."""
+"""PSNR wanted of path traced images of perfect geometry against the truth [dB]."""
 
 DANCE_PHASE = 0.15
 """The moment of the demo figure's dance that is rendered."""
@@ -62,16 +61,16 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class RelitSubject:
     """What is rendered, and what that should look like.
 
     Attributes:
-        name: In tables.
+        name: Name in tables.
         cloud: Relightable Gaussians.
         raster: How splats are drawn.
-        cameras: At least one.
-        lights: By name.
-        truth: By light, an image a camera.
+        cameras: Views, at least one.
+        lights: Environments by name.
+        truth: For each light, an image a camera.
     """
 
     name: str
@@ -122,10 +121,9 @@ def warm_up(bench: Bench) -> None:
     PathRenderer(PathOptions(samples=1), device=device).draw(shot)
     for count in sorted({min(bench.effort.scored_shadows), max(bench.effort.scored_shadows)}):
         deferred_renderer(bench, count, SHARP).frame(shot).launch()
-    TracedRelighter()(shot.cloud, shot.environment, [shot.camera], raster=SHARP, samples=1, device=device)
 
 
-def subjects(bench: Bench) -> Iterator[Subject]:
+def subjects(bench: Bench) -> Iterator[RelitSubject]:
     """Yield the captures' perfect geometry, the demo figure, and the reconstructions that were given."""
     for name, capture in bench.captures.items():
         frame = truth_frames(capture)[0]
@@ -147,12 +145,12 @@ def subjects(bench: Bench) -> Iterator[Subject]:
 
 def captured_subject(
     name: str, capture: Capture, frame: int, cloud: GaussianCloud, raster: RasterOptions, views: int
-) -> Subject:
+) -> RelitSubject:
     """Return Gaussians with a capture's truth under the lights that it has, of views far from each other."""
     records = [r for r in capture.select(split="test", frames=[frame]) if r.truth_path is not None and r.relit_paths]
     records = records[:: max(1, len(records) // views)][:views]
     names = sorted(records[0].relit_paths)
-    return Subject(
+    return RelitSubject(
         name,
         cloud,
         raster,
@@ -165,7 +163,7 @@ def captured_subject(
     )
 
 
-def demo_subject(bench: Bench) -> Subject:
+def demo_subject(bench: Bench) -> RelitSubject:
     """Return the demo figure as Gaussians whose materials are the mesh's own, and the mesh path traced."""
     effort, device = bench.effort, str(bench.device)
     mesh = build_figure(effort.demo_spacing).at(DANCE_PHASE)
@@ -197,7 +195,7 @@ def demo_subject(bench: Bench) -> Subject:
         ]
         truth[name] = [Known(image.rgb, image.alpha) for image in images]
     bench.say(f"demo figure: {len(cloud):,} Gaussians, truth of {effort.truth_samples} paths a pixel")
-    return Subject("demo figure", cloud, SHARP, cameras, lights, truth)
+    return RelitSubject("demo figure", cloud, SHARP, cameras, lights, truth)
 
 
 def materials_at(mesh: MaterialMesh, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -219,12 +217,11 @@ def materials_at(mesh: MaterialMesh, points: NDArray[np.float32]) -> tuple[NDArr
     return np.clip(color, 0.0, 1.0).astype(np.float32), np.clip(roughness, 0.0, 1.0).astype(np.float32)
 
 
-def measure_light(bench: Bench, subject: Subject, light: str, kept: dict[str, NDArray[Any]]) -> Row:
+def measure_light(bench: Bench, subject: RelitSubject, light: str, kept: dict[str, NDArray[Any]]) -> Row:
     """Return a row of every way under one light; images of the first camera go to ``kept``."""
     reference, rendered = path_traced(bench, subject, light)
     for count in bench.effort.scored_shadows:
         rendered.append(deferred(bench, subject, light, count))
-    rendered.append(gathered(bench, subject, light))
     best = max((r for r in rendered if r.method == "path traced"), key=lambda r: int(r.setting.split()[0]))
     usual = DeferredOptions().environment_shadows
     shown = min((r for r in rendered if r.method == "deferred"), key=lambda r: abs(int(r.setting.split()[-1]) - usual))
@@ -248,7 +245,7 @@ def measure_light(bench: Bench, subject: Subject, light: str, kept: dict[str, ND
     }
 
 
-def path_traced(bench: Bench, subject: Subject, light: str) -> tuple[Row, list[Rendered]]:
+def path_traced(bench: Bench, subject: RelitSubject, light: str) -> tuple[Row, list[Rendered]]:
     """Return every level of samples of a pixel, each with what all before took; progressive, so that none is redone."""
     effort, device = bench.effort, bench.device
     renderer = PathRenderer(PathOptions(samples=max(effort.levels), bounces=effort.bounces), device=str(device))
@@ -285,7 +282,7 @@ def deferred_renderer(bench: Bench, count: int, raster: RasterOptions) -> Deferr
     return DeferredRenderer(options, raster=raster, device=str(bench.device))
 
 
-def deferred(bench: Bench, subject: Subject, light: str, count: int) -> Rendered:
+def deferred(bench: Bench, subject: RelitSubject, light: str, count: int) -> Rendered:
     """Return deferred images, each timed with all shadow maps drawn again."""
     renderer = deferred_renderer(bench, count, subject.raster)
     images, spent = [], []
@@ -298,20 +295,7 @@ def deferred(bench: Bench, subject: Subject, light: str, count: int) -> Rendered
     return Rendered("deferred", f"N = {count}", images, spent)
 
 
-def gathered(bench: Bench, subject: Subject, light: str) -> Rendered:
-    """Return images of light gathered at every Gaussian; what all of them share is part of what each takes."""
-    relighter, device = TracedRelighter(), str(bench.device)
-    how: dict[str, Any] = {"raster": subject.raster, "samples": bench.effort.side, "device": device}
-    found: list[Any] = []
-    environment = subject.lights[light]
-    seconds = seconds_of(
-        lambda: found.extend(relighter(subject.cloud, environment, subject.cameras, **how)), bench.device
-    )
-    each = 1e3 * seconds / len(found)
-    return Rendered("per Gaussian", "128 rays", [Known(i.rgb, i.alpha) for i in found], [each] * len(found))
-
-
-def shot_of(subject: Subject, light: str, camera: Camera) -> Shot:
+def shot_of(subject: RelitSubject, light: str, camera: Camera) -> Shot:
     """Return a subject under one of its lights."""
     return Shot(cloud=subject.cloud, camera=camera, environment=subject.lights[light])
 

@@ -19,7 +19,7 @@ from beam_warp.study.true_surface import gaussians_on_mesh
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.shot import ImageRenderer, Shot
+from beam_warp.world.shot import Renderer, Shot
 
 ROUGHNESS = (0.03, 0.1, 0.3, 0.6, 1.0)
 TARGET_ERROR = 0.01
@@ -45,7 +45,7 @@ def measure_furnace(bench: Bench) -> Iterator[Row]:
     effort, device = bench.effort, str(bench.device)
     usual = DeferredOptions().environment_shadows
     path = PathOptions(samples=effort.furnace_samples, bounces=FURNACE_BOUNCES)
-    renderers: dict[str, ImageRenderer] = {
+    renderers: dict[str, Renderer] = {
         "path traced": PathRenderer(path, device=device),
         "deferred, no shadow maps": DeferredRenderer(bench.deferred_options(0), device=device),
         f"deferred, N = {usual}": DeferredRenderer(bench.deferred_options(usual), device=device),

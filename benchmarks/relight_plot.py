@@ -36,13 +36,13 @@ COMPARED = ("walker", "runner")
 """Subjects side by side, if they are there; else all."""
 
 SHOWN_LIGHT = "sunrise"
-"""Under this light, if it is there; else under the last."""
+"""Light of the compared pictures, if it is there; else the last light is shown."""
 
 GAIN = 4.0
-"""Of differences."""
+"""Factor by which differences are brightened."""
 
 LARGEST_FILE = 150_000
-"""Of a picture [byte]: it lies in the repository."""
+"""Largest size of a picture [byte]: it lies in the repository."""
 
 RESOLUTIONS = (130, 115, 100, 90, 80, 70, 60, 50)
 """Dots per inch, tried one after the other."""

@@ -32,28 +32,28 @@ class Effort:
     """How much is measured.
 
     Attributes:
-        gaussians: Of the figure whose frames are timed.
+        gaussians: Gaussians of the figure whose frames are timed.
         size: Width and height of its images.
         shadows: Directions that stand for the environment, where shadow maps of it are timed.
         maps: Sides of a light's and of an environment's shadow maps [texel].
         frames: Launched one after the other before the clock is read.
-        repeats: Of everything that is timed.
-        poses: Of the moving figure, which lie on the device.
-        path_samples: Of a pixel in a timed pass.
-        bounces: Of paths.
-        perfect_gaussians: On true surfaces.
+        repeats: Repetitions of everything that is timed.
+        poses: Poses of the moving figure, which lie on the device.
+        path_samples: Samples of a pixel in a timed pass.
+        bounces: Bounces of paths.
+        perfect_gaussians: Gaussians on true surfaces.
         views: Test views a capture at most.
-        side: Of the square of samples of a pixel, deferred, where it is scored.
-        scored_shadows: As ``shadows``, where it is scored.
+        side: Side of the square of samples of a pixel, deferred, where it is scored.
+        scored_shadows: The same as ``shadows``, where it is scored.
         levels: Samples of a pixel at which path tracing is scored, ascending.
         level_seconds: A level that would take longer, for one image, is left out.
         demo_size: Width and height of the demo figure's images.
-        demo_spacing: Of the grid that it is meshed with [m].
+        demo_spacing: Spacing of the grid that it is meshed with [m].
         truth_samples: Paths a pixel of its truth.
-        furnace_gaussians: Of the white ball.
+        furnace_gaussians: Gaussians of the white ball.
         furnace_size: Side of the furnace's images.
-        furnace_samples: Of a pixel, path traced.
-        bias_gaussians: Of the figure on which bias is looked for.
+        furnace_samples: Samples of a pixel, path traced.
+        bias_gaussians: Gaussians of the figure on which bias is looked for.
         bias_size: Width and height of its images.
         bias_seeds: Images of few samples, and of sixteen times as many.
     """
@@ -140,7 +140,7 @@ class Bench:
     """What parts share.
 
     Attributes:
-        captures: With truth under other lights, by name.
+        captures: Captures by name, with truth under other lights.
         assets: Decomposed reconstructions by the name of their capture.
         sky: What the figure stands under.
         effort: How much is measured.

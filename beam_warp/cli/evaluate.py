@@ -57,7 +57,7 @@ class Evaluate:
     ] = None
     relight: Annotated[
         tuple[str, ...],
-        arg(metavar="NAME ...", help="How relit images are made: deferred, traced, path; none leaves them out."),
+        arg(metavar="NAME ...", help="How relit images are made: deferred, path; none leaves them out."),
     ] = ("deferred",)
     scaled_relighting: Annotated[bool, arg(help="Also relight with base colour times its best scale.")] = False
     samples: Annotated[int, arg(metavar="N", help="A pixel is the mean of N x N samples.")] = 2

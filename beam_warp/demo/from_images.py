@@ -21,7 +21,6 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
 from beam_warp.jobs.report import write_json
-from beam_warp.light.prefiltered import EnvironmentLighting
 from beam_warp.materials.job import ESTIMATE, OverviewOptions, Progress, RunOptions, RunResult, run
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
@@ -35,10 +34,13 @@ from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, seen_radiance
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import Relighting, display_exposure
 from beam_warp.trace.mesh_paths import TracedMesh
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.shot import Renderer
 
 TRUTH_PATHS = 64
 CHAMFER_SAMPLES = 20_000
@@ -99,7 +101,6 @@ def demo_from_images(
     out: Path,
     options: FromImagesOptions,
     lights: Mapping[str, EnvironmentMap],
-    lightings: Mapping[str, EnvironmentLighting],
     *,
     device: str | None,
     seed: int,
@@ -115,7 +116,6 @@ def demo_from_images(
         out: Folder, which exists.
         options: See `FromImagesOptions`.
         lights: Environments by name; the first one is that of the capture, all are put on the result.
-        lightings: The same, ready to light with.
         device: Warp device; None takes the first CUDA device, or the CPU.
         seed: Same seed, same device: same result.
         progress: Called with (stage, done, total).
@@ -169,7 +169,8 @@ def demo_from_images(
         demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS)), device=device
     )
     truths = [Truth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
-    relit = relit_views(result.sequence[last], cameras, lightings, raster=steps.raster, device=device)
+    renderer = DeferredRenderer(UNSHADOWED, raster=steps.raster, device=device)
+    relit = relit_views(result.sequence[last], cameras, lights, renderer, raster=steps.raster, device=device)
     report: dict[str, Any] = {
         "options": asdict(options),
         "gaussians": [len(cloud) for cloud in found.sequence],
@@ -182,7 +183,7 @@ def demo_from_images(
         "warnings": [*found.report["warnings"], *result.report["warnings"]],
     }
     picture = out / "reconstruction.png"
-    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lightings, steps.raster, device)
+    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, renderer, steps.raster, device)
     laps.end("score relightings")
     report["seconds"] = laps.seconds
     return FromImages(picture, result, report)
@@ -301,13 +302,14 @@ def _write_picture(
     sequence: GaussianSequence,
     relightable: GaussianSequence,
     meshes: Sequence[trimesh.Trimesh],
-    lightings: Mapping[str, EnvironmentLighting],
+    lights: Mapping[str, EnvironmentMap],
+    renderer: Renderer,
     raster: RasterOptions,
     device: str | None,
 ) -> None:
     """Draw a row a frame, from one test camera after the other: photograph, ours, normals, mesh, other lights."""
     records = _test_views(capture)
-    others = {name: lightings[name] for name in list(lightings)[1:]}
+    others = {name: lights[name] for name in list(lights)[1:]}
     rows, columns = _subject([record.image().alpha for record in records])
     factor = -(-PANEL_HEIGHT // (rows.stop - rows.start))
     panels: list[Panel] = []
@@ -322,14 +324,14 @@ def _write_picture(
         buffer = rasterize(cloud, camera, channels=(RADIANCE, SURFACE_NORMALS), options=raster, device=device)
         alpha = buffer.alpha[..., None]
         seen = display_color(seen_radiance(buffer, cloud), buffer.alpha)
-        (relit,) = relit_views(relightable[index], [camera], others, raster=raster, device=device)
+        (relit,) = relit_views(relightable[index], [camera], others, renderer, raster=raster, device=device)
         photograph = over_background(display_color(image[..., :3], image[..., 3]), image[..., 3:])
         show(f"frame {record.frame}: photograph", photograph)
         show("Gaussians", over_background(seen, alpha))
         show("normals", over_background(0.5 * buffer.channels[SURFACE_NORMALS] + 0.5, alpha))
         show("mesh", shaded_image(meshes[index], camera.supersampled(factor), device), factor)
-        for name, lighting in others.items():
-            lit = display_color(relit.radiance[name], relit.buffer.alpha, display_exposure(lighting))
+        for name, light in others.items():
+            lit = display_color(relit.radiance[name], relit.buffer.alpha, display_exposure(light))
             show(f"relit: {name}", over_background(lit, relit.buffer.alpha[..., None]))
     write_png(path, lay_out(panels, len(panels) // len(records)))
 

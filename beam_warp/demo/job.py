@@ -20,9 +20,10 @@ from beam_warp.demo.truth import Truth, comparison, relit_views, score_views
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb
 from beam_warp.image.files import write_exr, write_png
 from beam_warp.jobs.report import write_report
-from beam_warp.light.prefiltered import EnvironmentLighting
 from beam_warp.materials.job import OverviewOptions, Progress, RunOptions, RunResult, no_progress, run
 from beam_warp.raster.records import RasterOptions
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import Relighting
 from beam_warp.trace.mesh_paths import TracedMesh, outgoing_radiance
 from beam_warp.world.camera import Camera
@@ -265,20 +266,19 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress =
     folder.mkdir(exist_ok=True)
     for name, light in scene.lights.items():
         write_exr(folder / f"{name}.exr", {c: light.radiance[..., i] for i, c in enumerate("RGB")})
-    lightings = {
-        name: EnvironmentLighting.from_environment(light, device=options.device) for name, light in scene.lights.items()
-    }
+    renderer = DeferredRenderer(UNSHADOWED, raster=RASTER, device=options.device)
     relit = relit_views(
         result.sequence[scene.truth_frame],
         [truth.camera for truth in scene.truth],
-        lightings,
+        scene.lights,
+        renderer,
         raster=RASTER,
         device=options.device,
     )
     result.report["scores"] = score_views(scene.truth, relit)
-    write_png(out / "relit.png", comparison(scene.truth[0], relit[0], lightings))
+    write_png(out / "relit.png", comparison(scene.truth[0], relit[0], scene.lights))
     images = demo_from_images(
-        out, options.images, scene.lights, lightings, device=options.device, seed=options.seed, progress=progress
+        out, options.images, scene.lights, device=options.device, seed=options.seed, progress=progress
     )
     result.report["from_images"] = images.report
     result.report["seconds"]["build demo"] = built

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from beam_warp.image.files import display_image
 from beam_warp.image.metrics import SOLID_ALPHA, Score, compare, least_squares_scale, mean_scores
 from beam_warp.image.panels import Panel, lay_out, over_background
-from beam_warp.light.prefiltered import EnvironmentLighting
 from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import display_exposure
-from beam_warp.render.split_sum import relight
 from beam_warp.trace.mesh_paths import TracedChannels, TracedMesh, trace_channels, trace_radiance
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.shot import Renderer, Shot
 
 CHANNEL_SAMPLES = 16
 
@@ -54,15 +53,22 @@ class Relit:
 def relit_views(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
-    lightings: Mapping[str, EnvironmentLighting],
+    lights: Mapping[str, EnvironmentMap],
+    renderer: Renderer,
     *,
     raster: RasterOptions,
     device: str | None = None,
 ) -> list[Relit]:
-    """Draw a relightable cloud for some cameras, and light what they see."""
-    buffers = rasterize(cloud, cameras, options=raster, device=device)
+    """Draw a relightable cloud for some cameras: its channels, and what a renderer shows of it under each light."""
     return [
-        Relit(buffer, {name: relight(buffer, lighting) for name, lighting in lightings.items()}) for buffer in buffers
+        Relit(
+            buffer,
+            {
+                name: renderer.draw(Shot(cloud=cloud, camera=buffer.camera, environment=light)).rgb
+                for name, light in lights.items()
+            },
+        )
+        for buffer in rasterize(cloud, cameras, options=raster, device=device)
     ]
 
 
@@ -92,7 +98,7 @@ def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, An
     }
 
 
-def comparison(truth: Truth, view: Relit, lightings: Mapping[str, EnvironmentLighting]) -> NDArray[np.uint8]:
+def comparison(truth: Truth, view: Relit, lights: Mapping[str, EnvironmentMap]) -> NDArray[np.uint8]:
     """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
 
     def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:
@@ -103,8 +109,8 @@ def comparison(truth: Truth, view: Relit, lightings: Mapping[str, EnvironmentLig
         ("ambient occlusion", gray(found["ambient_occlusion"]), gray(known.ambient_occlusion)),
         ("base colour", display_image(found["base_color"]) / 255.0, display_image(known.base_color) / 255.0),
     ]
-    for name, lighting in lightings.items():
-        stops = display_exposure(lighting)
+    for name, light in lights.items():
+        stops = display_exposure(light)
         ours = display_color(view.radiance[name], view.buffer.alpha, stops)
         pairs.append((name, ours, display_color(truth.radiance[name], truth.alpha, stops)))
     alphas = view.buffer.alpha[..., None], truth.alpha[..., None]

@@ -118,7 +118,7 @@ def evaluate_asset(
         split=chosen.split,
         raster=chosen.raster,
         samples=chosen.samples,
-        relighters={name: RELIGHTERS[name]() for name in chosen.relighters},
+        relighters={name: RELIGHTERS[name] for name in chosen.relighters},
         scaled_relighting=chosen.scaled_relighting,
         device=chosen.device,
         observe=observe,

@@ -15,7 +15,7 @@ from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.evaluate.drawn import SAMPLES, DrawnMaterials, draw_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
-from beam_warp.evaluate.relighters import RELIGHTERS, Relighter, RelitImage
+from beam_warp.evaluate.relighters import RELIGHTERS, Relighter
 from beam_warp.evaluate.steadiness import TemporalScores, gaussian_deviation, surface_scores
 from beam_warp.image.files import Image
 from beam_warp.image.metrics import SOLID_ALPHA, Compared, angles_between, as_compared, least_squares_scale
@@ -24,6 +24,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.world.axes import change_axes
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.shot import RenderedImage, Renderer, Shot
 
 LEAST_OVERLAP = 0.5
 """Coverage of asset and truth in common, over what either covers, below which they are not of the same thing. Measured
@@ -220,7 +221,7 @@ class ScoredView:
     record: CaptureRecord
     truth: Image
     drawn: DrawnMaterials
-    relit: Mapping[str, Mapping[str, RelitImage]]
+    relit: Mapping[str, Mapping[str, RenderedImage]]
     scores: ViewScores
 
 
@@ -273,14 +274,16 @@ def score_materials(
     Source: BEAM §4 (bounding box, black background); Stanford-ORB, Kuang et al. 2023 (scale by least squares).
     """
     require_count("samples", samples, 1, 64)
+    drawn = raster or stated_raster(sequence.metadata)
+    made = {"deferred": RELIGHTERS["deferred"]} if relighters is None else relighters
     job = _Job(
         sequence=sequence,
         capture=capture,
         matched=match_frames(sequence, frames),
         split=split,
-        raster=raster or stated_raster(sequence.metadata),
+        raster=drawn,
         samples=samples,
-        relighters={"deferred": RELIGHTERS["deferred"]()} if relighters is None else relighters,
+        renderers={name: make(drawn, samples, device) for name, make in made.items()},
         metrics=metrics or PerceptualMetrics.installed(),
         device=device,
         progress=progress or _quiet,
@@ -336,7 +339,7 @@ class _Job:
     split: str
     raster: RasterOptions
     samples: int
-    relighters: Mapping[str, Relighter]
+    renderers: Mapping[str, Renderer]
     metrics: PerceptualMetrics
     device: str | None
     progress: Progress
@@ -377,7 +380,7 @@ class _Job:
 
     def _lights(self, records: Sequence[CaptureRecord]) -> dict[str, EnvironmentMap]:
         """Read every light that a record is known under."""
-        if not self.relighters:
+        if not self.renderers:
             return {}
         names = dict.fromkeys(name for record in records for name in record.relit_paths)
         paths = {name: self.capture.folder / "truth" / f"{name}.exr" for name in names}
@@ -422,17 +425,17 @@ class _Job:
 
     def _relit(
         self, cloud: GaussianCloud, records: Sequence[CaptureRecord], lights: Mapping[str, EnvironmentMap]
-    ) -> dict[str, dict[str, list[RelitImage]]]:
+    ) -> dict[str, dict[str, list[RenderedImage]]]:
         """Relight a cloud in every way, under every light, for every record."""
-        cameras = [record.camera for record in records]
         return {
             name: {
-                light: relighter(
-                    cloud, environment, cameras, raster=self.raster, samples=self.samples, device=self.device
-                )
+                light: [
+                    renderer.draw(Shot(cloud=cloud, camera=record.camera, environment=environment))
+                    for record in records
+                ]
                 for light, environment in lights.items()
             }
-            for name, relighter in self.relighters.items()
+            for name, renderer in self.renderers.items()
         }
 
     def _score(
@@ -440,7 +443,7 @@ class _Job:
         record: CaptureRecord,
         truth: Image,
         drawn: DrawnMaterials,
-        relit: Mapping[str, Mapping[str, RelitImage]],
+        relit: Mapping[str, Mapping[str, RenderedImage]],
         sums: _ScaleSums,
     ) -> ViewScores:
         """Score one view, and take its base colour into the sums of its frame."""
@@ -485,7 +488,7 @@ class _Job:
         self,
         record: CaptureRecord,
         truth_alpha: NDArray[np.float32],
-        relit: Mapping[str, Mapping[str, RelitImage]],
+        relit: Mapping[str, Mapping[str, RenderedImage]],
     ) -> dict[str, dict[str, ImageScore]]:
         """Score one view under every light."""
         lights = dict.fromkeys(light for by_light in relit.values() for light in by_light)
@@ -589,7 +592,7 @@ class _Job:
             "samples_per_pixel": self.samples**2,
             "antialiased": self.raster.antialiased,
             "low_pass": self.raster.low_pass,
-            "relighters": list(self.relighters),
+            "relighters": list(self.renderers),
             "background": "black",
             "region": "bounding box of the truth's alpha above 0.5; solid: alpha above 0.999",
             "color_encoding": "sRGB, cut to [0, 1]",
@@ -601,7 +604,7 @@ class _Job:
         if not any("novel_view" in view.channels for view in views):
             absent["novel_view"] = "the asset has no captured radiance"
         if not lights:
-            absent["relit"] = "no relighter was chosen" if not self.relighters else "the capture has no relit images"
+            absent["relit"] = "no relighter was chosen" if not self.renderers else "the capture has no relit images"
         return absent
 
     def _notes(self, frames: Sequence[int], views: Sequence[ViewScores]) -> tuple[str, ...]:

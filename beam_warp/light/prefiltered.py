@@ -1,13 +1,14 @@
-"""Deferred relighting: a G-buffer and an environment give radiance, at a cost per pixel that no light changes.
+"""Environments blurred by the specular lobe of every roughness, and their irradiance: the light of a split sum.
 
 With E(n) the irradiance, L_r(d) the environment blurred by the GGX lobe of roughness r (n = v = d), and the directional
 albedo of the specular lobe E_s = F0 A(n·v, r) + B(n·v, r), F0 = 0.04, a pixel of base colour ρ shows
 
     L = (1 - E_s) ρ E(n) / π · V + L_r(reflect(v, n)) E_s · S,
 
-multiplied by its alpha. V is ambient occlusion (1 is open) and S = clamp((n·v + V)^(2^(-16 r - 1)) - 1 + V, 0, 1) the
-specular occlusion that goes with it. The weight 1 - E_s keeps energy: a white open surface under uniform light of
-radiance 1 shows 1 at every angle and roughness.
+multiplied by its alpha, at a cost that no light changes. V is ambient occlusion (1 is open) and
+S = clamp((n·v + V)^(2^(-16 r - 1)) - 1 + V, 0, 1) the specular occlusion that goes with it. The weight 1 - E_s keeps
+energy: a white open surface under uniform light of radiance 1 shows 1 at every angle and roughness. This module makes E
+and L_r; ``kernels/light/shading.py`` evaluates the sum.
 
 Sources: Karis 2013 (split sum); Lagarde and de Rousiers 2014 (specular occlusion, listing 26); Kulla and Conty 2017 and
 Blender's Principled BSDF (albedo scaling). Left out: self-reflection between surfaces, and the stretch of the lobe at
@@ -24,7 +25,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.light.prefilter import FluxTree, launch_prefilter_environment
 from beam_warp.kernels.light.shading import EnvironmentLight
 from beam_warp.light.ggx import specular_albedo_table
@@ -46,90 +46,41 @@ OPENING = 0.4
 """Cells larger than this share of their distance from the lobe's axis, or of the lobe's width, are split."""
 
 
-@dataclass(frozen=True, eq=False)
-class EnvironmentLighting:
-    """An environment made ready for shading on one device.
+def blurred_environment(environment: EnvironmentMap, device: Any) -> EnvironmentLight:
+    """Integrate irradiance and blur an environment for every roughness; the same device gives the same bits.
 
-    Attributes:
+    Args:
         environment: The light.
-        device: Name of the device that holds ``light``.
-        light: The device struct that kernels take.
+        device: A Warp device.
+
+    Returns:
+        The struct that kernels take.
     """
-
-    environment: EnvironmentMap
-    device: str
-    light: Any
-
-    @classmethod
-    def from_environment(cls, environment: EnvironmentMap, *, device: str | None = None) -> EnvironmentLighting:
-        """Integrate irradiance and blur the environment for every roughness; the same device gives the same bits.
-
-        Args:
-            environment: The light.
-            device: ``"cpu"``, ``"cuda:0"``, …; None takes the first CUDA device, or the CPU where there is none.
-
-        Raises:
-            DeviceError: There is no such device.
-        """
-        target = resolve_device(device)
-        heights = [
-            environment.height,
-            *(_level_rows(roughness, environment.height) for roughness in LEVEL_ROUGHNESS[1:]),
-        ]
-        offsets = np.concatenate([[0], np.cumsum([2 * height * height for height in heights])])
-        texels = wp.empty(int(offsets[-1]), dtype=wp.vec3, device=target)
-        wp.copy(texels, wp.array(environment.radiance.reshape(-1, 3), dtype=wp.vec3, device=target))
-        tree = _flux_tree(environment, target)
-        for roughness, height, offset in zip(LEVEL_ROUGHNESS[1:], heights[1:], offsets[1:], strict=False):
-            launch_prefilter_environment(
-                tree,
-                alpha=roughness * roughness,
-                opening=OPENING,
-                height=height,
-                offset=int(offset),
-                out_texels=texels,
-                device=target,
-            )
-        light = EnvironmentLight()
-        light.irradiance = wp.array(environment.default_irradiance, dtype=wp.vec3, device=target)
-        light.texels = texels
-        light.heights = wp.array(heights, dtype=int, device=target)
-        light.offsets = wp.array(offsets[:-1], dtype=int, device=target)
-        light.level_count = len(heights)
-        light.first_roughness = FIRST_ROUGHNESS
-        light.log_ratio = float(np.log(LEVEL_ROUGHNESS[2] / LEVEL_ROUGHNESS[1]))
-        light.albedo_terms = wp.array(specular_albedo_table(), dtype=wp.vec2, device=target)
-        return cls(environment, str(target), light)
-
-    def scaled(self, factor: float) -> EnvironmentLighting:
-        """Return the same light times a factor; cheaper than preparing it again."""
-        light = EnvironmentLight()
-        for name in EnvironmentLight.vars:
-            setattr(light, name, getattr(self.light, name))
-        for name in ("irradiance", "texels"):
-            array = getattr(self.light, name)
-            setattr(light, name, wp.array(array.numpy() * np.float32(factor), dtype=wp.vec3, device=self.device))
-        return EnvironmentLighting(self.environment.scaled(factor), self.device, light)
-
-    def turned_around(self) -> EnvironmentLighting:
-        """Return the same light turned by 180 degrees about z, a whole number of columns in every level: a copy."""
-
-        def turned(image: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.roll(image, image.shape[1] // 2, axis=1)
-
-        light = EnvironmentLight()
-        for name in EnvironmentLight.vars:
-            setattr(light, name, getattr(self.light, name))
-        light.irradiance = wp.array(turned(self.light.irradiance.numpy()), dtype=wp.vec3, device=self.device)
-        levels = [turned(self.blurred_level(level)).reshape(-1, 3) for level in range(self.light.level_count)]
-        light.texels = wp.array(np.concatenate(levels), dtype=wp.vec3, device=self.device)
-        return EnvironmentLighting(self.environment.rotated(180.0), self.device, light)
-
-    def blurred_level(self, level: int) -> NDArray[np.float32]:
-        """Return one level of blurred radiance as a lat-long image, ``(H, 2 H, 3)``, to look at or to test."""
-        height = int(self.light.heights.numpy()[level])
-        offset = int(self.light.offsets.numpy()[level])
-        return self.light.texels[offset : offset + 2 * height * height].numpy().reshape(height, 2 * height, 3)
+    heights = [environment.height, *(_level_rows(roughness, environment.height) for roughness in LEVEL_ROUGHNESS[1:])]
+    offsets = np.concatenate([[0], np.cumsum([2 * height * height for height in heights])])
+    texels = wp.empty(int(offsets[-1]), dtype=wp.vec3, device=device)
+    wp.copy(texels, wp.array(environment.radiance.reshape(-1, 3), dtype=wp.vec3, device=device))
+    tree = _flux_tree(environment, device)
+    for roughness, height, offset in zip(LEVEL_ROUGHNESS[1:], heights[1:], offsets[1:], strict=False):
+        launch_prefilter_environment(
+            tree,
+            alpha=roughness * roughness,
+            opening=OPENING,
+            height=height,
+            offset=int(offset),
+            out_texels=texels,
+            device=device,
+        )
+    light = EnvironmentLight()
+    light.irradiance = wp.array(environment.default_irradiance, dtype=wp.vec3, device=device)
+    light.texels = texels
+    light.heights = wp.array(heights, dtype=int, device=device)
+    light.offsets = wp.array(offsets[:-1], dtype=int, device=device)
+    light.level_count = len(heights)
+    light.first_roughness = FIRST_ROUGHNESS
+    light.log_ratio = float(np.log(LEVEL_ROUGHNESS[2] / LEVEL_ROUGHNESS[1]))
+    light.albedo_terms = wp.array(specular_albedo_table(), dtype=wp.vec2, device=device)
+    return light
 
 
 def _level_rows(roughness: float, height: int) -> int:

@@ -18,7 +18,7 @@ LARGEST_HEIGHT = 256
 """Taller maps are reduced to this height, energy kept, before they are cut: a texel is then 0.7 degrees."""
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance weights."""
+"""Rec.709 luminance weights: regions are cut, and texels drawn, by what the eye sees of them."""
 
 MOST_REGIONS = 256
 WIDEST = np.radians(75.0)
@@ -31,8 +31,9 @@ class EnvironmentRegions:
 
     Attributes:
         directions: Unit, where each region's power comes from in the mean, ``(K, 3)`` float64.
-        half_angles: Of the disc of even radiance whose directions spread as the region's do [rad], ``(K,)`` float64.
-        moments: By channel, radiance times direction summed over each region [W/m^2], and half the width that
+        half_angles: Half angle of the disc of even radiance whose directions spread as the region's do [rad], ``(K,)``
+            float64.
+        moments: Radiance times direction summed over each region, by channel [W/m^2], and half the width that
             `beam_warp.kernels.trace.incident_light.above_horizon` takes, ``(3, K, 4)`` float64.
     """
 

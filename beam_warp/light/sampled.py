@@ -1,8 +1,7 @@
-"""An environment prepared on a device: for drawing directions by it, or by it times cosine, and for its irradiance."""
+"""Tables of an environment: for drawing directions by it, or by it times cosine, and for its irradiance."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.light.product_tree import ProductTree
 from beam_warp.kernels.trace.incident_light import LightMoments
+from beam_warp.light.regions import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap
 
 BLOCK_ROWS, BLOCK_COLUMNS = 16, 32
@@ -21,67 +21,12 @@ GROUP_ROWS, GROUP_COLUMNS = 4, 8
 LARGEST_HEIGHT = 512
 """Taller maps are reduced to this height, energy kept: a texel is then 0.35 degrees, two thirds of the sun."""
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance weights: texels are drawn by what the eye sees of them."""
-
 MOMENT_ROWS = 32
 """Rows of the grid behind `light_moments`. Measured against full sums under even light and skies with suns of up to 2e4
 times the mean: 2e-4 RMS of the irradiance, without bias; bilinear lookup of a 64-row irradiance map errs by 8e-3."""
 
 FINE_ROWS = 512
 """Least rows that moments are summed over, so that cells of any map have nearly the same size."""
-
-
-@dataclass(frozen=True, eq=False)
-class SampledEnvironment:
-    """An environment on a device, ready for every density; make it once, use it for many points.
-
-    Attributes:
-        device: Warp device that holds it.
-        distribution: For drawing by the environment alone.
-        blocks: For drawing by the environment times the cosine.
-        moments: For the irradiance that would arrive if nothing were in the way.
-        mean_irradiance: Unshadowed irradiance [W/m^2], mean over normals and channels.
-    """
-
-    device: Any
-    distribution: EnvironmentDistribution
-    blocks: EnvironmentBlocks
-    moments: LightMoments
-    mean_irradiance: float
-
-    @classmethod
-    def from_environment(cls, environment: EnvironmentMap, device: Any) -> SampledEnvironment:
-        """Prepare an environment; all parts see the same texels, those of `fitted`."""
-        environment, target = fitted(environment), wp.get_device(device)
-        return cls(
-            target,
-            environment_distribution(environment, target),
-            environment_blocks(environment, target),
-            light_moments(environment, target),
-            float(np.pi * environment.mean_radiance().mean()),
-        )
-
-    def scaled(self, factor: float) -> SampledEnvironment:
-        """Return the same light times a factor; cheaper than preparing it again, and its directions are the same."""
-        return SampledEnvironment(
-            self.device,
-            _scaled(EnvironmentDistribution, self.distribution, ("radiance",), factor),
-            _scaled(EnvironmentBlocks, self.blocks, ("radiance", "luminance", "block_power"), factor),
-            _scaled(LightMoments, self.moments, ("red", "green", "blue"), factor),
-            self.mean_irradiance * factor,
-        )
-
-
-def _scaled(structure: Any, arrays: Any, names: tuple[str, ...], factor: float) -> Any:
-    """Return an instance of a structure of arrays, some of them times a factor, the others shared."""
-    result = structure()
-    for name in structure.vars:
-        array = getattr(arrays, name)
-        if name in names:
-            array = upload(array.numpy() * np.float32(factor), array.dtype, array.device)
-        setattr(result, name, array)
-    return result
 
 
 def suited_height(height: int) -> int:
@@ -96,13 +41,12 @@ def fitted(environment: EnvironmentMap) -> EnvironmentMap:
 
 
 def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentBlocks:
-    """Group an environment's texels into blocks and accumulate what drawing needs.
+    """Group an environment's texels into blocks, and accumulate the powers that directions are drawn by.
 
     Args:
-        environment: Resampled, energy kept, if blocks do not divide its size.
+        environment: The light, on a grid that blocks divide; see `fitted`.
         device: Warp device.
     """
-    environment = fitted(environment)
     height, width = environment.height, environment.width
     rows, columns = height // BLOCK_ROWS, width // BLOCK_COLUMNS
     radiance = environment.radiance.astype(np.float64)
@@ -141,15 +85,10 @@ def environment_blocks(environment: EnvironmentMap, device: Any) -> EnvironmentB
     return blocks
 
 
-def product_tree(environment: EnvironmentMap, device: Any) -> ProductTree:
-    """Group the blocks of an environment, for points that cannot keep a weight for each of them.
-
-    Args:
-        environment: Resampled, energy kept, if blocks do not divide its size.
-        device: Warp device.
-    """
+def product_tree(blocks: EnvironmentBlocks, device: Any) -> ProductTree:
+    """Group the blocks of an environment, for points that cannot keep a weight for each of them."""
     tree = ProductTree()
-    tree.blocks = environment_blocks(environment, device)
+    tree.blocks = blocks
     side = BLOCK_ROWS // GROUP_ROWS
     power = tree.blocks.block_power.numpy().astype(np.float64)
     middles = tree.blocks.block_direction.numpy().astype(np.float64)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -11,19 +11,61 @@ from numpy.typing import ArrayLike
 
 from beam_warp.device.arrays import upload
 from beam_warp.kernels.light.lights import DIRECTIONAL, POINT, SPOT, Lights
-from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight
+from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, light_entry
+
+Numbers: TypeAlias = tuple[float, ...]
+
+
+class LightRow(NamedTuple):
+    """A light as `Lights` lays it out; what a type does not have is left at its default."""
+
+    kind: int
+    power: Numbers
+    size: float
+    position: Numbers = (0.0, 0.0, 0.0)
+    direction: Numbers = (0.0, 0.0, 0.0)
+    cone: Numbers = (1.0, 0.0)
+
+
+def _directional_row(light: DirectionalLight) -> LightRow:
+    sine = float(np.sin(np.radians(light.angular_diameter) / 2.0))
+    return LightRow(int(DIRECTIONAL), light.irradiance, sine, direction=light.direction)
+
+
+def _point_row(light: PointLight) -> LightRow:
+    return LightRow(int(POINT), light.intensity, light.radius, light.position)
+
+
+def _spot_row(light: SpotLight) -> LightRow:
+    cone = tuple(np.cos(np.radians((light.inner_angle, light.outer_angle))).tolist())
+    return LightRow(int(SPOT), light.intensity, light.radius, light.position, light.direction, cone)
+
+
+ROWS: Mapping[type[Light], Callable[[Any], LightRow]] = {
+    DirectionalLight: _directional_row,
+    PointLight: _point_row,
+    SpotLight: _spot_row,
+}
+"""How each type of light is laid out for kernels."""
+
+NOTHING = LightRow(int(POINT), (0.0, 0.0, 0.0), 0.0)
+"""The row of arrays without lights."""
 
 
 def upload_lights(lights: Sequence[Light], device: Any, origin: ArrayLike = (0.0, 0.0, 0.0)) -> Lights:
-    """Return the struct that kernels take; an empty one has rows of nothing and a count of 0.
+    """Return the struct that kernels take; without lights it has one row of nothing and a count of 0.
 
     Args:
         lights: Any number of lights.
         device: A Warp device.
         origin: World position that the struct's positions are relative to [m].
+
+    Raises:
+        InvalidOptionError: One of them is no light.
     """
-    rows = [_row(light) for light in lights] or [_row(PointLight(position=(0, 0, 0), intensity=(0, 0, 0)))]
-    kinds, positions, directions, powers, sizes, cones, shadowed = zip(*rows, strict=True)
+    rows = [light_entry(ROWS, light)(light) for light in lights] or [NOTHING]
+    shadowed = [light.casts_shadows for light in lights] or [False]
+    kinds, powers, sizes, positions, directions, cones = zip(*rows, strict=True)
     arrays = Lights()
     arrays.kinds = upload(np.array(kinds, np.int32), int, device)
     arrays.positions = upload(
@@ -36,17 +78,3 @@ def upload_lights(lights: Sequence[Light], device: Any, origin: ArrayLike = (0.0
     arrays.shadowed = upload(np.array(shadowed, np.int32), int, device)
     arrays.count = len(lights)
     return arrays
-
-
-def _row(light: Light) -> tuple[Any, ...]:
-    """Return kind, position, direction, power, size, cone and whether there is a shadow."""
-    nowhere, whole = (0.0, 0.0, 0.0), (1.0, 0.0)
-    if isinstance(light, DirectionalLight):
-        sine = np.sin(np.radians(light.angular_diameter) / 2.0)
-        return int(DIRECTIONAL), nowhere, light.direction, light.irradiance, sine, whole, int(light.casts_shadows)
-    if isinstance(light, SpotLight):
-        cone = tuple(np.cos(np.radians((light.inner_angle, light.outer_angle))).tolist())
-        kind, direction = int(SPOT), light.direction
-    else:
-        cone, kind, direction = whole, int(POINT), nowhere
-    return kind, light.position, direction, light.intensity, light.radius, cone, int(light.casts_shadows)

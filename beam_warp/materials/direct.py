@@ -36,7 +36,7 @@ from beam_warp.kernels.materials.residues import (
 )
 from beam_warp.kernels.trace.incident_light import PRODUCT, launch_draw_light, launch_sum_unshadowed
 from beam_warp.kernels.trace.surface_rays import RayBatch
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.incident import DENSITIES, Density, techniques
@@ -221,7 +221,7 @@ def measure_materials(
     scene: Scene,
     points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: MaterialLight,
+    light: PreparedEnvironment,
     *,
     options: MaterialOptions,
     views: ViewEvidence | None = None,
@@ -309,7 +309,7 @@ def lit_points(
     cloud: GaussianCloud,
     points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: MaterialLight,
+    light: PreparedEnvironment,
     rows: NDArray[np.integer[Any]],
     views: ViewEvidence | None,
 ) -> LitPoints:
@@ -344,7 +344,7 @@ def lit_points(
 def make_points(
     points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: MaterialLight,
+    light: PreparedEnvironment,
     rows: NDArray[np.integer[Any]],
     views: Observations,
 ) -> LitPoints:
@@ -365,14 +365,14 @@ def make_points(
     views.specular = wp.zeros(views.directions.shape, dtype=wp.vec3, device=device)
     views.diffuse_share = wp.zeros(views.directions.shape, dtype=float, device=device)
     arriving = _empty(PointLight, len(rows), device)
-    launch_sum_unshadowed(light.sampled.moments, surface.normals, arriving.unshadowed, device)
+    launch_sum_unshadowed(light.moments, surface.normals, arriving.unshadowed, device)
     return LitPoints(arriving, surface, views, np.asarray(rows, np.int64))
 
 
 def light_batches(
     scene: Scene,
     points: SurfacePoints,
-    light: MaterialLight,
+    light: PreparedEnvironment,
     measured: LitPoints,
     options: MaterialOptions,
     hit_radiance: NDArray[np.float32] | None,
@@ -413,7 +413,7 @@ def light_batches(
     ):
         cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
         if is_product:
-            launch_accumulate_block_weights(light.sampled.blocks, batch.normals, cumulative, device)
+            launch_accumulate_block_weights(light.blocks, batch.normals, cumulative, device)
         rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
         found = LightRays()
         found.directions = rays.directions
@@ -421,7 +421,7 @@ def light_batches(
         found.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
         found.paired = int(all(part.samples.columns > 0 for part in parts))
         for part in parts:
-            launch_draw_light(part, light.sampled, cumulative, batch, stream, rays, found.weights, device)
+            launch_draw_light(part, light, cumulative, batch, stream, rays, found.weights, device)
         trace_rays(scene, EXACT, rays, found.visibility)
         if bounced is not None:
             launch_trace_bounce(
@@ -438,7 +438,7 @@ def light_batches(
             batch,
             found,
             measured.light,
-            light.blurred.light,
+            light.blurred,
             measured.surface,
             DIFFUSE_WEIGHTS[options.diffuse_weight],
             measured.views,

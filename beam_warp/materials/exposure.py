@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
@@ -31,7 +31,7 @@ def estimate_exposure(
     scene: Scene,
     points: SurfacePoints,
     roughness: NDArray[np.float32],
-    light: MaterialLight,
+    light: PreparedEnvironment,
     *,
     options: MaterialOptions,
     subset: int = 4096,

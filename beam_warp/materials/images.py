@@ -37,7 +37,7 @@ from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
 from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixels, launch_write_bake_targets
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
 from beam_warp.materials.residues import (
@@ -170,7 +170,7 @@ def decompose_by_images(
     scene: Scene,
     views: Sequence[CapturedView],
     roughness: NDArray[np.float32],
-    light: SampledEnvironment,
+    light: PreparedEnvironment,
     options: ImagePathOptions | None = None,
     *,
     raster_options: RasterOptions | None = None,
@@ -305,7 +305,7 @@ def _measure_view(
     scene: Scene,
     gaussians: GaussianArrays,
     view: CapturedView,
-    light: SampledEnvironment,
+    light: PreparedEnvironment,
     options: ImagePathOptions,
     raster_options: RasterOptions,
     number: int,
@@ -343,7 +343,7 @@ def _measure_view(
 
 
 def _bake_target(
-    surfaces: ViewSurfaces, view: CapturedView, clean: list[wp.array], light: SampledEnvironment
+    surfaces: ViewSurfaces, view: CapturedView, clean: list[wp.array], light: PreparedEnvironment
 ) -> BakeTarget:
     """Solve L_o = rho L_D + L_S for every pixel, and say which ones count."""
     device = surfaces.alpha.device

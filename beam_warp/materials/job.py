@@ -27,7 +27,7 @@ from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions, write_json, write_report
 from beam_warp.jobs.store import frame_key, make_folders, read_frame, write_frame
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import BaseColor, solve_base_color
 from beam_warp.materials.changes import ChangeTest, with_changes
 from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
@@ -209,8 +209,8 @@ def _draw_overview(job: _Job, sequence: GaussianSequence, path: Path, options: O
         height=options.height,
     )
     lights = [
-        Relighting("relit by the light of the capture", job.light.blurred),
-        options.second_light or Relighting("relit by that light turned by 180°", job.light.blurred.turned_around()),
+        Relighting("relit by the light of the capture", job.light),
+        options.second_light or Relighting("relit by that light turned by 180°", job.light, degrees=180.0),
     ]
     raster = RasterOptions.from_metadata(sequence.metadata)
     write_png(path, contact_sheet(cloud, camera, lights, options=raster, device=str(job.device)))
@@ -255,8 +255,7 @@ class _Job:
         self.persistent = options.persistent or sequence.topology == "constant"
         self.resumed = 0
         self.first = self._inputs(0)
-        with self.timer("prepare light"):
-            given = MaterialLight.from_environment(environment, self.device)
+        given = PreparedEnvironment(environment, self.device)
         self.exposure = self._find_exposure(environment, given)
         self.lit = environment.scaled(2.0**self.exposure)
         self.light = given.scaled(2.0**self.exposure)
@@ -296,7 +295,7 @@ class _Job:
             sort_keys=True,
         )
 
-    def _find_exposure(self, environment: EnvironmentMap, light: MaterialLight) -> float:
+    def _find_exposure(self, environment: EnvironmentMap, light: PreparedEnvironment) -> float:
         """Return the stops; an automatic exposure is kept beside the frames, so that a resumed job has it at once."""
         if self.options.exposure != "auto":
             return float(self.options.exposure)
@@ -464,7 +463,7 @@ class _Job:
                 scene,
                 views,
                 roughness["roughness"],
-                self.light.sampled,
+                self.light,
                 self.options.images,
                 raster_options=self._images.raster,
                 previous=previous,

@@ -31,7 +31,7 @@ from beam_warp.kernels.materials.pixel_surfaces import (
     launch_scatter,
 )
 from beam_warp.light.ggx import specular_albedo_table
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -164,7 +164,7 @@ def surface_occlusion(
 def surface_residues(
     scene: Scene,
     surfaces: ViewSurfaces,
-    light: SampledEnvironment,
+    light: PreparedEnvironment,
     *,
     sample_count: int = 100,
     offset: float = 0.02,

@@ -34,7 +34,7 @@ from beam_warp.checks import require_number
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.materials.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions, light_batches, lit_points, mean_radiance
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
@@ -173,7 +173,7 @@ def measure_roughness_profile(
     cloud: GaussianCloud,
     scene: Scene,
     points: SurfacePoints,
-    light: MaterialLight,
+    light: PreparedEnvironment,
     views: ViewEvidence | None,
     *,
     options: MaterialOptions,
@@ -211,7 +211,7 @@ def measure_roughness_profile(
         if progress is not None:
             progress(len(chosen) - (total - done), len(chosen))
 
-    normals, observed, lobes = measured.surface.normals, measured.views, light.blurred.light
+    normals, observed, lobes = measured.surface.normals, measured.views, light.blurred
     bounced = mean_radiance(cloud, views) if options.bounce else None
     for lit in light_batches(scene, points, light, measured, options, bounced, frame, report):
         shares = wp.empty((len(lit.batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)

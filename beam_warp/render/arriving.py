@@ -1,8 +1,8 @@
-"""What light arrives where, for deferred shading: shadow maps of lights and of an environment's regions, and bounces.
+"""Light that reaches Gaussians in deferred shading: shadow maps of lights and of an environment's regions, and bounces.
 
-The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. What
-arrives at a Gaussian is the irradiance in closed form times the share that its regions leave, and what surfaces around
-it send (``kernels/render/cluster_bounces.py``); it is blended into pixels like a material.
+The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. A
+Gaussian gets the irradiance in closed form times the share that the regions' shadows leave, and what surfaces around it
+send (``kernels/render/cluster_bounces.py``). Both are blended into pixels like a material.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from beam_warp.kernels.render.cluster_bounces import (
     launch_gather_bounces,
     launch_sum_clusters,
 )
-from beam_warp.kernels.render.gaussian_light import RegionShadows, launch_light_gaussians
+from beam_warp.kernels.render.gaussian_light import RegionShadows, SceneLight, launch_light_gaussians
 from beam_warp.kernels.render.shadow_maps import ShadowMaps
 from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows
 from beam_warp.kernels.trace.incident_light import LightMoments
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import NO_LIGHT, PreparedEnvironments
 from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.raster.records import GaussianArrays
 from beam_warp.render.options import DeferredOptions
-from beam_warp.render.shadow_maps import ShadowDrawer, ShadowView, Subject, distant_view, light_views
+from beam_warp.render.shadow_maps import ShadowCasters, ShadowDrawer, ShadowView, distant_view, light_views
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.lights import Light
 
@@ -40,42 +40,12 @@ CLUSTER_COUNT = 1024
 LIGHT_TAPS, REGION_TAPS = (16, 32), (8, 12)
 """Taps that search, and that filter: of a light's map, and of a region's, whose errors are averaged over regions."""
 
-KEPT_ENVIRONMENTS = 8
-"""How many environments made ready are kept."""
-
-NO_LIGHT = EnvironmentMap.constant((0.0, 0.0, 0.0), height=4)
-"""What stands for no environment."""
-
-
-class PreparedEnvironments:
-    """Environments made ready on a device, the last few that were asked for."""
-
-    def __init__(self, region_count: int, device: Any) -> None:
-        """Begin without any; ``region_count`` 0 cuts none."""
-        self._region_count, self._device = region_count, device
-        self._kept: dict[EnvironmentMap, tuple[EnvironmentLighting, EnvironmentRegions | None]] = {}
-
-    def of(self, environment: EnvironmentMap) -> tuple[EnvironmentLighting, EnvironmentRegions | None]:
-        """Return what was made of an environment; it is made if it is not the same object as one of the last few."""
-        if environment not in self._kept:
-            lighting = EnvironmentLighting.from_environment(environment, device=str(self._device))
-            lit = self._region_count and environment is not NO_LIGHT
-            regions = EnvironmentRegions.of(environment, self._region_count) if lit else None
-            self._kept[environment] = (lighting, regions)
-            if len(self._kept) > KEPT_ENVIRONMENTS:
-                del self._kept[next(iter(self._kept))]
-        return self._kept[environment]
-
 
 class ArrivingLight:
-    """Lights and an environment on a device, their shadow maps, and what of them arrives at Gaussians.
+    """Lights and an environment on a device, their shadow maps, and the irradiance that reaches Gaussians.
 
     Attributes:
-        distant: The environment, for kernels.
-        regions: Its shadows.
-        lights: Other lights.
-        shadows: Theirs.
-        generation: Grows whenever what launches are given becomes another: graphs of them must be recorded again.
+        generation: Grows whenever launches would be given other arrays: CUDA graphs must be recorded again.
     """
 
     def __init__(
@@ -89,14 +59,14 @@ class ArrivingLight:
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = _zero_clusters(gaussian_count, cluster_count)
             self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
-            self.distant = DistantLight()
-            self.distant.turn = wp.zeros(1, dtype=wp.vec2)
+            self._distant = DistantLight()
+            self._distant.turn = wp.zeros(1, dtype=wp.vec2)
             self._moments = LightMoments()
             self._no_radiosity = wp.zeros(0, dtype=wp.vec3)
         self._no_maps = ShadowMaps()
-        self.regions = RegionShadows()
-        self.lights = Lights()
-        self.shadows = LightShadows()
+        self._regions = RegionShadows()
+        self._lights = Lights()
+        self._shadows = LightShadows()
         self.generation = 0
         self._region_drawer: ShadowDrawer | None = None
         self._light_drawer: ShadowDrawer | None = None
@@ -113,22 +83,23 @@ class ArrivingLight:
             wp.copy(self._clusters.order, items, count=self._count)
 
     def set_environment(
-        self, environment: EnvironmentMap | None, degrees: float, subject: Subject, *, moved: bool
+        self, environment: EnvironmentMap | None, degrees: float, casters: ShadowCasters, *, moved: bool
     ) -> None:
-        """Take an environment, as turned about z; ``moved`` says that what casts shadows is another."""
-        shown = environment or NO_LIGHT
+        """Take an environment, turned about z; ``moved`` says that something else casts shadows than before."""
+        shown = self._environments.of(environment)
         if (shown, degrees) == self._shown and not moved:
             return
-        lighting, regions = self._environments.of(shown)
         if self._shown is None or shown is not self._shown[0]:
-            self.distant.light = lighting.light
+            self._distant.light = shown.blurred
             self.generation += 1
+        count = 0 if shown.environment is NO_LIGHT else self._options.environment_shadows
+        regions = shown.regions(count).turned(degrees) if count else None
         angle = np.radians(degrees)
-        self.distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
-        self._set_regions(None if regions is None else regions.turned(degrees), subject)
+        self._distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
+        self._set_regions(regions, casters)
         self._shown = (shown, degrees)
 
-    def _set_regions(self, regions: EnvironmentRegions | None, subject: Subject) -> None:
+    def _set_regions(self, regions: EnvironmentRegions | None, casters: ShadowCasters) -> None:
         """Bring regions to the device."""
         count = 0 if regions is None else len(regions)
         if self._moments.red is None or len(self._moments.red) != count:
@@ -141,50 +112,50 @@ class ArrivingLight:
                 getattr(self._moments, name).assign(moments.astype(np.float32))
             size = self._options.environment_map_size
             pairs = zip(regions.directions, regions.half_angles, strict=True)
-            views = [distant_view(direction, float(half), subject, size) for direction, half in pairs]
-        self._region_drawer = self._moved(self._region_drawer, views, subject, REGION_TAPS)
-        self.regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
-        self.regions.moments = self._moments
+            views = [distant_view(direction, float(half), casters, size) for direction, half in pairs]
+        self._region_drawer = self._moved(self._region_drawer, views, casters, REGION_TAPS)
+        self._regions.maps = self._no_maps if self._region_drawer is None else self._region_drawer.maps
+        self._regions.moments = self._moments
         self._stale["regions"] = True
 
-    def set_lights(self, lights: tuple[Light, ...], subject: Subject, *, moved: bool) -> None:
-        """Take lights; ``moved`` says that what casts shadows is another."""
+    def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
+        """Take lights; ``moved`` says that something else casts shadows than before."""
         if lights == self._lamps and not moved:
             return
         views = [
-            light_views(light, subject, self._options.light_map_size) if light.casts_shadows else [] for light in lights
+            light_views(light, casters, self._options.light_map_size) if light.casts_shadows else [] for light in lights
         ]
         counts = [len(of_light) for of_light in views]
         uploaded = upload_lights(lights, self._device)
         if self._lamps is None or counts != self._map_counts:
-            self.lights = uploaded
+            self._lights = uploaded
             starts = np.concatenate([[0], np.cumsum(counts)])[: max(len(lights), 1)]
-            self.shadows.first_maps = upload(starts.astype(np.int32), int, self._device)
-            self.shadows.map_counts = upload(np.array(counts or [0], np.int32), int, self._device)
+            self._shadows.first_maps = upload(starts.astype(np.int32), int, self._device)
+            self._shadows.map_counts = upload(np.array(counts or [0], np.int32), int, self._device)
             self._light_drawer = None
             self.generation += 1
         else:
             for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
-                wp.copy(getattr(self.lights, name), getattr(uploaded, name))
+                wp.copy(getattr(self._lights, name), getattr(uploaded, name))
         self._light_drawer = self._moved(
-            self._light_drawer, [view for of_light in views for view in of_light], subject, LIGHT_TAPS
+            self._light_drawer, [view for of_light in views for view in of_light], casters, LIGHT_TAPS
         )
-        self.shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
+        self._shadows.maps = self._no_maps if self._light_drawer is None else self._light_drawer.maps
         self._lamps, self._map_counts = lights, counts
         self._stale["lights"] = True
 
     def _moved(
-        self, drawer: ShadowDrawer | None, views: list[ShadowView], subject: Subject, taps: tuple[int, int]
+        self, drawer: ShadowDrawer | None, views: list[ShadowView], casters: ShadowCasters, taps: tuple[int, int]
     ) -> ShadowDrawer | None:
-        """Return what draws some views: the same as before if their number is."""
+        """Return a drawer of some views: the same as before if their number is the same."""
         if not views:
             return None
         if drawer is None:
             self.generation += 1
-            return ShadowDrawer(self._count, views, subject=subject, taps=taps, device=self._device)
-        if drawer.maps.thickness != np.float32(subject.thickness):
+            return ShadowDrawer(self._count, views, casters=casters, taps=taps, device=self._device)
+        if drawer.maps.thickness != np.float32(casters.thickness):
             self.generation += 1
-        drawer.move(views, subject)
+        drawer.move(views, casters)
         return drawer
 
     def draw(self, gaussians: GaussianArrays, mesh: Any) -> None:
@@ -212,20 +183,24 @@ class ArrivingLight:
 
     @property
     def capacities(self) -> tuple[int, ...]:
-        """Room for pairs of what draws maps: where it changes, graphs must be recorded again."""
+        """Room for pairs of splats and tiles in the drawers: where it changes, graphs must be recorded again."""
         drawers = (self._region_drawer, self._light_drawer)
         return tuple(room for drawer in drawers if drawer is not None for room in drawer.pair_capacities)
 
+    def scene_light(self) -> SceneLight:
+        """Return the struct that kernels take. It is made anew each time: a struct copies the structs in it."""
+        light = SceneLight()
+        light.environment, light.regions = self._distant, self._regions
+        light.lights, light.shadows = self._lights, self._shadows
+        return light
+
     def _light(self, gaussians: GaussianArrays) -> None:
-        """Find what arrives at the Gaussians."""
+        """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
         launch_light_gaussians(
             gaussians,
-            self.distant,
-            self.regions,
-            self.lights,
-            self.shadows,
+            self.scene_light(),
             self._arriving,
             self._lit,
             self._device,
@@ -237,7 +212,7 @@ class ArrivingLight:
 
     def _bounced(self, gaussians: GaussianArrays) -> wp.array:
         """Return the radiosity of the clusters after all bounces but the last."""
-        launch_sum_clusters(gaussians, self._lit, self.distant.light.albedo_terms, self._clusters, self._device)
+        launch_sum_clusters(gaussians, self._lit, self._distant.light.albedo_terms, self._clusters, self._device)
         radiosity = self._clusters.sent
         for bounce in range(self._options.bounces - 1):
             following = self._radiosity[bounce % 2]

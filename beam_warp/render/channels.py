@@ -59,7 +59,7 @@ class SeenChannel:
     """What a camera sees of one channel.
 
     Attributes:
-        name: Of `DRAWABLE`.
+        name: One of `DRAWABLE`.
         alpha: Coverage, ``(H, W)`` float32.
         values: The mean of what each pixel sees, ``(H, W)`` or ``(H, W, C)`` float32, as in
             `beam_warp.raster.gbuffer.GBuffer`; of ``observability`` the share of what it sees that has each flag, ``(H,
@@ -142,14 +142,14 @@ def see_channel(
 
     Args:
         cloud: Gaussians, axes "rfu".
-        camera: From where.
-        name: Of `DRAWABLE`.
+        camera: The view.
+        name: One of `DRAWABLE`.
         options: How splats are drawn: as they were when the Gaussians were fitted.
         device: Warp device.
 
     Raises:
         InvalidOptionError: There is no such channel, or the cloud is in other axes.
-        InvalidArrayError: The cloud lacks it.
+        InvalidArrayError: The cloud lacks the channel.
     """
     require_choice("channel", name, DRAWABLE)
     if name != OBSERVABILITY:

@@ -12,18 +12,19 @@ grazing angles, scattering inside. docs/rendering.md has measurements.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from beam_warp.device.arrays import resolve_device
+from beam_warp.light.prepared import PreparedEnvironment, PreparedEnvironments
 from beam_warp.raster.records import RasterOptions
-from beam_warp.render.arriving import PreparedEnvironments
 from beam_warp.render.options import DeferredOptions
 from beam_warp.render.prepared_shot import DeferredFrame
 from beam_warp.world.shot import RenderedImage, Shot
 
 
 class DeferredRenderer:
-    """Renders shots by deferred shading; see `beam_warp.world.shot.ImageRenderer`.
+    """Renders shots by deferred shading; a `beam_warp.world.shot.Renderer`.
 
     What two shots share is kept from one to the next: environments made ready, arrays on the device if there are as
     many Gaussians and pixels, shadow maps if neither what casts them nor their light changed.
@@ -35,6 +36,7 @@ class DeferredRenderer:
         *,
         raster: RasterOptions | None = None,
         device: Any = None,
+        prepared: Iterable[PreparedEnvironment] = (),
     ) -> None:
         """Choose how shots are drawn.
 
@@ -42,6 +44,7 @@ class DeferredRenderer:
             options: See `DeferredOptions`.
             raster: How splats are drawn: as they were fitted.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+            prepared: Environments of shots to come that are prepared already, on that device.
 
         Raises:
             DeviceError: There is no such device.
@@ -49,7 +52,7 @@ class DeferredRenderer:
         self.options = options or DeferredOptions()
         self._raster = raster or RasterOptions()
         self._device = resolve_device(device)
-        self._environments = PreparedEnvironments(self.options.environment_shadows, self._device)
+        self._environments = PreparedEnvironments(self._device, prepared)
         self._frame: DeferredFrame | None = None
 
     def frame(self, shot: Shot) -> DeferredFrame:

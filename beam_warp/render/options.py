@@ -23,7 +23,7 @@ class DeferredOptions:
         light_map_size: Side of every light's shadow maps [texel].
         environment_map_size: Side of the environment's shadow maps [texel].
         samples: Side of the square of samples of a pixel: the image is their mean.
-        layers: Of `LAYERS`, what images come with besides colour and alpha.
+        layers: Names from `LAYERS`: what images come with besides colour and alpha.
 
     Raises:
         InvalidOptionError: An option is out of range.
@@ -54,3 +54,7 @@ class DeferredOptions:
     def lights_gaussians(self) -> bool:
         """Whether what arrives is found for every Gaussian, and not only for pixels."""
         return bool(self.environment_shadows or self.bounces)
+
+
+UNSHADOWED = DeferredOptions(environment_shadows=0, bounces=0, layers=())
+"""The split sum alone: ambient occlusion stands for the environment's shadows, and light does not bounce."""

@@ -26,17 +26,16 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.files import replacing
 from beam_warp.kernels.mesh.surface import MeshSurface
-from beam_warp.kernels.render.path_tracing import PathImages, PathLight, launch_trace_paths
+from beam_warp.kernels.render.path_tracing import PathImages, PathLight, PathPass, launch_trace_paths
 from beam_warp.kernels.render.path_vertices import PathMaterials
 from beam_warp.light.ggx import specular_albedo_table
-from beam_warp.light.sampled import product_tree
+from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.trace.camera_rays import pixel_rays
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
 from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.scene import NOTHING, Scene
 from beam_warp.trace.transmittance import EXACT
-from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
 
@@ -44,7 +43,7 @@ PASS_SAMPLES = 16
 """Samples of a pixel between two looks at its noise; fewer where there are too few in all for `FEWEST_PASSES`."""
 
 FEWEST_PASSES = 4
-"""Before a pixel's noise is believed: fewer passes miss what is rare."""
+"""Passes before a pixel's noise is believed: fewer miss what is rare."""
 
 NOISE_BLOCK = 8
 """Pixels are stopped in squares of this side, when the noisiest of a square is good enough: one alone may look good by
@@ -54,7 +53,8 @@ WARP_TILE = (8, 4)
 """Columns and rows of pixels that the threads of a warp trace."""
 
 DARKEST = 1e-3
-"""Luminance below which noise counts as if there: the square root's slope has no bound at black."""
+"""Luminance that darker pixels are taken to have where their noise is judged:
+the slope of the square root has no bound at black."""
 
 CHECKPOINT_SECONDS = 10.0
 """Time between two checkpoints."""
@@ -115,7 +115,7 @@ class PathOptions:
 
 
 class PathRenderer:
-    """Path traces shots; what two shots share, geometry and environment, is made ready once."""
+    """Path traces shots, a `beam_warp.world.shot.Renderer`. What two shots share is prepared once."""
 
     def __init__(self, options: PathOptions | None = None, *, device: str | None = None) -> None:
         """Choose the device.
@@ -130,11 +130,11 @@ class PathRenderer:
         self.options = options or PathOptions()
         self.device = resolve_device(device)
         self._geometry: _Geometry | None = None
-        self._environment: tuple[EnvironmentMap, Any] | None = None
+        self._environments = PreparedEnvironments(self.device)
         self._albedo_table = upload(specular_albedo_table(), wp.vec2, self.device)
 
     def start(self, shot: Shot) -> PathProgress:
-        """Make a shot ready; nothing is traced yet."""
+        """Prepare a shot; nothing is traced yet."""
         held = self._geometry
         if held is None or held.cloud is not shot.cloud or held.mesh is not shot.mesh:
             self._geometry = held = _Geometry.of(shot.cloud, shot.mesh, self.device)
@@ -174,13 +174,11 @@ class PathRenderer:
         return image
 
     def _light(self, shot: Shot, geometry: _Geometry) -> PathLight:
-        """Bring all that sheds light to the device."""
+        """Bring environment and lights to the device."""
         light = PathLight()
-        environment = shot.environment or _BLACK
-        if self._environment is None or self._environment[0] is not environment:
-            self._environment = (environment, product_tree(environment, self.device))
-        light.environment = self._environment[1]
-        light.has_environment = int(bool(environment.radiance.any()))
+        shown = self._environments.of(shot.environment)
+        light.environment = shown.product_tree
+        light.has_environment = int(bool(shown.environment.radiance.any()))
         turn = np.radians(shot.environment_rotation)
         light.turn = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
         light.lights = upload_lights(shot.lights, self.device, geometry.scene.origin)
@@ -188,12 +186,9 @@ class PathRenderer:
         return light
 
 
-_BLACK = EnvironmentMap.constant((0.0, 0.0, 0.0))
-
-
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What paths meet, on a device."""
+    """Everything that paths can meet, on a device."""
 
     cloud: GaussianCloud
     mesh: ShotMesh | None
@@ -294,6 +289,8 @@ class PathProgress:
         samples = min(wanted, self.options.samples - self.sample_count)
         if self.done:
             return
+        tracing = PathPass()
+        tracing.seed, tracing.samples, tracing.bounces = self.options.seed, samples, self.options.bounces
         launch_trace_paths(
             self._geometry.scene.occluders,
             self._geometry.materials,
@@ -301,9 +298,7 @@ class PathProgress:
             self._light,
             self._rays,
             self._pixels,
-            self.options.seed,
-            samples,
-            self.options.bounces,
+            tracing,
             self._images,
             self._device,
         )
@@ -312,7 +307,7 @@ class PathProgress:
             self._keep_noisy(self.options.target_error)
 
     def image(self, *, denoiser: Denoiser = "none") -> RenderedImage:
-        """Return what is known by now.
+        """Return the image of the samples so far.
 
         Args:
             denoiser: What takes noise off the radiance, one of `beam_warp.trace.denoise.DENOISERS`.
@@ -351,7 +346,7 @@ class PathProgress:
         """Write what is done to a file, in one step.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         arrays = {name: getattr(self._images, name).numpy() for name in IMAGES}
         with replacing(path) as temporary, temporary.open("wb") as file:

@@ -15,12 +15,13 @@ from beam_warp.image.metrics import block_means
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_mesh import launch_blend_mesh, launch_shade_mesh
 from beam_warp.kernels.render.deferred_pixels import launch_average_samples, launch_shade_gaussians
+from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.render.arriving import ArrivingLight, PreparedEnvironments
+from beam_warp.render.arriving import ArrivingLight
 from beam_warp.render.options import DeferredOptions
-from beam_warp.render.shadow_maps import Subject
+from beam_warp.render.shadow_maps import ShadowCasters
 from beam_warp.trace.mesh_paths import TracedMesh
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -72,7 +73,7 @@ class DeferredFrame:
         self._count = len(shot.cloud)
         self._size = (shot.camera.width, shot.camera.height)
         self._cloud: GaussianCloud | None = None
-        self._subject = Subject(np.zeros(3), 1.0)
+        self._casters = ShadowCasters(np.zeros(3), 1.0)
         self._mesh: ShotMesh | None = None
         self._traced: TracedMesh | None = None
         self._light = ArrivingLight(self._count, options, environments, device)
@@ -116,10 +117,10 @@ class DeferredFrame:
         moved = shot.cloud is not self._cloud or shot.mesh is not self._mesh
         self._set_mesh(shot.mesh)
         if moved:
-            self._subject = Subject.of(shot.cloud, None if shot.mesh is None else shot.mesh.surface.vertices)
+            self._casters = ShadowCasters.of(shot.cloud, None if shot.mesh is None else shot.mesh.surface.vertices)
         self._set_cloud(shot.cloud)
-        self._light.set_environment(shot.environment, shot.environment_rotation, self._subject, moved=moved)
-        self._light.set_lights(tuple(shot.lights), self._subject, moved=moved)
+        self._light.set_environment(shot.environment, shot.environment_rotation, self._casters, moved=moved)
+        self._light.set_lights(tuple(shot.lights), self._casters, moved=moved)
 
     def _set_camera(self, camera: Camera) -> None:
         """Move the camera."""
@@ -191,14 +192,12 @@ class DeferredFrame:
 
     def _shade(self) -> None:
         """Light what was drawn."""
-        light, images = self._light, self._rasterizer.images
+        light, images = self._light.scene_light(), self._rasterizer.images
         launch_shade_gaussians(
             self._views,
             images,
             self._options.lights_gaussians,
-            light.distant,
-            light.lights,
-            light.shadows,
+            light,
             self.samples,
             self._device,
         )
@@ -207,10 +206,7 @@ class DeferredFrame:
                 self._views,
                 self._traced.surface,
                 self._catches,
-                light.distant,
-                light.regions,
-                light.lights,
-                light.shadows,
+                light,
                 self._mesh_image,
                 self._mesh_surfaces,
                 self._device,

@@ -13,14 +13,14 @@ median over the Gaussians of the middle one of their three scales, at most 2 % o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.device.arrays import upload
 from beam_warp.kernels.raster.project import RasterView
@@ -30,7 +30,7 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.world.camera import Camera, bulk
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.lights import DirectionalLight, Light, SpotLight
+from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, light_entry
 
 FAR = 500.0
 """How many radii away a distant light's view stands: directions are parallel to 1/500, depths fine to 6e-5 m."""
@@ -64,13 +64,13 @@ FACE_ANGLE = 48.0
 
 
 @dataclass(frozen=True)
-class Subject:
-    """The sphere that casts shadows.
+class ShadowCasters:
+    """The sphere around everything that casts shadows.
 
     Attributes:
         center: World position [m], ``(3,)``.
-        radius: [m].
-        thickness: Of its layer of Gaussians [m].
+        radius: Radius of the sphere [m].
+        thickness: Thickness of the layer of Gaussians that a surface is [m].
     """
 
     center: NDArray[np.float64]
@@ -78,7 +78,7 @@ class Subject:
     thickness: float = 0.0
 
     @classmethod
-    def of(cls, cloud: GaussianCloud, vertices: NDArray[np.float32] | None = None) -> Subject:
+    def of(cls, cloud: GaussianCloud, vertices: NDArray[np.float32] | None = None) -> ShadowCasters:
         """Return the sphere around a cloud's bulk and what corners of triangles are near it; or around all corners."""
         corners = np.zeros((0, 3)) if vertices is None else np.asarray(vertices, np.float64)
         if not len(cloud):
@@ -102,9 +102,9 @@ class ShadowView:
     """One map's view.
 
     Attributes:
-        camera: A square image.
-        radius: Of the light's disc at the camera's position [m].
-        front: Depth before which nothing of the subject is [m].
+        camera: The view, of a square image.
+        radius: Radius of the light's disc at the camera's position [m].
+        front: Depth before which nothing casts shadows [m].
     """
 
     camera: Camera
@@ -112,41 +112,69 @@ class ShadowView:
     front: float
 
 
-def distant_view(direction: Any, half_angle: float, subject: Subject, size: int) -> ShadowView:
+def distant_view(direction: Any, half_angle: float, casters: ShadowCasters, size: int) -> ShadowView:
     """Return the view of a distant light.
 
     Args:
-        direction: Unit, from the subject to the light.
-        half_angle: Of its disc [rad].
-        subject: What casts shadows.
+        direction: Unit vector to the light.
+        half_angle: Half the angle that its disc takes up [rad].
+        casters: What casts shadows.
         size: Texels of a side.
     """
-    distance = FAR * subject.radius
+    distance = FAR * casters.radius
     away = np.asarray(direction, np.float64)
-    camera = _camera(subject.center + distance * away, -away, np.arcsin(min(ROOM / FAR, 1.0)), size)
-    return ShadowView(camera, distance * float(np.tan(half_angle)), distance - ROOM * subject.radius)
+    camera = _camera(casters.center + distance * away, -away, np.arcsin(min(ROOM / FAR, 1.0)), size)
+    return ShadowView(camera, distance * float(np.tan(half_angle)), distance - ROOM * casters.radius)
 
 
-def light_views(light: Light, subject: Subject, size: int) -> list[ShadowView]:
+def light_views(light: Light, casters: ShadowCasters, size: int) -> list[ShadowView]:
     """Return the views of a light's maps: one, or the six of a cube.
 
     Six are in the order of `beam_warp.kernels.render.shadow_maps.face_towards`.
+
+    Raises:
+        InvalidOptionError: ``light`` is of no type that lights have.
     """
-    if isinstance(light, DirectionalLight):
-        half = 0.5 * np.radians(light.angular_diameter)
-        return [distant_view(-np.asarray(light.direction), half, subject, size)]
-    position = np.asarray(light.position, np.float64)
-    to_subject = subject.center - position
-    distance, extent = float(np.linalg.norm(to_subject)), ROOM * subject.radius
+    return light_entry(VIEWS, light)(light, casters, size)
+
+
+def _directional_views(light: DirectionalLight, casters: ShadowCasters, size: int) -> list[ShadowView]:
+    half = 0.5 * np.radians(light.angular_diameter)
+    return [distant_view(-np.asarray(light.direction), half, casters, size)]
+
+
+def _point_views(light: PointLight, casters: ShadowCasters, size: int) -> list[ShadowView]:
+    return _lamp_views(light.position, light.radius, np.zeros(3), np.pi, casters, size=size)
+
+
+def _spot_views(light: SpotLight, casters: ShadowCasters, size: int) -> list[ShadowView]:
+    cone = float(np.radians(light.outer_angle))
+    return _lamp_views(light.position, light.radius, np.asarray(light.direction), cone, casters, size=size)
+
+
+VIEWS: Mapping[type[Light], Callable[[Any, ShadowCasters, int], list[ShadowView]]] = {
+    DirectionalLight: _directional_views,
+    PointLight: _point_views,
+    SpotLight: _spot_views,
+}
+"""Where the shadow maps of each type of light look from."""
+
+
+def _lamp_views(
+    at: ArrayLike, radius: float, direction: NDArray[np.float64], cone: float, casters: ShadowCasters, *, size: int
+) -> list[ShadowView]:
+    """Return the views of a lamp that shines into a cone; they see the smaller of the cone and what casts shadows."""
+    position = np.asarray(at, np.float64)
+    axis = casters.center - position
+    distance, extent = float(np.linalg.norm(axis)), ROOM * casters.radius
     half_angle = np.arcsin(extent / distance) if distance > extent else np.pi
-    axis = to_subject
-    if isinstance(light, SpotLight) and np.radians(light.outer_angle) < half_angle:
-        axis, half_angle = np.asarray(light.direction), np.radians(light.outer_angle)
+    if cone < half_angle:
+        axis, half_angle = direction, cone
     front = max(distance - extent, NEAR)
     if half_angle <= np.radians(WIDEST):
-        return [ShadowView(_camera(position, axis, half_angle, size), light.radius, front)]
+        return [ShadowView(_camera(position, axis, half_angle, size), radius, front)]
     faces = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
-    return [ShadowView(_camera(position, face, np.radians(FACE_ANGLE), size), light.radius, NEAR) for face in faces]
+    return [ShadowView(_camera(position, face, np.radians(FACE_ANGLE), size), radius, NEAR) for face in faces]
 
 
 def _camera(eye: NDArray[np.float64], axis: NDArray[np.float64], half_angle: float, size: int) -> Camera:
@@ -161,8 +189,8 @@ class ShadowDrawer:
     """Draws the maps of some views, all of one size, again and again.
 
     Attributes:
-        maps: What kernels take: the same arrays for ever.
-        cameras: What the maps see now.
+        maps: The maps as kernels take them: the same arrays for as long as the drawer lives.
+        cameras: The views of the maps now.
     """
 
     def __init__(
@@ -170,16 +198,16 @@ class ShadowDrawer:
         gaussian_count: int,
         views: Sequence[ShadowView],
         *,
-        subject: Subject,
+        casters: ShadowCasters,
         taps: tuple[int, int],
         device: Any,
     ) -> None:
         """Allocate.
 
         Args:
-            gaussian_count: N.
-            views: At least one.
-            subject: What casts shadows.
+            gaussian_count: Number of Gaussians that are drawn.
+            views: Views of the maps, at least one.
+            casters: What casts shadows.
             taps: How many look for what is in the way of a light of a size, and how many are then compared, each with
                 four texels.
             device: Warp device.
@@ -212,21 +240,21 @@ class ShadowDrawer:
         self.maps.search_taps = upload(disc_taps(taps[0]), wp.vec2, device)
         self.maps.filter_taps = upload(disc_taps(taps[1]), wp.vec2, device)
         self.maps.largest_kernel = LARGEST_KERNEL * self.cameras[0].width
-        self._set(views, subject)
+        self._set(views, casters)
 
-    def move(self, views: Sequence[ShadowView], subject: Subject) -> None:
-        """See the subject from elsewhere; number and size of the views stay."""
+    def move(self, views: Sequence[ShadowView], casters: ShadowCasters) -> None:
+        """Draw from other views from now on; their number and size stay."""
         self.cameras = [view.camera for view in views]
         for rasterizer, group in zip(self._rasterizers, self._groups, strict=True):
             rasterizer.set_cameras([self.cameras[k] for k in group])
         self.maps.views.assign(wp.array(ViewLayout.of(self.cameras).views, dtype=RasterView, device=self._device))
-        self._set(views, subject)
+        self._set(views, casters)
 
-    def _set(self, views: Sequence[ShadowView], subject: Subject) -> None:
+    def _set(self, views: Sequence[ShadowView], casters: ShadowCasters) -> None:
         """Bring what kernels know of lights to the device."""
         self.maps.radii.assign(np.array([view.radius for view in views], np.float32))
         self.maps.fronts.assign(np.array([view.front for view in views], np.float32))
-        self.maps.thickness = subject.thickness
+        self.maps.thickness = casters.thickness
 
     @property
     def pair_capacities(self) -> tuple[int, ...]:
@@ -237,7 +265,7 @@ class ShadowDrawer:
         """Draw all maps, however much room they take.
 
         Args:
-            gaussians: On the device.
+            gaussians: The Gaussians, on the device.
             mesh: A `beam_warp.kernels.mesh.surface.MeshSurface`, or None.
         """
         self._mesh = mesh

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import display_image
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT, Panel, lay_out, over_background
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
-from beam_warp.render.split_sum import relight
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import UNSHADOWED
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.shot import Shot
 
 WHITE_IRRADIANCE = 0.85 * np.pi
 """Relightings are exposed so that a white surface facing the light's strongest side comes to 0.85."""
@@ -25,15 +27,27 @@ WHITE_IRRADIANCE = 0.85 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class Relighting:
-    """A light to show the asset under; one that is prepared, on the device that draws, is not prepared again."""
+    """A light to show the asset under.
+
+    Attributes:
+        title: Title of its panel.
+        light: An environment; one that is prepared, on the device that draws, is not prepared again.
+        degrees: The angle about z by which it is turned, as in `beam_warp.world.shot.Shot`.
+    """
 
     title: str
-    light: EnvironmentMap | EnvironmentLighting
+    light: EnvironmentMap | PreparedEnvironment
+    degrees: float = 0.0
+
+    @property
+    def environment(self) -> EnvironmentMap:
+        """The light as it is before it is turned."""
+        return self.light.environment if isinstance(self.light, PreparedEnvironment) else self.light
 
 
-def display_exposure(lighting: EnvironmentLighting) -> float:
+def display_exposure(environment: EnvironmentMap) -> float:
     """Return the stops that bring a white surface, at its best-lit orientation, to just below display white."""
-    brightest = float(lighting.light.irradiance.numpy().max())
+    brightest = float(environment.default_irradiance.max())
     return float(np.log2(WHITE_IRRADIANCE / max(brightest, 1e-12)))
 
 
@@ -70,13 +84,15 @@ def contact_sheet(
         ("roughness (white is 1)", over_background(_gray(buffer.channels["roughness"]), alpha)),
         ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels["normals"] + 0.5, alpha)),
     ]
+    prepared = [relighting.light for relighting in relightings if isinstance(relighting.light, PreparedEnvironment)]
+    renderer = DeferredRenderer(UNSHADOWED, raster=options, device=device, prepared=prepared)
     for relighting in relightings:
-        lighting = relighting.light
-        if isinstance(lighting, EnvironmentMap):
-            lighting = EnvironmentLighting.from_environment(lighting, device=device)
-        radiance = relight(buffer, lighting)
-        straight = np.divide(radiance, alpha, out=np.zeros_like(radiance), where=alpha > 0.0)
-        shown = display_image(straight, display_exposure(lighting)) / 255.0
+        light = relighting.environment
+        image = renderer.draw(
+            Shot(cloud=cloud, camera=camera, environment=light, environment_rotation=relighting.degrees)
+        )
+        straight = np.divide(image.rgb, alpha, out=np.zeros_like(image.rgb), where=alpha > 0.0)
+        shown = display_image(straight, display_exposure(light)) / 255.0
         panels.append((relighting.title, over_background(shown, alpha)))
     return _grid(panels)
 

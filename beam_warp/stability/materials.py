@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from beam_warp.capture.findings import Finding
 from beam_warp.device.arrays import device_label, resolve_device
 from beam_warp.errors import BeamError
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.agreement import (
     judge_clipping,
     judge_environment,
@@ -149,12 +149,12 @@ class Bench:
     """
 
     studio: MaterialStudio
-    _lights: dict[int, tuple[EnvironmentMap, MaterialLight]] = field(default_factory=dict)
+    _lights: dict[int, tuple[EnvironmentMap, PreparedEnvironment]] = field(default_factory=dict)
 
-    def light(self, environment: EnvironmentMap) -> MaterialLight:
+    def light(self, environment: EnvironmentMap) -> PreparedEnvironment:
         """Return a light prepared on the device."""
         if id(environment) not in self._lights:  # the map is held beside, so that its id stays its own
-            prepared = MaterialLight.from_environment(environment, resolve_device(self.studio.device))
+            prepared = PreparedEnvironment(environment, resolve_device(self.studio.device))
             self._lights[id(environment)] = (environment, prepared)
         return self._lights[id(environment)][1]
 

@@ -119,7 +119,7 @@ RELIGHTING_TITLE = "## Relighting"
 
 RELIGHTING_TEXT = """\
 Subjects and lights on which renderers make acne, fireflies, glowing shells or NaN, and what the deferred renderer and
-the path tracer make of them: `beam_warp/stability/relighting_cases.py`. What must hold is a closed form in float64, an
+the path tracer make of them: `beam_warp/stability/relighting_cases/`. What must hold is a closed form in float64, an
 image of {times} times the samples, or a bound, each with its reason. That images are finite, with alpha in [0, 1] and
 no negative light, is asked of all.
 

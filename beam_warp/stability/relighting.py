@@ -1,6 +1,6 @@
-"""What renderers make of subjects and lights on which relighting fails: what was measured, and whether it holds.
+"""Both renderers on the cases on which relighting fails: measured numbers, and whether they hold.
 
-The path tracer draws every case with several seeds: what is measured is the mean over them, with its standard error
+The path tracer draws every case with several seeds: a measured number is the mean over them, with its standard error
 from their spread. A bound is missed if the mean is beyond it by more than chance explains; if chance explains more than
 the bounds leave room for, nothing was shown, and that is a fault too.
 """
@@ -20,18 +20,18 @@ from beam_warp.device.arrays import device_label, resolve_device
 from beam_warp.errors import BeamError
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
-from beam_warp.stability.relighting_cases import (
+from beam_warp.stability.relighting_cases import RELIGHTING_CASES
+from beam_warp.stability.relighting_cases.cases import (
     DEFERRED,
     PATH,
-    RELIGHTING_CASES,
     RENDERERS,
     Demand,
     Drawn,
     RelightingCase,
     RelightStress,
-    RelightStudio,
 )
-from beam_warp.world.shot import ImageRenderer, RenderedImage, Shot
+from beam_warp.stability.relighting_cases.scenes import RelightStudio
+from beam_warp.world.shot import RenderedImage, Renderer, Shot
 
 SEEDS = 8
 """Images of the path tracer by which its noise is told."""
@@ -42,7 +42,7 @@ either way with a probability of 2e-4."""
 
 REFERENCE_SEED = 1000
 REFERENCE_TIMES = 4
-"""Of the samples of a reference, how many times as many as an image's."""
+"""How many times the samples of an image a reference takes."""
 
 BOUNCES = 4
 
@@ -52,11 +52,11 @@ class Held:
     """What was measured for one demand.
 
     Attributes:
-        what: It is.
-        value: The mean over seeds.
-        error: Its standard error; 0 for a renderer without noise.
-        low: It must not be below.
-        high: It must not be above.
+        what: Name of the measured number.
+        value: Mean of the number over seeds.
+        error: Standard error of the mean; 0 for a renderer without noise.
+        low: Lower bound.
+        high: Upper bound.
         because: Where the bounds come from.
     """
 
@@ -95,15 +95,15 @@ class RelightingOutcome:
     """What one renderer made of one case.
 
     Attributes:
-        case: Its name.
+        case: Name of the case.
         renderer: ``"deferred"`` or ``"path"``.
         device: Warp device.
-        gaussians: How many, in the largest shot.
+        gaussians: Number of Gaussians in the largest shot.
         size: Columns and rows of the images.
-        samples: Of a pixel, for each seed; 1 for the deferred renderer.
+        samples: Samples of a pixel, for each seed; 1 for the deferred renderer.
         done: What happened to the input.
         held: What was measured.
-        faults: What should not be; empty if all is well.
+        faults: Faults, in words; empty if all is well.
         seconds: Time of the first images, compilation included.
     """
 
@@ -154,7 +154,7 @@ class RelightingBench:
     deferred: DeferredOptions = field(default_factory=DeferredOptions)
     seeds: int = SEEDS
 
-    def renderer(self, name: str, seed: int = 0, *, times: int = 1) -> ImageRenderer:
+    def renderer(self, name: str, seed: int = 0, *, times: int = 1) -> Renderer:
         """Return a renderer that drew nothing yet, with so many times the samples."""
         if name == DEFERRED:
             return DeferredRenderer(self.deferred, device=self.device)
@@ -176,8 +176,8 @@ def run_relighting_cases(
     """Run case after case with every renderer.
 
     Args:
-        bench: Where they are drawn.
-        cases: From `RELIGHTING_CASES`.
+        bench: How they are drawn.
+        cases: Members of `RELIGHTING_CASES`.
         progress: Called with (cases done, cases in all).
     """
     for done, case in enumerate(cases, start=1):
@@ -233,7 +233,7 @@ def hold(demand: Demand, values: Sequence[float]) -> Held:
 
 
 def image_faults(images: Sequence[RenderedImage]) -> list[str]:
-    """Return what no image may have."""
+    """Return faults that no image may have, in words."""
     faults = []
     for image in images:
         for name, array in {"rgb": image.rgb, "alpha": image.alpha, **image.layers}.items():

@@ -15,7 +15,7 @@ from beam_warp.stage.jobs import FrameContext
 from beam_warp.world.shot import RenderedImage, Shot
 
 SEED_STEP = 0x9E3779B9
-"""Between the seeds of two frames, modulo 2^32; odd, so that no two frames share one."""
+"""Difference between the seeds of two frames, modulo 2^32. It is odd, so that no two frames share a seed."""
 
 
 class DeferredFrames:

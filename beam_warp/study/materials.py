@@ -16,7 +16,7 @@ from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
@@ -183,7 +183,7 @@ class _Bench:
     def __init__(self, subject: MaterialsSubject, plan: MaterialsPlan, device: Any) -> None:
         """Prepare the light and the reference."""
         self.subject, self.plan, self.device = subject, plan, device
-        self.light = MaterialLight.from_environment(subject.environment, device)
+        self.light = PreparedEnvironment(subject.environment, device)
         self._compiled: set[str] = set()
         rough = subject.cloud.roughness
         self.roughness = np.full(len(subject.cloud), ROUGHNESS, np.float32) if rough is None else rough
@@ -317,7 +317,7 @@ class _Bench:
             Scene.from_gaussians(subject.cloud, str(self.device)),
             subject.views,
             self.roughness,
-            self.light.sampled,
+            self.light,
             ImagePathOptions(
                 occlusion_samples=rays,
                 light_samples=2 * rays,

@@ -14,7 +14,7 @@ import warp as wp
 from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.kernels.common.launching import thread_count
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, Subject
 from beam_warp.study.tracing_plan import DEFAULT_PLAN, TracingPlan
 from beam_warp.study.tracing_truth import Progress, References, find_references
@@ -74,7 +74,7 @@ def tracing_study(
     references = find_references(
         cloud, environment, plan, scene, file=references_file, seconds=reference_seconds, progress=progress
     )
-    bench = _Bench(plan, references, scene, SampledEnvironment.from_environment(environment, target), len(cloud))
+    bench = _Bench(plan, references, scene, PreparedEnvironment(environment, target), len(cloud))
     subject = Subject(
         name="tracing",
         title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {device_name(target)}",
@@ -191,8 +191,8 @@ class _Bench:
         self,
         plan: TracingPlan,
         references: References,
-        scene: Scene,
-        light: SampledEnvironment,
+        scene: dict[str, Scene],
+        light: PreparedEnvironment,
         count: int,
     ) -> None:
         """Keep what is measured on; ``count`` is the number of Gaussians that times are scaled to."""

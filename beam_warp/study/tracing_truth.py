@@ -19,7 +19,7 @@ from beam_warp.converters.staging import staged_outputs
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.trace.surface_rays import launch_local_surface
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.normals import estimate_normals
 from beam_warp.study.tracing_plan import TracingPlan, parse_offset
 from beam_warp.trace.incident import irradiance
@@ -121,7 +121,7 @@ def find_references(
         normals = estimate_normals(cloud, scene, progress=lambda done, total: report("normals", done, total)).normals
     number = min(plan.points or POINTS[scene.device.is_cuda], len(seen))
     chosen = np.random.default_rng(plan.seed).permutation(seen)[:number]
-    light = SampledEnvironment.from_environment(environment, scene.device)
+    light = PreparedEnvironment(environment, scene.device)
     started, blocks = time.perf_counter(), []
     for start in range(0, number, BLOCK[scene.device.is_cuda]):
         rows = chosen[start : start + BLOCK[scene.device.is_cuda]]
@@ -148,7 +148,7 @@ def find_references(
 def _trace_block(
     points: NDArray[np.float32],
     normals: NDArray[np.float32],
-    light: SampledEnvironment,
+    light: PreparedEnvironment,
     plan: TracingPlan,
     scene: Scene,
     number: int,

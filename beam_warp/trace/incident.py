@@ -20,7 +20,7 @@ from beam_warp.kernels.trace.incident_light import (
     launch_reduce_light,
     launch_sum_unshadowed,
 )
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
 from beam_warp.trace.sampling import Sampler, sample_set
 from beam_warp.trace.scene import Scene
@@ -73,7 +73,7 @@ def irradiance(
     scene: Scene,
     points: Any,
     normals: Any,
-    environment: EnvironmentMap | SampledEnvironment,
+    environment: EnvironmentMap | PreparedEnvironment,
     *,
     sample_count: int = 64,
     sampler: Sampler = "owen",
@@ -105,7 +105,7 @@ def irradiance(
         scene: Occluders; the work runs on its device.
         points: Surface points [m], ``(N, 3)`` float32, NumPy or a warp array of vec3 on the scene's device.
         normals: Unit outward normals, like ``points``.
-        environment: Distant light; maps of more than 512 rows are reduced to 512, energy kept. A `SampledEnvironment`
+        environment: Distant light; maps of more than 512 rows are reduced to 512, energy kept. A `PreparedEnvironment`
             saves preparing the same map again.
         sample_count: Rays per point, at least 2, and 4 for ``"mis"``; powers of two suit ``"owen"``.
         sampler: Sample sets: ``"owen"``, ``"stratified"`` or ``"iid"``; see `beam_warp.ambient_occlusion`.
@@ -137,7 +137,7 @@ def irradiance(
     up = upload_vectors("normals", normals, scene.device, unit_length=True)
     require_same_length("normals", up, "points", len(at))
     if isinstance(environment, EnvironmentMap):
-        environment = SampledEnvironment.from_environment(environment, scene.device)
+        environment = PreparedEnvironment(environment, scene.device)
     elif environment.device != scene.device:
         raise InvalidOptionError(
             f"environment must be on {scene.device}, got one on {environment.device}. Prepare it for that device."
@@ -152,7 +152,7 @@ def _gather(
     scene: Scene,
     points: wp.array,
     normals: wp.array,
-    environment: SampledEnvironment,
+    environment: PreparedEnvironment,
     parts: list[Technique],
     ratio: bool,
     offset: float | Literal["auto"],

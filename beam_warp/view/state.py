@@ -14,7 +14,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.image.tone import ViewTransform
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight
+from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, unknown_light
 
 LIT = "lit"
 """The channel that is what light makes of all the others."""
@@ -255,7 +255,11 @@ class PlacedLight:
                 radius=self.size,
                 casts_shadows=self.casts_shadows,
             )
-        return PointLight(position=self.position, intensity=power, radius=self.size, casts_shadows=self.casts_shadows)
+        if self.kind == "point":
+            return PointLight(
+                position=self.position, intensity=power, radius=self.size, casts_shadows=self.casts_shadows
+            )
+        raise unknown_light(self.kind)
 
 
 def srgb_of(color: Color) -> tuple[float, float, float]:

@@ -1,4 +1,16 @@
-"""Lights at a place or from a direction, in physical units, and the JSON that lists them."""
+"""Lights at a place or from a direction, in physical units, and the JSON that lists them.
+
+A new type of light takes one entry in each of these places:
+
+- here, a record and its name in `LIGHT_TYPES`: shots take it, and JSON is read and written;
+- ``kernels/light/lights.py``, a kind and a case of `light_disc`: the direction, distance, irradiance and angle of the
+  light at a point, from which sampling, densities and shading of both renderers follow;
+- `beam_warp.light.uploaded.ROWS`: its layout for that kernel;
+- `beam_warp.render.shadow_maps.VIEWS`: where its shadow maps look from;
+- `beam_warp.view.state.PlacedLight.light`, if it can be placed by hand in the viewer.
+
+``tests/light/test_uploaded.py`` fails for a type without its entries.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +18,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_array, require_finite, require_number, require_range
-from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError
+from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, InvalidOptionError, MissingFileError
 
 SUN_DIAMETER = 0.53
 """Angular diameter of the sun [degree]."""
@@ -26,9 +38,9 @@ class DirectionalLight:
 
     Attributes:
         direction: World direction in which the light travels, of any length but 0.
-        irradiance: On a plane that faces the light [W/m^2], scene-linear Rec.709, in the unit of the environment's
-            radiance times steradian.
-        angular_diameter: Of its disc [degree], 0 to 90; shadows of 0 are sharp.
+        irradiance: Irradiance on a plane that faces the light [W/m^2], scene-linear Rec.709, in the unit of the
+            environment's radiance times steradian.
+        angular_diameter: Angle that the disc of the light takes up [degree], 0 to 90; shadows of 0 are sharp.
         casts_shadows: Whether what is in the way casts a shadow.
 
     Raises:
@@ -55,7 +67,7 @@ class PointLight:
     Attributes:
         position: World position [m].
         intensity: Radiant intensity [W/sr], scene-linear Rec.709: irradiance is intensity over the distance squared.
-        radius: Of the sphere [m], at least 0; shadows of 0 are sharp. A point inside of it gets no light.
+        radius: Radius of the sphere [m], at least 0; shadows of 0 are sharp. A point inside of it gets no light.
         casts_shadows: Whether what is in the way casts a shadow.
 
     Raises:
@@ -81,11 +93,11 @@ class SpotLight:
 
     Attributes:
         position: World position [m].
-        direction: World direction of its axis, away from the light, of any length but 0.
+        direction: World direction of the cone's axis, away from the light, of any length but 0.
         intensity: Radiant intensity on the axis [W/sr], scene-linear Rec.709.
-        inner_angle: Between the axis and where light begins to fade [degree].
-        outer_angle: Between the axis and where it ends [degree], above ``inner_angle`` and at most 89.
-        radius: Of the sphere that shines [m], at least 0.
+        inner_angle: Angle between the axis and where light begins to fade [degree].
+        outer_angle: Angle between the axis and where light ends [degree], above ``inner_angle`` and at most 89.
+        radius: Radius of the sphere that shines [m], at least 0.
         casts_shadows: Whether what is in the way casts a shadow.
 
     Raises:
@@ -114,7 +126,26 @@ class SpotLight:
 Light: TypeAlias = DirectionalLight | PointLight | SpotLight
 
 LIGHT_TYPES: Mapping[str, type[Light]] = {"directional": DirectionalLight, "point": PointLight, "spot": SpotLight}
-"""By the name that JSON gives them."""
+"""Every type of light, by the name that JSON gives it."""
+
+Entry = TypeVar("Entry")
+
+
+def light_entry(table: Mapping[type[Light], Entry], light: Any) -> Entry:
+    """Return a table's entry for the type of a light.
+
+    Raises:
+        InvalidOptionError: ``light`` is of no type that lights have.
+    """
+    if type(light) not in table:
+        raise unknown_light(type(light).__name__)
+    return table[type(light)]
+
+
+def unknown_light(got: str) -> InvalidOptionError:
+    """Return the error that refuses what is no light."""
+    known = ", ".join(kind.__name__ for kind in LIGHT_TYPES.values())
+    return InvalidOptionError(f"lights must be of {known}, got {got}. Choose one of these types.")
 
 
 def lights_from_json(records: Any, where: str = "lights") -> tuple[Light, ...]:
@@ -125,7 +156,7 @@ def lights_from_json(records: Any, where: str = "lights") -> tuple[Light, ...]:
         where: What to call the list in errors.
 
     Raises:
-        AssetFormatError: It is no list of such objects; says which one, and what of it is wrong.
+        AssetFormatError: The records are no list of such objects; the error names the first wrong one and its fault.
     """
     if not isinstance(records, Sequence) or isinstance(records, str | bytes):
         raise AssetFormatError(f"{where} must be a list of lights, got {type(records).__name__}. Put them in [ ].")
@@ -135,7 +166,7 @@ def lights_from_json(records: Any, where: str = "lights") -> tuple[Light, ...]:
 def lights_to_json(lights: Sequence[Light]) -> list[dict[str, Any]]:
     """Return what `lights_from_json` reads."""
     names = {kind: name for name, kind in LIGHT_TYPES.items()}
-    return [{"type": names[type(light)], **asdict(light)} for light in lights]
+    return [{"type": light_entry(names, light), **asdict(light)} for light in lights]
 
 
 def read_lights(path: Path) -> tuple[Light, ...]:
@@ -143,7 +174,7 @@ def read_lights(path: Path) -> tuple[Light, ...]:
 
     Raises:
         MissingFileError: The file cannot be read.
-        AssetFormatError: It is not JSON, or see `lights_from_json`.
+        AssetFormatError: The file is not JSON, or its list is wrong: see `lights_from_json`.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""What one rendered image is made of, and what a renderer gives back: the same for every renderer."""
+"""A shot, which is everything that one image is rendered from, the rendered image, and the protocol of renderers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
-from beam_warp.world.lights import Light
+from beam_warp.world.lights import LIGHT_TYPES, Light, unknown_light
 from beam_warp.world.mesh import MaterialMesh
 
 
@@ -55,7 +55,7 @@ class Shot:
 
     Raises:
         InvalidArrayError: The cloud lacks base colour, roughness, ambient occlusion or normals.
-        InvalidOptionError: The cloud is in other axes, or the rotation is not finite.
+        InvalidOptionError: The cloud is in other axes, the rotation is not finite, or one of ``lights`` is no light.
     """
 
     cloud: GaussianCloud
@@ -68,6 +68,9 @@ class Shot:
     def __post_init__(self) -> None:
         """Check what every renderer needs."""
         require_number("environment_rotation", self.environment_rotation, -1e6, 1e6)
+        for light in self.lights:
+            if type(light) not in LIGHT_TYPES.values():
+                raise unknown_light(type(light).__name__)
         if self.cloud.axes != WORLD_AXES:
             raise InvalidOptionError(
                 f"cloud must be in the axes {WORLD_AXES!r}, got {self.cloud.axes!r}. Convert it with "
@@ -85,7 +88,7 @@ class RenderedImage:
     Attributes:
         rgb: Scene-linear Rec.709 radiance multiplied by alpha, ``(H, W, 3)`` float32.
         alpha: Coverage in [0, 1], ``(H, W)`` float32. A caught shadow is black with the alpha of what it takes away.
-        layers: By name, further images, means over what is covered, 0 where nothing is: ``base_color`` (H, W, 3),
+        layers: Further images by name, means over what is covered, 0 where nothing is: ``base_color`` (H, W, 3),
             ``roughness``, ``normals`` (unit, world), ``depth`` (along the optical axis [m]), ``ambient_occlusion`` and
             what else the renderer knows.
     """
@@ -95,8 +98,11 @@ class RenderedImage:
     layers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
-class ImageRenderer(Protocol):
-    """Renders shots, one after the other; what two shots share is made ready once."""
+class Renderer(Protocol):
+    """Renders shots, one after the other. What two shots share is prepared once.
+
+    `beam_warp.render.deferred.DeferredRenderer` and `beam_warp.render.path.PathRenderer` are the renderers.
+    """
 
     def draw(self, shot: Shot) -> RenderedImage:
         """Render one image."""

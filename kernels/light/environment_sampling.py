@@ -1,4 +1,4 @@
-"""Directions drawn from an environment map alone, by luminance times solid angle: map, density and inverse.
+"""Directions drawn from an environment map alone, by luminance times solid angle: map and density.
 
 Two searches in cumulative sums, so that the map is monotone in each coordinate and keeps the stratification of its
 samples. Radiance is constant inside a texel, and so is the density: inside, cos(theta) and phi are uniform.
@@ -85,26 +85,6 @@ def square_to_environment_pdf(distribution: EnvironmentDistribution, direction: 
     row = wp.clamp(int(uv[1] * float(height)), 0, height - 1)
     column = wp.clamp(int(uv[0] * float(width)), 0, width - 1)
     return distribution.density[row, column]
-
-
-@wp.func
-def environment_to_square(distribution: EnvironmentDistribution, direction: wp.vec3) -> wp.vec2:
-    """The point of the unit square that `square_to_environment` takes to ``direction``."""
-    uv = direction_to_latlong(direction)
-    height = distribution.density.shape[0]
-    width = distribution.density.shape[1]
-    row = wp.clamp(int(uv[1] * float(height)), 0, height - 1)
-    column = wp.clamp(int(uv[0] * float(width)), 0, width - 1)
-    upper = wp.cos(PI * float(row) / float(height))
-    lower = wp.cos(PI * float(row + 1) / float(height))
-    down = wp.clamp((direction[2] - upper) / (lower - upper), 0.0, 1.0)
-    across = wp.clamp(uv[0] * float(width) - float(column), 0.0, 1.0)
-    top = distribution.row_edges[row]
-    left = distribution.column_edges[row, column]
-    return wp.vec2(
-        left + (distribution.column_edges[row, column + 1] - left) * across,
-        top + (distribution.row_edges[row + 1] - top) * down,
-    )
 
 
 @wp.func

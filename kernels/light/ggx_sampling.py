@@ -1,4 +1,4 @@
-"""Directions drawn from a GGX lobe by its visible normals: map, density and inverse, in the frame of the normal (+z).
+"""Directions drawn from a GGX lobe by its visible normals: map and density, in the frame of the normal (+z).
 
 Source: Dupuy and Benyoub 2023: seen from a stretched view direction, visible normals are a uniform spherical cap.
 """
@@ -38,16 +38,3 @@ def square_to_visible_reflection_pdf(view: wp.vec3, light: wp.vec3, alpha: float
         masking = view[2] + wp.sqrt(view[2] * view[2] * (1.0 - a2) + a2)
         density = 0.5 * ggx_distribution(half[2], alpha) / masking
     return density
-
-
-@wp.func
-def visible_reflection_to_square(view: wp.vec3, light: wp.vec3, alpha: float) -> wp.vec2:
-    """The point of the unit square that `square_to_visible_reflection` takes to ``light``."""
-    axis = stretched(view, alpha)
-    half = wp.normalize(view + light)
-    m = wp.normalize(wp.vec3(half[0] / alpha, half[1] / alpha, half[2]))
-    c = 2.0 * wp.dot(axis, m) * m - axis
-    turn = wp.atan2(c[1], c[0]) / (2.0 * PI)
-    if turn < 0.0:
-        turn += 1.0
-    return wp.vec2(turn, 1.0 - (c[2] + axis[2]) / (1.0 + axis[2]))

@@ -76,7 +76,7 @@ def light_disc(lights: Lights, k: int, point: wp.vec3) -> LightDisc:
 
 @wp.func
 def solid_angle(sine: float) -> float:
-    """Of a cone of directions about an axis [sr]; exact for small ones, where 1 - cos is not."""
+    """Solid angle [sr] of a cone of directions, by the sine of its half angle; exact for small ones too."""
     return 2.0 * PI * sine * sine / (1.0 + wp.sqrt(wp.max(1.0 - sine * sine, 0.0)))
 
 

@@ -170,53 +170,6 @@ def block_of(blocks: EnvironmentBlocks, texel: wp.vec2i) -> int:
     return (texel[0] / rows) * BLOCK_COLUMNS + texel[1] / columns
 
 
-@wp.func
-def square_to_product_pdf(
-    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, direction: wp.vec3
-) -> float:
-    """Density of a direction [1/sr]."""
-    texel = texel_of(blocks, direction)
-    block = block_of(blocks, texel)
-    total = cumulative[point, BLOCK_COUNT - 1]
-    density = float(0.0)
-    if total > 0.0 and blocks.block_power[block] > 0.0:
-        share = (cumulative[point, block] - entry_before(cumulative, point, 0, block)) / total
-        density = share * (blocks.luminance[texel[0], texel[1]] / blocks.block_power[block])
-    return density
-
-
-@wp.func
-def product_to_square(
-    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], point: int, direction: wp.vec3
-) -> wp.vec2:
-    """The point of the unit square that `square_to_product` takes to ``direction``, if its density there is not 0."""
-    texel = texel_of(blocks, direction)
-    block = block_of(blocks, texel)
-    row = texel[0]
-    height = blocks.radiance.shape[0]
-    width = blocks.radiance.shape[1]
-    rows = height / BLOCK_ROWS
-    columns = width / BLOCK_COLUMNS
-
-    # Within the texel, then within the block, then among the blocks: the steps of the map from its end.
-    upper = wp.cos(float(row) / float(height) * PI)
-    lower = wp.cos(float(row + 1) / float(height) * PI)
-    u = wp.clamp((direction[2] - upper) / (lower - upper), 0.0, 1.0)
-    v = wp.clamp(direction_to_latlong(direction)[0] * float(width) - float(texel[1]), 0.0, 1.0)
-    u_begin = entry_before(blocks.row_cdf, block, 0, row % rows)
-    u = u_begin + u * (blocks.row_cdf[block, row % rows] - u_begin)
-    v_begin = entry_before(blocks.column_cdf, row, texel[1] - texel[1] % columns, texel[1] % columns)
-    v = v_begin + v * (blocks.column_cdf[row, texel[1]] - v_begin)
-
-    block_row = block / BLOCK_COLUMNS
-    row_begin = entry_before(cumulative, point, 0, block_row * BLOCK_COLUMNS)
-    row_end = cumulative[point, block_row * BLOCK_COLUMNS + BLOCK_COLUMNS - 1]
-    block_begin = entry_before(cumulative, point, 0, block)
-    u = (row_begin + u * (row_end - row_begin)) / cumulative[point, BLOCK_COUNT - 1]
-    v = (block_begin + v * (cumulative[point, block] - block_begin) - row_begin) / (row_end - row_begin)
-    return wp.vec2(u, v)
-
-
 def launch_accumulate_block_weights(blocks, normals, out_cumulative, device):
     """Prepare product sampling at each point."""
     launch(

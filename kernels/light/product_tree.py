@@ -49,7 +49,7 @@ def block_in_group(group: int, k: int) -> int:
 
 @wp.func
 def total_weight(tree: ProductTree, normal: wp.vec3) -> float:
-    """Of all groups: what densities at a point have in common."""
+    """Sum of the weights of all groups: densities at a point are divided by it."""
     total = float(0.0)
     for group in range(GROUP_COUNT):
         total += group_weight(tree, group, normal)

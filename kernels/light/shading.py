@@ -1,13 +1,10 @@
-"""Shading a G-buffer with an environment: irradiance for the diffuse lobe, split sum for the specular one.
+"""Light of an environment with nothing in the way: irradiance for the diffuse lobe, split sum for the specular one.
 
-The float64 twin is in the tests of `beam_warp.light.prefiltered`, where the formulas and their sources stand.
+Formulas and sources stand in `beam_warp.light.prefiltered`.
 """
-
-from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.light.latlong import direction_to_latlong, latlong_bilinear, latlong_wrap
 
@@ -30,18 +27,6 @@ class EnvironmentLight:
     first_roughness: float  # of level 1; level 0 is the mirror
     log_ratio: float  # natural logarithm of the ratio of roughness of one level to that of the level before
     albedo_terms: wp.array2d[wp.vec2]  # (A, B) over roughness and the square root of n·v
-
-
-@wp.struct
-class ShadedSurfaces:
-    """What each pixel shows, un-premultiplied; a pixel of alpha 0 is not looked at."""
-
-    base_color: wp.array[wp.vec3]
-    roughness: wp.array[float]
-    ambient_occlusion: wp.array[float]
-    normals: wp.array[wp.vec3]
-    alpha: wp.array[float]
-    view_directions: wp.array[wp.vec3]  # unit, from the camera
 
 
 @wp.func
@@ -123,7 +108,7 @@ def view_albedo(light: EnvironmentLight, normal: wp.vec3, view: wp.vec3, roughne
 
 
 @wp.func
-def environment_radiance(
+def split_sum_radiance(
     light: EnvironmentLight,
     base_color: wp.vec3,
     roughness: float,
@@ -140,33 +125,3 @@ def environment_radiance(
     n_dot_v = wp.clamp(wp.dot(normal, view), MIN_N_DOT_V, 1.0)
     open_share = specular_occlusion(ambient_occlusion, n_dot_v, roughness)
     return diffuse + reflected_radiance(light, normal, view, roughness) * (reflected * open_share)
-
-
-@wp.kernel
-def shade_environment_kernel(
-    first: int, light: EnvironmentLight, surfaces: ShadedSurfaces, out_radiance: wp.array[wp.vec3]
-):
-    i = first + wp.tid()
-    alpha = surfaces.alpha[i]
-    if not (alpha > 0.0):
-        out_radiance[i] = wp.vec3(0.0, 0.0, 0.0)
-        return
-    out_radiance[i] = alpha * environment_radiance(
-        light,
-        surfaces.base_color[i],
-        wp.clamp(surfaces.roughness[i], 0.0, 1.0),
-        wp.clamp(surfaces.ambient_occlusion[i], 0.0, 1.0),
-        surfaces.normals[i],
-        -surfaces.view_directions[i],
-    )
-
-
-def launch_shade_environment(light: Any, surfaces: Any, *, out_radiance: wp.array, device: Any) -> None:
-    """Shade every pixel; radiance comes out multiplied by alpha."""
-    launch(
-        shade_environment_kernel,
-        len(out_radiance),
-        inputs=[light, surfaces],
-        outputs=[out_radiance],
-        device=device,
-    )

@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False})
 PI = wp.constant(3.14159265358979323846)
 
 MEAN_COSINE = wp.constant(0.6666667)
-"""Of cosine-weighted directions: the specular lobe's albedo there stands for that of diffuse light."""
+"""Mean cosine of cosine-weighted directions: the specular lobe's albedo there stands for that of diffuse light."""
 
 
 @wp.struct

@@ -5,15 +5,12 @@ import warp as wp
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.light.latlong import latlong_bilinear
-from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.mesh.surface import MeshSurface, closest_hit, surface_point
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_pixels import SHADE_CHUNK, arriving_radiance, pixel_ray
-from beam_warp.kernels.render.gaussian_light import RegionShadows, environment_openness, luminance, random_turn
+from beam_warp.kernels.render.gaussian_light import SceneLight, environment_openness, luminance, random_turn
 from beam_warp.kernels.render.surface_lighting import (
-    DistantLight,
-    LightShadows,
     lit_irradiance,
     lit_radiance,
     unshadowed_irradiance,
@@ -29,10 +26,7 @@ def shade_mesh_kernel(
     views: wp.array[RasterView],
     surface: MeshSurface,
     catches_shadows: wp.array[wp.bool],
-    environment: DistantLight,
-    regions: RegionShadows,
-    lights: Lights,
-    shadows: LightShadows,
+    light: SceneLight,
     out_image: wp.array[wp.vec4],
     out_surfaces: wp.array2d[float],
 ):
@@ -57,26 +51,28 @@ def shade_mesh_kernel(
         normal = -normal
     depth = wp.dot(point - view.position, direction) / length
     turn = random_turn(i)
-    free = latlong_bilinear(environment.light.irradiance, unturned(environment, normal))
+    free = latlong_bilinear(light.environment.light.irradiance, unturned(light.environment, normal))
     open_share = wp.vec3(1.0, 1.0, 1.0)
-    if regions.moments.red.shape[0] > 0:
-        open_share = environment_openness(regions, point, normal, turn)
+    if light.regions.moments.red.shape[0] > 0:
+        open_share = environment_openness(light.regions, point, normal, turn)
     arriving = wp.cw_mul(free, open_share)
     if catches_shadows[hit.face]:
-        all_light = luminance(free + unshadowed_irradiance(lights, point, normal))
+        all_light = luminance(free + unshadowed_irradiance(light.lights, point, normal))
         cover = float(0.0)
         if all_light > 0.0:
-            cover = 1.0 - luminance(arriving + lit_irradiance(lights, shadows, point, normal, turn)) / all_light
+            cover = (
+                1.0 - luminance(arriving + lit_irradiance(light.lights, light.shadows, point, normal, turn)) / all_light
+            )
         out_image[i] = wp.vec4(0.0, 0.0, 0.0, wp.clamp(cover, 0.0, 1.0))
         out_surfaces[i, 7] = -depth
         return
     toward = -direction
     radiance = arriving_radiance(
-        environment, seen.base_color, seen.roughness, luminance(open_share), arriving, normal, toward
+        light.environment, seen.base_color, seen.roughness, luminance(open_share), arriving, normal, toward
     )
-    if lights.count > 0:
-        shading = shading_of(normal, toward, seen.base_color, seen.roughness, environment.light.albedo_terms)
-        radiance += lit_radiance(lights, shadows, shading, point, turn)
+    if light.lights.count > 0:
+        shading = shading_of(normal, toward, seen.base_color, seen.roughness, light.environment.light.albedo_terms)
+        radiance += lit_radiance(light.lights, light.shadows, shading, point, turn)
     out_image[i] = wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
     for c in range(3):
         out_surfaces[i, c] = seen.base_color[c]
@@ -106,14 +102,12 @@ def blend_mesh_kernel(
         out_image[i] = mesh + (1.0 - mesh[3]) * gaussians
 
 
-def launch_shade_mesh(
-    views, surface, catches_shadows, environment, regions, lights, shadows, out_image, out_surfaces, device
-):
+def launch_shade_mesh(views, surface, catches_shadows, light, out_image, out_surfaces, device):
     """Shade what of the triangles every pixel of one camera sees."""
     launch(
         shade_mesh_kernel,
         len(out_image),
-        inputs=[views, surface, catches_shadows, environment, regions, lights, shadows],
+        inputs=[views, surface, catches_shadows, light],
         outputs=[out_image, out_surfaces],
         device=device,
         block_dim=128,

@@ -3,14 +3,13 @@
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.light.shading import (
     MIN_N_DOT_V,
-    environment_radiance,
     reflected_radiance,
     seen_normal,
     specular_occlusion,
+    split_sum_radiance,
     view_albedo,
 )
 from beam_warp.kernels.raster.project import RasterView
@@ -20,10 +19,11 @@ from beam_warp.kernels.render.gaussian_light import (
     OCCLUSION,
     OPENNESS,
     ROUGHNESS,
+    SceneLight,
     random_turn,
     row_vector,
 )
-from beam_warp.kernels.render.surface_lighting import DistantLight, LightShadows, lit_radiance, unturned
+from beam_warp.kernels.render.surface_lighting import DistantLight, lit_radiance, unturned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,9 +70,7 @@ def shade_gaussians_kernel(
     depth: wp.array[float],
     median_depth: wp.array[float],
     has_arriving: int,
-    environment: DistantLight,
-    lights: Lights,
-    shadows: LightShadows,
+    light: SceneLight,
     out_image: wp.array[wp.vec4],
 ):
     """Radiance multiplied by alpha, and alpha."""
@@ -93,7 +91,7 @@ def shade_gaussians_kernel(
     radiance = wp.vec3()
     if has_arriving != 0:
         radiance = arriving_radiance(
-            environment,
+            light.environment,
             base_color,
             roughness,
             wp.clamp(channels[i, OPENNESS] * share, 0.0, 1.0),
@@ -102,21 +100,21 @@ def shade_gaussians_kernel(
             toward,
         )
     else:
-        radiance = environment_radiance(
-            environment.light,
+        radiance = split_sum_radiance(
+            light.environment.light,
             base_color,
             roughness,
             ambient_occlusion,
-            unturned(environment, raw_normal),
-            unturned(environment, toward),
+            unturned(light.environment, raw_normal),
+            unturned(light.environment, toward),
         )
-    if lights.count > 0:
+    if light.lights.count > 0:
         shading = shading_of(
-            seen_normal(raw_normal, toward), toward, base_color, roughness, environment.light.albedo_terms
+            seen_normal(raw_normal, toward), toward, base_color, roughness, light.environment.light.albedo_terms
         )
         # where the front leaks the mean lies inside the body, where no light arrives
         place = view.position + wp.min(depth[i], median_depth[i]) * ray
-        radiance += lit_radiance(lights, shadows, shading, place, random_turn(i))
+        radiance += lit_radiance(light.lights, light.shadows, shading, place, random_turn(i))
     out_image[i] = wp.vec4(radiance[0] * coverage, radiance[1] * coverage, radiance[2] * coverage, coverage)
 
 
@@ -134,7 +132,7 @@ def average_samples_kernel(first: int, width: int, side: int, samples: wp.array[
     out_image[i] = total / float(side * side)
 
 
-def launch_shade_gaussians(views, images, has_arriving, environment, lights, shadows, out_image, device):
+def launch_shade_gaussians(views, images, has_arriving, light, out_image, device):
     """Shade what a rasteriser drew for one camera."""
     launch(
         shade_gaussians_kernel,
@@ -146,9 +144,7 @@ def launch_shade_gaussians(views, images, has_arriving, environment, lights, sha
             images.depth,
             images.median_depth,
             int(has_arriving),
-            environment,
-            lights,
-            shadows,
+            light,
         ],
         outputs=[out_image],
         device=device,

@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 TAU = wp.constant(6.283185307179586)
 
 ROUGHNESS = wp.constant(3)
-"""Columns of a Gaussian's values: base colour first; then these."""
+"""First of the columns of a Gaussian's values after its base colour; the others are below."""
 
 OCCLUSION = wp.constant(4)
 NORMAL = wp.constant(5)
@@ -37,6 +37,16 @@ class RegionShadows:
 
     maps: ShadowMaps
     moments: LightMoments  # as turned
+
+
+@wp.struct
+class SceneLight:
+    """All light of a shot, and its shadows."""
+
+    environment: DistantLight
+    regions: RegionShadows
+    lights: Lights
+    shadows: LightShadows
 
 
 @wp.func
@@ -83,10 +93,7 @@ def light_gaussians_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     values: wp.array2d[float],
-    environment: DistantLight,
-    regions: RegionShadows,
-    lights: Lights,
-    shadows: LightShadows,
+    light: SceneLight,
     out_arriving: wp.array[wp.vec4],
     out_lit: wp.array[wp.vec3],
 ):
@@ -95,23 +102,23 @@ def light_gaussians_kernel(
     normal = row_vector(values, i, NORMAL)
     point = positions[i]
     turn = random_turn(i)
-    free = latlong_bilinear(environment.light.irradiance, unturned(environment, normal))
+    free = latlong_bilinear(light.environment.light.irradiance, unturned(light.environment, normal))
     arriving = free * values[i, OCCLUSION]
     share = values[i, OCCLUSION]
-    if regions.moments.red.shape[0] > 0:
-        arriving = wp.cw_mul(free, environment_openness(regions, point, normal, turn))
+    if light.regions.moments.red.shape[0] > 0:
+        arriving = wp.cw_mul(free, environment_openness(light.regions, point, normal, turn))
         if luminance(free) > 0.0:
             share = luminance(arriving) / luminance(free)
     out_arriving[i] = wp.vec4(arriving[0], arriving[1], arriving[2], share)
-    out_lit[i] = arriving + lit_irradiance(lights, shadows, point, normal, turn)
+    out_lit[i] = arriving + lit_irradiance(light.lights, light.shadows, point, normal, turn)
 
 
-def launch_light_gaussians(gaussians, environment, regions, lights, shadows, out_arriving, out_lit, device):
+def launch_light_gaussians(gaussians, light, out_arriving, out_lit, device):
     """Find what arrives at the Gaussians, of their positions and values."""
     launch(
         light_gaussians_kernel,
         len(gaussians.positions),
-        inputs=[gaussians.positions, gaussians.values, environment, regions, lights, shadows],
+        inputs=[gaussians.positions, gaussians.values, light],
         outputs=[out_arriving, out_lit],
         device=device,
         block_dim=128,

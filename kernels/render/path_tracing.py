@@ -56,6 +56,15 @@ class PathLight:
 
 
 @wp.struct
+class PathPass:
+    """One pass over some pixels."""
+
+    seed: wp.uint32
+    samples: int  # of a pixel
+    bounces: int  # after the first surface, at most
+
+
+@wp.struct
 class PathImages:
     """Sums over samples, a row for each pixel; means over coverage are taken when an image is asked for."""
 
@@ -264,13 +273,11 @@ def trace_paths_kernel(
     light: PathLight,
     rays: PixelRays,
     pixels: wp.array[int],
-    seed: wp.uint32,
-    sample_count: int,
-    bounce_count: int,
+    tracing: PathPass,
     out_images: PathImages,
 ):
     pixel = pixels[first + wp.tid()]
-    stream = stream_of(seed, wp.uint32(0), wp.uint32(pixel))
+    stream = stream_of(tracing.seed, wp.uint32(0), wp.uint32(pixel))
     begin = out_images.counts[pixel]
     axis = wp.vec3(rays.camera_to_world[0, 2], rays.camera_to_world[1, 2], rays.camera_to_world[2, 2])
     radiance = wp.vec3(0.0)
@@ -281,14 +288,14 @@ def trace_paths_kernel(
     distance = float(0.0)
     coverage = float(0.0)
     caught = wp.vec3(0.0)
-    for sample in range(begin, begin + sample_count):
+    for sample in range(begin, begin + tracing.samples):
         direction = pixel_direction(rays, pixel, sample_pair(sample, stream, 0))
         choice = sample_pair(sample, stream, 1)
         vertex = first_vertex(occluders, materials, settings, rays.origin, direction, choice[0])
         if vertex.found:
             if vertex.on_gaussian:
                 vertex = lifted_vertex(occluders, vertex)
-            bounces = bounce_count
+            bounces = tracing.bounces
             if vertex.catches:  # only the light that is missing is asked for
                 vertex.base_color = wp.vec3(1.0)
                 vertex.roughness = 1.0
@@ -304,8 +311,8 @@ def trace_paths_kernel(
                 normal += vertex.normal
                 roughness += vertex.roughness
                 distance += vertex.t * wp.dot(direction, axis)
-    mean = wp.dot(radiance, LUMINANCE) / float(sample_count)
-    out_images.counts[pixel] = begin + sample_count
+    mean = wp.dot(radiance, LUMINANCE) / float(tracing.samples)
+    out_images.counts[pixel] = begin + tracing.samples
     out_images.passes[pixel] = out_images.passes[pixel] + 1
     out_images.radiance[pixel] = out_images.radiance[pixel] + radiance
     out_images.indirect[pixel] = out_images.indirect[pixel] + indirect
@@ -318,14 +325,12 @@ def trace_paths_kernel(
     out_images.caught[pixel] = out_images.caught[pixel] + caught
 
 
-def launch_trace_paths(
-    occluders, materials, settings, light, rays, pixels, seed, sample_count, bounce_count, out_images, device
-):
+def launch_trace_paths(occluders, materials, settings, light, rays, pixels, tracing, out_images, device):
     """Add a pass of samples to each of ``pixels``, numbers that must differ from each other."""
     launch(
         trace_paths_kernel,
         len(pixels),
-        inputs=[occluders, materials, settings, light, rays, pixels, wp.uint32(seed), sample_count, bounce_count],
+        inputs=[occluders, materials, settings, light, rays, pixels, tracing],
         outputs=[out_images],
         device=device,
         block_dim=64,

@@ -37,7 +37,7 @@ SMOOTH_KERNEL = wp.constant(4.0)
 """Radius below which taps are bilinear [texel]: in wider kernels they are texels apart, and hit many."""
 
 ROUNDING = wp.constant(4.0e-7)
-"""Of a depth: a few float32 steps."""
+"""Share of a depth that is rounding: a few float32 steps."""
 
 
 @wp.struct

@@ -14,8 +14,7 @@ from materials_plot import draw_all
 from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference
 
 from beam_warp.device.arrays import resolve_device
-from beam_warp.light.prepared import MaterialLight
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.camera import Camera
@@ -69,7 +68,7 @@ class TestScores:
         assert scores["ambient_occlusion"]["true_coverage_psnr"] > scores["ambient_occlusion"]["psnr"]
 
     def test_light_is_compared_with_many_rays(self, perfect):
-        light = SampledEnvironment.from_environment(EnvironmentMap.constant([1.0, 2.0, 3.0]), resolve_device("cpu"))
+        light = PreparedEnvironment(EnvironmentMap.constant([1.0, 2.0, 3.0]), resolve_device("cpu"))
         points = perfect.points()
         rows = np.flatnonzero(points.seen)[:12]
         reference = light_reference(perfect.scene, points, rows, light, 1024)
@@ -95,7 +94,7 @@ class TestScores:
 
 @pytest.fixture(scope="module")
 def subject(perfect, tiny_capture):
-    light = MaterialLight.from_environment(EnvironmentMap.read(tiny_capture.environment_path), resolve_device("cpu"))
+    light = PreparedEnvironment(EnvironmentMap.read(tiny_capture.environment_path), resolve_device("cpu"))
     frame = SubjectFrame(0, perfect.cloud, perfect.views)
     return Subject("tiny", [frame], SHARP, light, resolve_device("cpu"))
 

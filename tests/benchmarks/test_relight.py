@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import relight as benchmark
 from materials_truth import SHARP, true_cloud
-from relight_accuracy import Known, materials_at, measure_light, scores
-from relight_accuracy import Subject as RelitSubject
+from relight_accuracy import Known, RelitSubject, materials_at, measure_light, scores
 from relight_energy import z_scores
 from relight_plot import LARGEST_FILE, draw_all
 from relight_scenes import MovingFigure, posed
@@ -42,9 +41,8 @@ def bench(relit_capture):
 
 @pytest.fixture
 def small_lights(monkeypatch):
-    """What takes long by itself, smaller: environments that are made ready, views that show where surfaces are."""
+    """Smaller environments: preparing one takes long by itself."""
     read, demo = EnvironmentMap.read, demo_environments()
-    monkeypatch.setattr("beam_warp.render.traced_relighting.SURROUNDING_SIDE", 32)
     monkeypatch.setattr("relight_accuracy.EnvironmentMap.read", lambda path: read(path).resized(16, 32))
     monkeypatch.setattr(
         "relight_accuracy.demo_environments", lambda: {name: demo[name].resized(16, 32) for name in demo}
@@ -174,7 +172,7 @@ def test_all_of_it_runs(device, bench, tmp_path, small_lights):
     assert list(subjects) == ["demo", "demo figure"]
     for subject in subjects.values():
         for found in subject["lights"].values():
-            assert {row["method"] for row in found["rows"]} == {"path traced", "deferred", "per Gaussian"}
+            assert {row["method"] for row in found["rows"]} == {"path traced", "deferred"}
             assert [row["against_path"] is None for row in found["rows"]].count(True) == 1
     furnace = result["furnace"]["rows"]
     assert len(furnace) == 30

@@ -14,7 +14,6 @@ from beam_warp.demo.from_images import PANEL_HEIGHT, FromImagesOptions, demo_fro
 from beam_warp.demo.job import DemoOptions, run_demo
 from beam_warp.demo.lights import demo_environments
 from beam_warp.errors import OutputError
-from beam_warp.light.prefiltered import EnvironmentLighting
 from beam_warp.materials.job import no_progress
 
 
@@ -134,11 +133,10 @@ def test_small_demo_from_images_recovers_its_truth(small_demo):
 def test_demo_takes_up_its_capture_and_refuses_another(small_demo):
     out, options, _ = small_demo
     lights = {"studio": demo_environments()["studio"]}
-    lightings = {"studio": EnvironmentLighting.from_environment(lights["studio"], device="cpu")}
     images = replace(options.images, frame_count=1)
     with pytest.raises(OutputError, match=r"folder must be new or empty, got .*capture with content"):
-        demo_from_images(out, images, lights, lightings, device="cpu", seed=0, progress=no_progress)
+        demo_from_images(out, images, lights, device="cpu", seed=0, progress=no_progress)
     before = (out / "capture/transforms.json").stat().st_mtime_ns
-    again = demo_from_images(out, options.images, lights, lightings, device="cpu", seed=0, progress=no_progress)
+    again = demo_from_images(out, options.images, lights, device="cpu", seed=0, progress=no_progress)
     assert (out / "capture/transforms.json").stat().st_mtime_ns == before
     assert again.result.report["resumed_frames"] == 2

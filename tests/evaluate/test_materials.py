@@ -16,10 +16,11 @@ from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
 from beam_warp.evaluate.materials import score_materials, stated_raster
 from beam_warp.evaluate.perceptual import PerceptualMetrics
-from beam_warp.evaluate.relighters import DeferredRelighter, RelitImage
+from beam_warp.evaluate.relighters import RELIGHTERS
 from beam_warp.image.files import read_image
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.shot import RenderedImage
 
 NO_METRICS = PerceptualMetrics()
 CAP = 120.0
@@ -33,8 +34,16 @@ def asset():
 
 @pytest.fixture(scope="module")
 def relighters():
-    """The deferred one, which makes a light ready once."""
-    return {"deferred": DeferredRelighter()}
+    """One deferred renderer for all tests, which prepares a light once."""
+    renderers = {}
+
+    def make(raster, samples, device):
+        key = (raster, samples, device)
+        if key not in renderers:
+            renderers[key] = RELIGHTERS["deferred"](raster, samples, device)
+        return renderers[key]
+
+    return {"deferred": make}
 
 
 @pytest.fixture(scope="module")
@@ -269,20 +278,25 @@ class TestWhatIsThere:
         }  # fmt: skip
 
     def test_relighters_are_told_how_to_draw(self, asset, mirror):
-        """As the asset states, with the samples asked for, a frame's cameras at a time, under each light."""
-        told = []
+        """As the asset states, with the samples asked for; then each view once under each of its lights."""
+        told, drawn = [], []
 
-        def relighter(cloud, environment, cameras, *, raster, samples, device):
-            told.append((len(cloud), [camera.width for camera in cameras], raster, samples, device))
-            black = np.zeros((cameras[0].height, cameras[0].width), np.float32)
-            return [RelitImage(np.repeat(black[..., None], 3, axis=-1), black) for _ in cameras]
+        class Black:
+            def draw(self, shot):
+                drawn.append((len(shot.cloud), shot.camera.width))
+                black = np.zeros((shot.camera.height, shot.camera.width), np.float32)
+                return RenderedImage(np.repeat(black[..., None], 3, axis=-1), black)
+
+        def make(*how):
+            told.append(how)
+            return Black()
 
         stated = GaussianSequence.from_clouds(
             list(asset), metadata={"raster_antialiased": "true", "raster_low_pass": "0.1"}
         )
-        found = score(stated, mirror, "cpu", samples=3, relighters={"black": relighter})
-        expected = (len(asset[0]), [48, 48], RasterOptions(antialiased=True, low_pass=0.1), 3, "cpu")
-        assert told == [expected] * 4
+        found = score(stated, mirror, "cpu", samples=3, relighters={"black": make})
+        assert told == [(RasterOptions(antialiased=True, low_pass=0.1), 3, "cpu")]
+        assert drawn == [(len(asset[0]), 48)] * 8
         assert set(found.mean_relit()["black"]) == {"sunset", "stage"}
         assert found.conditions["samples_per_pixel"] == 9
 
@@ -319,6 +333,6 @@ def test_the_filter_that_an_asset_states():
 def test_a_capture_without_relit_images_is_scored_all_the_same(asset, mirror):
     """There is no light to take a mean over: nothing is stated, and the record is valid JSON."""
     plain = replace(mirror, records=tuple(replace(record, relit_paths={}) for record in mirror.records))
-    record = score(asset, plain, "cpu", relighters={"deferred": DeferredRelighter()}).as_dict()
+    record = score(asset, plain, "cpu", relighters={"deferred": RELIGHTERS["deferred"]}).as_dict()
     assert record["mean"]["relit_mean"] == {}
     json.dumps(record, allow_nan=False)

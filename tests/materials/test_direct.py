@@ -10,7 +10,7 @@ from support.shapes import cloud_of, disc_points, sphere_points, tiles
 from beam_warp import GaussianCloud, Observability, Scene, irradiance
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials, view_set
 from beam_warp.materials.exposure import estimate_exposure
@@ -41,7 +41,7 @@ def certain(cloud, scene, normals, offset="auto"):
 def _prepared(texels, shape, device):
     """Blurring a light for every roughness takes seconds on a CPU: the same light is prepared once."""
     environment = EnvironmentMap(np.frombuffer(texels, np.float32).reshape(shape))
-    return MaterialLight.from_environment(environment, wp.get_device(device))
+    return PreparedEnvironment(environment, wp.get_device(device))
 
 
 def prepared(environment, device):
@@ -297,12 +297,12 @@ def test_views_are_unit_and_on_the_visible_side():
 
 def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
     scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
-    one = MaterialLight.from_environment(sky(), scene.device).scaled(4.0)
-    other = MaterialLight.from_environment(sky().scaled(4.0), scene.device)
+    one = PreparedEnvironment(sky(), scene.device).scaled(4.0)
+    other = PreparedEnvironment(sky().scaled(4.0), scene.device)
     assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
     for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
-        ours, theirs = (getattr(light.sampled.blocks, name).numpy() for light in (one, other))
+        ours, theirs = (getattr(light.blocks, name).numpy() for light in (one, other))
         assert np.allclose(ours, theirs, rtol=1e-5, atol=1e-6)
     for name in ("irradiance", "texels"):
-        ours, theirs = (getattr(light.blurred.light, name).numpy() for light in (one, other))
+        ours, theirs = (getattr(light.blurred, name).numpy() for light in (one, other))
         assert np.allclose(ours, theirs, rtol=1e-4, atol=1e-6)

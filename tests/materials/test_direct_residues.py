@@ -28,7 +28,7 @@ from beam_warp.light.ggx import (
     smith_lambda,
     specular_albedo,
 )
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
@@ -109,7 +109,7 @@ class Points:
         found.specular = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         found.diffuse_share = wp.zeros(shape, dtype=float, device=self.device)
         launch_view_residues(
-            self.batch, self.rays, self.light, sky.light, self.surface, int(diffuse_weight), found, self.device
+            self.batch, self.rays, self.light, sky.blurred, self.surface, int(diffuse_weight), found, self.device
         )
         return found.specular.numpy(), found.diffuse_share.numpy()
 
@@ -207,7 +207,7 @@ def sky():
     def on(device):
         if device not in prepared:
             height = 64
-            prepared[device] = EnvironmentLighting.from_environment(
+            prepared[device] = PreparedEnvironment(
                 EnvironmentMap(structured(texel_directions(height, 2 * height)).astype(np.float32)), device=device
             )
         return prepared[device]
@@ -342,7 +342,7 @@ class TestResidues:
     @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
     def test_white_furnace(self, device, rng, roughness):
         """A white open surface under uniform light of radiance 1 sends 1 to every view: L_D share + L_S."""
-        white = EnvironmentLighting.from_environment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
+        white = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
         normals = unit(rng.normal(size=(33, 3)))
         directions, _, visibility = even_rays(normals, 256)
         weights = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)[..., None] * 4.0 * np.ones(3)

@@ -14,7 +14,7 @@ from beam_warp import Observability, Scene
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.evidence import view_evidence
@@ -117,7 +117,7 @@ def decomposed():
     evidence = view_evidence(cloud, cameras, views, device="cpu")
     scene = Scene.from_gaussians(cloud, "cpu")
     surface = SurfacePoints.seen_by(cloud, evidence, scene)
-    light = MaterialLight.from_environment(sky(), wp.get_device("cpu"))
+    light = PreparedEnvironment(sky(), wp.get_device("cpu"))
     measured = measure_materials(
         cloud,
         scene,

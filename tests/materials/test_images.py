@@ -10,7 +10,7 @@ from beam_warp import Camera, Scene
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingPackageError
 from beam_warp.light.ggx import specular_albedo
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials import images as image_path
 from beam_warp.materials.images import CROP_MARGIN, ImagePathOptions, crop_to_subject, decompose_by_images
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
@@ -50,9 +50,7 @@ class Ball:
         )
         self.cloud = cloud_of(tiles(points, points, spacing, opacity=0.95))
         self.scene = Scene.from_gaussians(self.cloud, device)
-        self.light = SampledEnvironment.from_environment(
-            EnvironmentMap.constant((1.0, 1.0, 1.0), height=32), self.scene.device
-        )
+        self.light = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=32), self.scene.device)
         self.roughness = np.full(count, ROUGHNESS, np.float32)
         self.views = [self.capture(camera, device, i) for i, camera in enumerate(around(views))]
         self.rng = rng
@@ -102,7 +100,7 @@ class TestKnownMaterials:
         up = np.tile((0.0, 0.0, 1.0), (len(floor), 1))
         cloud = cloud_of(tiles(floor, up, spacing, opacity=0.99), tiles(disc, up[: len(disc)], spacing, opacity=0.99))
         scene = Scene.from_gaussians(cloud, device)
-        light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), scene.device)
+        light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), scene.device)
         cameras = [
             Camera.orbit((0, 0, 0), 3.0, 90.0 * i, 14.0, width=64, height=32, vertical_fov=24.0) for i in range(4)
         ]
@@ -172,9 +170,7 @@ class TestGuards:
 
     def test_the_unlit_is_filled_from_neighbours(self, device):
         made = Ball(device, truth=0.5)
-        dark = SampledEnvironment.from_environment(
-            EnvironmentMap.constant((1.0, 1.0, 0.0), height=32), made.scene.device
-        )
+        dark = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 0.0), height=32), made.scene.device)
         found = decompose_by_images(made.cloud, made.scene, made.views, made.roughness, dark, ImagePathOptions(**FEW))
         assert (found.color_evidence == 0.0).all()  # no light in the last channel
         assert found.filled[:, 0].all()

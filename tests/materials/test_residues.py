@@ -9,7 +9,7 @@ from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, t
 from beam_warp import Camera, Scene
 from beam_warp.errors import InvalidOptionError
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, smith_lambda, specular_albedo
-from beam_warp.light.sampled import SampledEnvironment
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.residues import surface_occlusion, surface_residues, view_surfaces
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.transmittance import visibility
@@ -82,7 +82,7 @@ class TestSurfaces:
     def test_nothing_in_view(self, device, size):
         camera = looking_at(size=size, at=(0, 0, 50.0))
         found = surfaces_of(ball(100), camera, device)
-        light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
+        light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
         scene = Scene.from_gaussians(ball(100), device)
         assert len(found) == 0
         assert len(surface_occlusion(scene, found).visibility) == 0
@@ -131,7 +131,7 @@ class TestOcclusion:
         cloud = random_cloud(rng, 500, scale=(-2.0, 0.4), opacity=(0.5, 1.0))
         scene = Scene.from_gaussians(cloud, device)
         found = surfaces_of(cloud, looking_at(), device)
-        light = SampledEnvironment.from_environment(sunny(), scene.device)
+        light = PreparedEnvironment(sunny(), scene.device)
 
         def both(**options):
             residues = surface_residues(scene, found, light, sample_count=8, **options)
@@ -162,7 +162,7 @@ class TestEvenLight:
     @pytest.mark.parametrize("roughness", [0.15, 0.5, 0.9])
     def test_white_furnace(self, device, roughness):
         found = surfaces_of(ball(), looking_at(size=32), device, roughness)
-        light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
+        light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
         result = surface_residues(
             nothing(device), found, light, sample_count=256, diffuse_weight="albedo_scaling", seed=5
         )
@@ -177,7 +177,7 @@ class TestEvenLight:
     def test_fresnel_weight_is_that_of_every_ray(self, device):
         """1/pi integral of (1 - F(h.v)) (n.w), by a midpoint rule."""
         found = surfaces_of(ball(), looking_at(size=16), device)
-        light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
+        light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
         result = surface_residues(nothing(device), found, light, sample_count=512)
         cosine = np.einsum("ij,ij->i", found.rows.normals.numpy(), found.rows.to_camera.numpy())
         require_zero_mean(result.diffuse.numpy()[:, 1] - np.array([fresnel_diffuse(c) for c in cosine]))
@@ -230,7 +230,7 @@ def test_residues_are_unbiased(device, rng):
     scene = Scene.from_gaussians(cloud, device)
     found = surfaces_of(cloud, looking_at(size=5, fov=15.0), device, 0.4)
     assert len(found) > 10
-    light = SampledEnvironment.from_environment(sunny(), scene.device)
+    light = PreparedEnvironment(sunny(), scene.device)
     coarse = quadrature(scene, found, sunny(), 0.4, 0.05, 2)
     fine = quadrature(scene, found, sunny(), 0.4, 0.05, 4)
     runs = 60
@@ -255,7 +255,7 @@ def test_residues_are_unbiased(device, rng):
 
 def test_mirrors_in_the_sun_are_finite(device):
     found = surfaces_of(ball(400), looking_at(size=12), device, 0.0)
-    light = SampledEnvironment.from_environment(sunny(), found.alpha.device)
+    light = PreparedEnvironment(sunny(), found.alpha.device)
     result = surface_residues(nothing(device), found, light, sample_count=16)
     for name in ("diffuse", "specular", "diffuse_error", "specular_error"):
         values = getattr(result, name).numpy()
@@ -265,7 +265,7 @@ def test_mirrors_in_the_sun_are_finite(device):
 
 def test_darkness_is_dark(device):
     found = surfaces_of(ball(400), looking_at(size=6), device)
-    light = SampledEnvironment.from_environment(EnvironmentMap.constant((0, 0, 0), height=32), found.alpha.device)
+    light = PreparedEnvironment(EnvironmentMap.constant((0, 0, 0), height=32), found.alpha.device)
     result = surface_residues(nothing(device), found, light)
     assert not result.diffuse.numpy().any()
     assert not result.specular.numpy().any()
@@ -276,7 +276,7 @@ def test_darkness_is_dark(device):
 )
 def test_refusals(options):
     found = surfaces_of(ball(50), looking_at(size=2), wp.get_device("cpu"))
-    light = SampledEnvironment.from_environment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
+    light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), found.alpha.device)
     with pytest.raises(InvalidOptionError, match=f"^{next(iter(options))} must be"):
         surface_residues(nothing("cpu"), found, light, **options)
     with pytest.raises(InvalidOptionError, match=r"^surface_depth must be"):

@@ -15,7 +15,7 @@ from beam_warp.kernels.materials.residues import LightRays, Observations, PointL
 from beam_warp.kernels.materials.roughness_profile import ProfileFit, launch_lobe_shares, launch_profile
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import specular_albedo
-from beam_warp.light.prepared import MaterialLight
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
@@ -52,7 +52,7 @@ def cameras(count):
 @cache
 def light_of(sky, device):
     environment = EnvironmentMap(sky.radiance(texel_directions(64, 128)).astype(np.float32))
-    return MaterialLight.from_environment(environment, wp.get_device(device))
+    return PreparedEnvironment(environment, wp.get_device(device))
 
 
 def profile_of(sky, roughness, device, *, count=800, view_count=20, noise=NOISE, frame=0, base_color=None):
@@ -257,7 +257,7 @@ class TestKernels:
 
     def batch(self, rng, device):
         """Random normals, rays and views; the light is even, so that lobes have a closed form."""
-        light = MaterialLight.from_environment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=32), device)
+        light = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=32), device)
 
         def unit(*shape):
             d = rng.normal(size=(*shape, 3))
@@ -293,7 +293,7 @@ class TestKernels:
         fit.misfit = wp.zeros((3, self.POINTS, len(CANDIDATES)), dtype=float, device=device)
         fit.views = wp.zeros(self.POINTS, dtype=float, device=device)
         candidates = wp.array(np.array(CANDIDATES, np.float32), dtype=float, device=device)
-        launch_profile(batch, point_light, light.blurred.light, batch.normals, views, shares, candidates, fit, device)
+        launch_profile(batch, point_light, light.blurred, batch.normals, views, shares, candidates, fit, device)
         normals, towards, directions = (host[name].astype(np.float64) for name in ("normals", "towards", "rays"))
         cosine = (towards * normals).sum(-1)
         faces = np.clip((cosine - 0.2) / 0.3, 0.0, 1.0)

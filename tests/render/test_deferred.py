@@ -8,44 +8,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.figure_asset import figure_asset
+from support.flat_scenes import UP, brdf_twin, discs, mesh_of, nothing, plate
+from support.shapes import sphere_points
+from support.split_sum import shade
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
-from beam_warp.light.prefiltered import EnvironmentLighting
+from beam_warp.light.ggx import specular_albedo
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
-from beam_warp.render.split_sum import relight
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
-from beam_warp.world.mesh import MaterialMesh
-from beam_warp.world.shot import Shot, ShotMesh
+from beam_warp.world.shot import Shot
 
-UP = np.array([0.0, 0.0, 1.0])
 PLAIN = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=128)
 SMALL = DeferredOptions(environment_shadows=4, bounces=2, light_map_size=128, environment_map_size=64)
 FLOAT32 = float(np.finfo(np.float32).eps)
-
-
-def discs(positions, normals, radius, *, color=1.0, roughness=1.0, openness=1.0, opacity=1.0):
-    """Flat Gaussians; the rasteriser caps alpha at 0.99."""
-    positions = np.atleast_2d(np.asarray(positions, np.float32))
-    count = len(positions)
-    n = np.broadcast_to(np.asarray(normals, float), (count, 3))
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], n), 1.0 + n[:, 2:]], axis=1)
-    turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
-    return GaussianCloud(
-        positions=positions,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
-        scales=np.tile([radius, radius, 0.0], (count, 1)),
-        opacities=np.full(count, opacity),
-        base_color=np.broadcast_to(np.asarray(color, np.float32), (count, 3)),
-        roughness=np.broadcast_to(np.float32(roughness), (count,)),
-        ambient_occlusion=np.full(count, openness),
-        normals=n,
-    )
 
 
 def floor(**material):
@@ -66,18 +47,6 @@ def middle(image):
 
 def render(shot, device, options=PLAIN, raster=None):
     return DeferredRenderer(options, raster=raster, device=device).draw(shot)
-
-
-def brdf_twin(normal, view, light, roughness):
-    """Float64: the dielectric GGX lobe, without the cosine."""
-    n, v, d = (np.asarray(a, float) / np.linalg.norm(a, axis=-1, keepdims=True) for a in (normal, view, light))
-    half = v + d
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    alpha = roughness**2
-    n_l, n_v = (n * d).sum(-1), (n * v).sum(-1)
-    shadowing = 1.0 / (1.0 + smith_lambda(n_l, alpha) + smith_lambda(n_v, alpha))
-    fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight((v * half).sum(-1))
-    return ggx_distribution((n * half).sum(-1), alpha) * shadowing * fresnel / (4.0 * n_l * n_v)
 
 
 def figure(frame_count=1):
@@ -192,14 +161,21 @@ def test_shadows_of_gaussians_on_gaussians(device):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 180.0])
-def test_without_shadows_it_is_relight(device, rng, degrees):
-    """Pixel by pixel, up to rounding: sums of some fifty float32 terms; a half turn of the map is a copy."""
+def test_without_shadows_it_is_the_split_sum(device, rng, degrees):
+    """Pixel by pixel of the G-buffer, to rounding: sums of some fifty float32 terms. Half a turn of the light is half a
+    turn of normals and views, which changes signs."""
     cloud = figure()[0]
     view = figure_camera(cloud)
     light = random_light(rng)
     found = render(Shot(cloud=cloud, camera=view, environment=light, environment_rotation=degrees), device)
-    lighting = EnvironmentLighting.from_environment(light, device=device)
-    expected = relight(rasterize(cloud, view, device=device), lighting if degrees == 0.0 else lighting.turned_around())
+    buffer = rasterize(cloud, view, device=device)
+    turn = 1.0 if degrees == 0.0 else np.array([-1.0, -1.0, 1.0])
+    expected = shade(
+        PreparedEnvironment(light, device),
+        **buffer.channels | {"normals": turn * buffer.channels["normals"]},
+        alpha=buffer.alpha,
+        view_directions=turn * view.directions(),
+    )
     np.testing.assert_allclose(found.rgb, expected, rtol=200 * FLOAT32, atol=200 * FLOAT32 * expected.max())
 
 
@@ -243,10 +219,7 @@ def test_white_furnace(device, roughness, options):
 
 def test_a_convex_body_is_open(device):
     """Under any light a ball of rough white discs is as bright as without shadows, within 2 %: none falls on itself."""
-    count = 3000
-    k = np.arange(count) + 0.5
-    z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    normals = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
+    normals = sphere_points(3000)[0]
     cloud = discs(normals, normals, 0.06)
     radiance = 1.0 + texel_directions(16, 32) @ [0.5, -0.3, 0.4]
     light = EnvironmentMap(radiance[..., None] * np.ones(3))
@@ -276,10 +249,8 @@ def test_bounces_in_a_closed_room(device):
     """Discs on a sphere that look inward see nothing but each other in 1 - V of their hemisphere: after b bounces what
     arrives is pi V sum_k ((1 - V) R)^k, k to b. All clusters send alike, so that the mean over them is exact; the
     specular lobe's albedo of diffuse light stands for its mean, which is off by less than 0.01 of R."""
-    count, openness, color = 2000, 0.4, 0.6
-    k = np.arange(count) + 0.5
-    z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    outward = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
+    openness, color = 0.4, 0.6
+    outward = sphere_points(2000)[0]
     cloud = discs(outward, -outward, 0.06, color=color, openness=openness)
     shot = Shot(cloud=cloud, camera=figure_camera(cloud), environment=EnvironmentMap.constant((1.0, 1.0, 1.0)))
     for bounces in (1, 3):
@@ -292,34 +263,6 @@ def test_bounces_in_a_closed_room(device):
 
 
 # ---- triangles ------------------------------------------------------------------------------------------------------
-
-
-def plate(z=0.0, half=3.0, x=0.0, *, catches=False, color=1.0, flip=False):
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return corners, faces[:, ::-1] if flip else faces, np.tile(-UP if flip else UP, (4, 1)), color, catches
-
-
-def mesh_of(*plates):
-    corners, faces, normals, colors, catches = [], [], [], [], []
-    for one in plates:
-        faces.append(one[1] + 4 * len(corners))
-        corners.append(one[0])
-        normals.append(one[2])
-        colors.append(np.full((4, 3), one[3]))
-        catches += [one[4]] * 2
-    surface = MaterialMesh(
-        vertices=np.concatenate(corners),
-        faces=np.concatenate(faces).astype(np.int32),
-        normals=np.concatenate(normals),
-        base_color=np.concatenate(colors),
-        roughness=np.ones(4 * len(corners)),
-    )
-    return ShotMesh(surface=surface, catches_shadows=np.array(catches))
-
-
-def nothing():
-    return discs(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -401,7 +344,6 @@ def test_hazards_are_finite(device, rng, options):
     touching = PointLight(position=tuple(cloud.positions[0].tolist()), intensity=(5, 5, 5))
     spot = SpotLight(position=inside.position, direction=(0, 0, 1), intensity=(1, 1, 1), outer_angle=85.0)
     view = figure_camera(cloud, (12, 16))
-    among = replace(view, camera_to_world=view.camera_to_world.copy())
     pose = view.camera_to_world.copy()
     pose[:3, 3] = cloud.positions[100]
     among = replace(view, camera_to_world=pose)
@@ -428,7 +370,7 @@ def test_hazards_are_finite(device, rng, options):
 def test_shots_of_any_order_and_size(device, rng):
     """What a renderer keeps of shots before changes nothing: the same bits as a new renderer's."""
     clouds = [*figure(2)]
-    fewer = clouds[0].select(np.arange(0, len(clouds[0]), 2)) if hasattr(clouds[0], "select") else None
+    fewer = clouds[0].select(np.arange(0, len(clouds[0]), 2))
     light, other = random_light(rng), random_light(rng)
     sun = DirectionalLight(direction=(1, 0.5, -1), irradiance=(1, 1, 1))
     lamp = PointLight(position=(2, -2, 2), intensity=(3, 3, 3), radius=0.1)
@@ -442,7 +384,7 @@ def test_shots_of_any_order_and_size(device, rng):
         Shot(cloud=clouds[1], camera=view, lights=(inside, sun)),
         Shot(cloud=clouds[1], camera=view, environment=other, mesh=mesh_of(plate()), lights=(sun,)),
         Shot(cloud=clouds[1], camera=view, environment=other, lights=(sun, lamp)),
-        Shot(cloud=clouds[0] if fewer is None else fewer, camera=small, environment=light),
+        Shot(cloud=fewer, camera=small, environment=light),
     ]
     renderer = DeferredRenderer(SMALL, device=device)
     for shot in shots:

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 from support.estimates import LARGEST_Z, require_zero_mean
+from support.flat_scenes import brdf_twin, mesh_of, plate
 from support.shapes import quaternions_from_normals, sphere_points, tiles
 
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError
-from beam_warp.light.ggx import specular_albedo_table
+from beam_warp.light.ggx import specular_albedo
 from beam_warp.render.path import FEWEST_PASSES, PASS_SAMPLES, PathOptions, PathRenderer
 from beam_warp.trace.mesh_paths import TracedMesh, trace_radiance
 from beam_warp.world.camera import Camera
@@ -65,20 +66,8 @@ def from_above(width=8, fov=2.0, height=2.0):
 def brdf_cosine(n, v, light, base_color, roughness):
     """The BSDF times n.l in float64: the twin of `kernels.scattering`."""
     n, v, light = (np.asarray(x, float) / np.linalg.norm(x) for x in (n, v, light))
-    h = (v + light) / np.linalg.norm(v + light)
-    nl, nv, nh, vh = n @ light, n @ v, n @ h, v @ h
-    a2 = roughness**4
-    d = a2 / (np.pi * (nh**2 * (a2 - 1.0) + 1.0) ** 2)
-    vis = 0.5 / (nl * np.sqrt(nv**2 * (1.0 - a2) + a2) + nv * np.sqrt(nl**2 * (1.0 - a2) + a2))
-    fresnel = 0.04 + 0.96 * (1.0 - vh) ** 5
-    table = specular_albedo_table().astype(float)
-    rows, columns = np.linspace(0.0, 1.0, table.shape[0]), np.linspace(0.0, 1.0, table.shape[1])
-    terms = [
-        np.interp(roughness, rows, [np.interp(np.sqrt(nv), columns, table[r, :, k]) for r in range(len(rows))])
-        for k in range(2)
-    ]
-    specular_albedo = 0.04 * terms[0] + terms[1]
-    return (base_color * (1.0 - specular_albedo) / np.pi + d * vis * fresnel) * nl
+    diffuse = base_color * (1.0 - specular_albedo(n @ v, roughness)) / np.pi
+    return (diffuse + brdf_twin(n, v, light, roughness)) * (n @ light)
 
 
 @pytest.mark.parametrize("roughness", [0.03, 0.3, 0.6, 1.0])
@@ -147,38 +136,16 @@ def test_a_half_opaque_disc_takes_half_of_the_light(device):
     assert np.isclose(shaded.rgb[1:3, 1:3].mean() / free.rgb[1:3, 1:3].mean(), 0.5, atol=0.02)
 
 
-def square(half, height, up=True):
-    corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return corners, faces if up else faces[:, ::-1]
-
-
-def shot_mesh(corners, faces, *, catches=False, base_color=0.5, roughness=1.0, normals=None):
-    count = len(corners)
-    if normals is None:
-        normals = np.tile([0.0, 0.0, 1.0], (count, 1))
-    surface = MaterialMesh(
-        vertices=corners,
-        faces=faces,
-        normals=normals,
-        base_color=np.full((count, 3), base_color),
-        roughness=np.full(count, roughness),
-    )
-    return ShotMesh(surface=surface, catches_shadows=np.full(len(faces), catches))
-
-
 def test_penumbras_are_as_wide_as_the_light_says(device):
     """A straight edge at half the height of a sphere light: light rises from 0 to 1 over the disc's area."""
     radius, height = 0.2, 2.0
     light = PointLight(position=(0.0, 0.0, height), intensity=(4.0, 4.0, 4.0), radius=radius)
-    corners, faces = square(4.0, 0.0)
-    wall = np.array([[-4.0, -4.0, 1.0], [0.0, -4.0, 1.0], [0.0, 4.0, 1.0], [-4.0, 4.0, 1.0]])
-    mesh = shot_mesh(np.concatenate([corners, wall]), np.concatenate([faces, faces + 4]))
+    ground, wall = plate(half=4.0, color=0.5), plate(1.0, 4.0, -4.0, color=0.5)
     camera = Camera.look_at((0.0, -0.01, 0.9), (0.0, 0.0, 0.0), width=64, height=8, vertical_fov=6.0)
     cloud = disc(height=50.0)  # nothing in view
     renderer = PathRenderer(PathOptions(samples=256, bounces=0), device=device)
-    shaded = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=mesh))
-    free = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=shot_mesh(corners, faces)))
+    shaded = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=mesh_of(ground, wall)))
+    free = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=ground))
     share = (shaded.rgb[..., 0] / free.rgb[..., 0]).mean(axis=0)
     x = (np.arange(64) + 0.5 - camera.center_x) / camera.focal_x * 0.9
     # the edge at x = 0, height 1 appears on the light's disc at 2 x' - x seen from x: its chord divides the disc
@@ -191,11 +158,10 @@ def test_penumbras_are_as_wide_as_the_light_says(device):
 def test_catchers_show_the_light_that_is_missing(device):
     """Under a small ball at height h a catcher's alpha is the share of a cosine sky that the ball hides: (r / h)^2."""
     radius, height = 0.25, 0.6
-    corners, faces = square(50.0, 0.0)
     cloud = ball(2000, radius, base_color=0.0).with_arrays()
     cloud = cloud.with_arrays(positions=cloud.positions + np.float32([0.0, 0.0, height]))
     camera = Camera.look_at((0.0, 1e-3, 0.3), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    shot = Shot(cloud=cloud, camera=camera, environment=WHITE, mesh=shot_mesh(corners, faces, catches=True))
+    shot = Shot(cloud=cloud, camera=camera, environment=WHITE, mesh=plate(half=50.0, catches=True))
     image = PathRenderer(PathOptions(samples=1024), device=device).draw(shot)
     assert np.all(image.rgb == 0.0)
     # tiles reach beyond the ball by a part of their size, 4 % of its radius: 8 % of the hidden share
@@ -211,7 +177,15 @@ def test_a_mesh_alone_is_what_the_path_tracer_of_meshes_sees(device):
     """Another integrator, with another way to draw the sky, of the same materials."""
     mesh = trimesh.creation.icosphere(subdivisions=3)
     mesh.apply_transform(np.diag([1.0, 1.0, 0.4, 1.0]))
-    part = shot_mesh(mesh.vertices, mesh.faces, base_color=0.7, roughness=0.4, normals=mesh.vertex_normals)
+    count = len(mesh.vertices)
+    surface = MaterialMesh(
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        normals=mesh.vertex_normals,
+        base_color=np.full((count, 3), 0.7),
+        roughness=np.full(count, 0.4),
+    )
+    part = ShotMesh(surface=surface, catches_shadows=np.zeros(len(mesh.faces), bool))
     rng = np.random.default_rng(1)
     sky = EnvironmentMap(rng.gamma(0.3, 1.0, (16, 32, 3)).astype(np.float32))
     camera = Camera.look_at((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), width=10, height=10, vertical_fov=30.0)

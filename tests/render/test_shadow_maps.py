@@ -3,18 +3,17 @@
 import numpy as np
 import pytest
 import warp as wp
+from support.flat_scenes import UP, discs, nothing, plate
+from support.shapes import sphere_points
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.render.shadow_maps import ShadowMaps, face_towards, visible_share
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.render import shadow_maps
-from beam_warp.render.shadow_maps import FAR, ROOM, ShadowDrawer, Subject, disc_taps, distant_view, light_views
+from beam_warp.render.shadow_maps import FAR, ROOM, ShadowCasters, ShadowDrawer, disc_taps, distant_view, light_views
 from beam_warp.trace.mesh_paths import TracedMesh
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
-from beam_warp.world.mesh import MaterialMesh
 
-UP = np.array([0.0, 0.0, 1.0])
 TAPS = (16, 32)
 
 
@@ -55,47 +54,17 @@ def visible(drawer, points, normals, light=None, turned=True):
     return out.numpy()
 
 
-def discs(positions, normals, radius, opacity=0.99, thickness=0.0):
-    """Flat Gaussians."""
-    positions = np.asarray(positions, np.float32)
-    count = len(positions)
-    n = np.broadcast_to(np.asarray(normals, float), (count, 3))
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], n), 1.0 + n[:, 2:]], axis=1)
-    turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
-    return GaussianCloud(
-        positions=positions,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
-        scales=np.tile([radius, radius, thickness], (count, 1)),
-        opacities=np.full(count, opacity),
-    )
-
-
-def empty():
-    return discs(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
-
-
-def square(z, half=0.5, x=0.0):
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
-    return MaterialMesh(
-        vertices=corners,
-        faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-        normals=np.tile(UP, (4, 1)),
-        base_color=np.ones((4, 3)),
-        roughness=np.ones(4),
-    )
-
-
 def drawn(light, cloud, subject, device, size=128, mesh=None):
     target = resolve_device(device)
     views = light_views(light, subject, size)
-    drawer = ShadowDrawer(len(cloud), views, subject=subject, taps=TAPS, device=target)
-    traced = None if mesh is None else TracedMesh.from_mesh(mesh, device=device)
+    drawer = ShadowDrawer(len(cloud), views, casters=subject, taps=TAPS, device=target)
+    traced = None if mesh is None else TracedMesh.from_mesh(mesh.surface, device=device)
     drawer.draw(upload_gaussians(cloud, target), None if traced is None else traced.surface)
     drawer.kept = traced
     return drawer
 
 
-SUBJECT = Subject(np.zeros(3), 1.0)
+SUBJECT = ShadowCasters(np.zeros(3), 1.0)
 
 
 # ---- where views stand ----------------------------------------------------------------------------------------------
@@ -145,15 +114,15 @@ def test_directions_of_a_distant_view_are_nearly_parallel(rng):
 
 def test_the_subject_is_what_is_there():
     cloud = discs([[0, 0, 0], [2, 0, 0]], UP, 0.01)
-    subject = Subject.of(cloud)
+    subject = ShadowCasters.of(cloud)
     np.testing.assert_allclose(subject.center, [1, 0, 0])
     assert subject.radius == pytest.approx(1.0)
     assert subject.thickness == pytest.approx(0.01)
     vertices = np.array([[0, 0, 0], [0, 0, 4]], np.float32)
-    assert Subject.of(empty(), vertices).radius == pytest.approx(2.0)
-    assert Subject.of(empty()).radius > 0.0
+    assert ShadowCasters.of(nothing(), vertices).radius == pytest.approx(2.0)
+    assert ShadowCasters.of(nothing()).radius > 0.0
     props = np.array([[1, 1.5, 0], [50, 0, 0]], np.float32)  # one is near
-    assert Subject.of(cloud, props).radius == pytest.approx(1.25)
+    assert ShadowCasters.of(cloud, props).radius == pytest.approx(1.25)
 
 
 def test_taps_are_spread_over_the_disc():
@@ -172,7 +141,7 @@ def test_taps_are_spread_over_the_disc():
 def test_the_shadow_of_a_square(device, direction):
     """Of triangles, under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
     light = DirectionalLight(direction=direction, irradiance=(1, 1, 1), angular_diameter=0.0)
-    drawer = drawn(light, empty(), SUBJECT, device, mesh=square(0.5, half=0.25))
+    drawer = drawn(light, nothing(), SUBJECT, device, mesh=plate(0.5, 0.25))
     x = np.linspace(-0.6, 0.6, 121)
     points = np.stack([x, 0 * x, 0 * x], axis=-1) + 0.5 * np.array([direction[0], direction[1], 0.0])
     share = visible(drawer, points, UP)
@@ -184,7 +153,7 @@ def test_the_shadow_of_a_square(device, direction):
 
 def test_what_is_outside_of_the_map_is_lit(device):
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
-    drawer = drawn(light, empty(), SUBJECT, device, mesh=square(0.5, half=5.0))
+    drawer = drawn(light, nothing(), SUBJECT, device, mesh=plate(0.5, 5.0))
     assert visible(drawer, [[0, 0, 0], [3, 0, 0], [0, 0, 1e4]], UP).tolist() == [0.0, 1.0, 1.0]
 
 
@@ -196,7 +165,7 @@ def test_the_penumbra_of_an_edge(device, diameter):
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
     height = 0.8
     size = 256
-    drawer = drawn(light, empty(), SUBJECT, device, size=size, mesh=square(height - 0.4, half=2.0, x=-2.0))
+    drawer = drawn(light, nothing(), SUBJECT, device, size=size, mesh=plate(height - 0.4, 2.0, -2.0))
     x = np.linspace(-0.25, 0.25, 201)
     points = np.stack([x, 0 * x, 0 * x - 0.4], axis=-1)
     rows = points + np.linspace(-0.3, 0.3, 25)[:, None, None] * np.array([0.0, 1.0, 0.0])
@@ -224,7 +193,7 @@ def test_a_point_light_inside_sees_all_around(device):
     light = PointLight(position=(0.1, 0.0, -0.1), intensity=(1, 1, 1))
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     cloud = discs(np.asarray(light.position) + 0.4 * axes, axes, 0.05)
-    drawer = drawn(light, cloud, Subject(np.zeros(3), 1.0, 0.002), device)
+    drawer = drawn(light, cloud, ShadowCasters(np.zeros(3), 1.0, 0.002), device)
     assert len(drawer.cameras) == 6
     behind = np.asarray(light.position) + 0.9 * axes
     assert visible(drawer, behind, -axes, light).max() < 0.02
@@ -241,7 +210,7 @@ def test_a_point_light_inside_sees_all_around(device):
 def test_a_translucent_layer_lets_the_rest_through(device, opacity):
     """One flat Gaussian of 0.3 m: under its middle, within two texels of 0.017 m, its response is above 1 - 0.013."""
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
-    drawer = drawn(light, discs([[0, 0, 0.5]], UP, 0.3, opacity), Subject(np.zeros(3), 1.0, 0.01), device)
+    drawer = drawn(light, discs([[0, 0, 0.5]], UP, 0.3, opacity=opacity), ShadowCasters(np.zeros(3), 1.0, 0.01), device)
     assert visible(drawer, [[0, 0, -0.5]], UP)[0] == pytest.approx(1.0 - opacity, abs=0.015 * opacity)
     assert visible(drawer, [[0, 0, 0.8]], UP)[0] == 1.0
 
@@ -249,23 +218,21 @@ def test_a_translucent_layer_lets_the_rest_through(device, opacity):
 def test_two_layers_of_gaussians(device):
     """Where a layer of more than half is before another, the nearer one's share is told from both depths."""
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
-    cloud = discs([[0, 0, 0.5], [0, 0, -0.5]], UP, 0.3, 0.99)
+    cloud = discs([[0, 0, 0.5], [0, 0, -0.5]], UP, 0.3)
     opacities = np.array([0.7, 0.99], np.float32)
-    drawer = drawn(light, cloud.with_arrays(opacities=opacities), Subject(np.zeros(3), 1.0, 0.01), device)
+    drawer = drawn(light, cloud.with_arrays(opacities=opacities), ShadowCasters(np.zeros(3), 1.0, 0.01), device)
     assert visible(drawer, [[0, 0, -0.5]], UP)[0] == pytest.approx(0.3, abs=0.03)
 
 
 def test_a_layer_does_not_shadow_itself(device, rng):
     """A ball of discs, each with a depth of its own, in the light: what faces it by more than 17 degrees is lit."""
     count = 16000
-    k = np.arange(count) + 0.5
-    z, phi = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    normals = np.stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z], axis=-1)
+    normals = sphere_points(count)[0]
     positions = 0.8 * normals + rng.normal(size=(count, 1)) * 0.001 * normals
     cloud = discs(positions, normals, 0.0225)  # 6 on top of each other
     for diameter in (0.0, 0.53, 40.0):
         light = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(1, 1, 1), angular_diameter=diameter)
-        drawer = drawn(light, cloud, Subject.of(cloud), device, size=256)
+        drawer = drawn(light, cloud, ShadowCasters.of(cloud), device, size=256)
         cosine = normals @ -np.asarray(light.direction)
         share = visible(drawer, positions, normals)
         assert share[cosine > 0.3].min() > 0.98
@@ -280,7 +247,7 @@ def test_a_plane_of_triangles_does_not_shadow_itself(device):
     for elevation in (90.0, 45.0, 12.0):
         direction = (-np.cos(np.radians(elevation)), 0.1, -np.sin(np.radians(elevation)))
         light = DirectionalLight(direction=direction, irradiance=(1, 1, 1), angular_diameter=20.0)
-        drawer = drawn(light, empty(), SUBJECT, device, mesh=square(0.0, half=3.0))
+        drawer = drawn(light, nothing(), SUBJECT, device, mesh=plate())
         assert visible(drawer, points, UP).min() > 0.98
 
 
@@ -289,8 +256,8 @@ def test_a_plane_of_triangles_does_not_shadow_itself(device):
 
 def test_redraw_and_move_are_draw(device):
     """Redrawing gives the same bits; so does moving to a light and back."""
-    cloud = discs([[0, 0, 0.5]], UP, 0.3, 0.7)
-    subject = Subject(np.zeros(3), 1.0, 0.01)
+    cloud = discs([[0, 0, 0.5]], UP, 0.3, opacity=0.7)
+    subject = ShadowCasters(np.zeros(3), 1.0, 0.01)
     light = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1))
     drawer = drawn(light, cloud, subject, device)
     first = drawer.maps.texels.numpy().copy()
@@ -309,10 +276,10 @@ def test_maps_in_groups_are_the_same_maps(device, monkeypatch):
     """Views that are drawn one after the other, into the same images, make the same texels."""
     light = PointLight(position=(0.1, 0.0, -0.1), intensity=(1, 1, 1))
     cloud = discs(0.5 * np.eye(3), np.eye(3), 0.1)
-    subject = Subject(np.zeros(3), 1.0, 0.002)
-    whole = drawn(light, cloud, subject, device, mesh=square(-0.5))
+    subject = ShadowCasters(np.zeros(3), 1.0, 0.002)
+    whole = drawn(light, cloud, subject, device, mesh=plate(-0.5, 0.5))
     monkeypatch.setattr(shadow_maps, "GROUP_SPLATS", 13)
-    grouped = drawn(light, cloud, subject, device, mesh=square(-0.5))
+    grouped = drawn(light, cloud, subject, device, mesh=plate(-0.5, 0.5))
     assert len(grouped.pair_capacities) == 2
     np.testing.assert_array_equal(grouped.maps.texels.numpy(), whole.maps.texels.numpy())
     grouped.redraw()

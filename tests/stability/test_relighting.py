@@ -20,29 +20,20 @@ from beam_warp.stability.relighting import (
     run_relighting_case,
     run_relighting_cases,
 )
-from beam_warp.stability.relighting_cases import (
-    DEFERRED,
-    FIREFLY,
-    GRAZING,
-    PATH,
-    RELIGHTING_CASES,
-    RENDERERS,
-    Demand,
-    Drawn,
-    RelightStress,
-    RelightStudio,
+from beam_warp.stability.relighting_cases import RELIGHTING_CASES
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, RENDERERS, Demand, Drawn, RelightStress
+from beam_warp.stability.relighting_cases.measures import (
     brightness,
     diffuse,
     disc_directions,
-    firefly,
     floor_points,
     in_wall_shadow,
     largest_difference,
     scattered,
     sky_closed_form,
-    white,
     wrong_parts,
 )
+from beam_warp.stability.relighting_cases.scenes import FIREFLY, GRAZING, RelightStudio, firefly, white
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage
@@ -93,6 +84,7 @@ def test_the_cases_of_the_plan_are_there():
     assert len({case.name for case in RELIGHTING_CASES}) == len(RELIGHTING_CASES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("name", NAMES)
 def test_what_must_hold_holds_or_is_told(outcomes, name, renderer):
@@ -104,6 +96,7 @@ def test_what_must_hold_holds_or_is_told(outcomes, name, renderer):
         assert fault.startswith(start)
 
 
+@pytest.mark.slow
 def test_noise_is_told_of_paths_only(outcomes):
     for (_, renderer), outcome in outcomes.items():
         assert all(np.isfinite(row.value) and np.isfinite(row.error) for row in outcome.held)
@@ -113,10 +106,12 @@ def test_noise_is_told_of_paths_only(outcomes):
     assert len(noisy) > 10
 
 
+@pytest.mark.slow
 def test_rows_of_nan_are_left_out_and_counted(outcomes):
     assert outcomes["a frame with rows of NaN", PATH].done == "10 rows left out"
 
 
+@pytest.mark.slow
 def test_records_and_tables(outcomes):
     for outcome in outcomes.values():
         assert RelightingOutcome.from_dict(outcome.as_dict()) == replace(outcome, seconds=round(outcome.seconds, 3))

@@ -14,7 +14,8 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.trace.incident_light import Technique, draw_light, launch_sum_unshadowed, mixture_pdf
-from beam_warp.light.sampled import SampledEnvironment, light_moments
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.light.sampled import light_moments
 from beam_warp.trace.incident import DENSITIES, irradiance, techniques
 from beam_warp.trace.sampling import SAMPLERS
 from beam_warp.trace.transmittance import TraceOptions
@@ -80,7 +81,7 @@ def cluttered(device, count=200):
 @cache
 def gentle_light(device):
     """Light that no density draws badly, and what of it arrives at the points above, to a 20th of 64 rays' noise."""
-    light = SampledEnvironment.from_environment(sky(8.0, ground=0.4), device)
+    light = PreparedEnvironment(sky(8.0, ground=0.4), device)
     scene, points, normals = cluttered(device)
     return light, irradiance(scene, points, normals, light, sample_count=4096, offset=0.05, seed=5).value
 
@@ -102,7 +103,7 @@ class TestUnbiased:
     def test_nothing_in_the_way(self, device, density, sampler):
         """The plain estimate against the sum over texels; the ratio estimate is that sum."""
         normals, truth = arriving()
-        light, points = SampledEnvironment.from_environment(sky(), device), np.zeros((600, 3))
+        light, points = PreparedEnvironment(sky(), device), np.zeros((600, 3))
         options = {"sample_count": 32, "density": density, "sampler": sampler}
         plain = irradiance(empty(device), points, normals, light, **options, ratio=False)
         # texels of the fine grid that the horizon cuts: (pi / 256)^2 / 12 of the light
@@ -226,7 +227,7 @@ class TestMultipleImportance:
 
     def test_directions_of_both_together_have_the_mixed_density(self, device, rng):
         environment, normal = sky(200.0), np.array([0.0, 0.6, 0.8])
-        light = SampledEnvironment.from_environment(environment, device)
+        light = PreparedEnvironment(environment, device)
         squares = rng.random((40_000, 2)).astype(np.float32)
         directions, pdfs = [], []
         for technique in techniques("mis", "iid", 64):
@@ -370,7 +371,7 @@ class TestHardLight:
 
     def test_bernoulli_acceptance_has_the_same_mean(self, device):
         scene, points, normals = cluttered(device)
-        light = SampledEnvironment.from_environment(sky(), device)
+        light = PreparedEnvironment(sky(), device)
         options = TraceOptions(acceptance="bernoulli")
         exact = irradiance(scene, points, normals, light, offset=0.05, sample_count=256, ratio=False, seed=1)
         drawn = irradiance(scene, points, normals, light, offset=0.05, options=options, ratio=False, seed=2)
@@ -380,7 +381,7 @@ class TestHardLight:
 class TestCalls:
     def test_chunks_and_threads_do_not_matter_and_seeds_do(self, monkeypatch):
         scene, points, normals = cluttered("cpu")
-        light = SampledEnvironment.from_environment(sky(), scene.device)
+        light = PreparedEnvironment(sky(), scene.device)
         for density in DENSITIES:
             whole = irradiance(scene, points, normals, light, density=density, sample_count=16)
             with monkeypatch.context() as patch:
@@ -398,7 +399,7 @@ class TestCalls:
         scene, points, normals = cluttered(device, 40)
         environment = sky(height=50)  # no multiple of 16: fitted
         plain = irradiance(scene, points, normals, environment)
-        light = SampledEnvironment.from_environment(environment, scene.device)
+        light = PreparedEnvironment(environment, scene.device)
         on_device = [wp.array(a, dtype=wp.vec3, device=device) for a in (points, normals)]
         prepared = irradiance(scene, *on_device, light)
         assert np.array_equal(prepared.value.numpy(), plain.value)

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
+from reference.light_sampling import product_to_square, square_to_product_pdf
 from scipy import stats
 from scipy.stats import qmc
 
@@ -26,11 +27,10 @@ from beam_warp.kernels.light.environment_sampling import radiance_over_pdf
 from beam_warp.kernels.light.product_sampling import (
     EnvironmentBlocks,
     launch_accumulate_block_weights,
-    product_to_square,
     square_to_product,
-    square_to_product_pdf,
 )
-from beam_warp.light.sampled import environment_blocks, suited_height
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.light.sampled import suited_height
 from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
 from beam_warp.world.environment import EnvironmentMap
 
@@ -301,7 +301,7 @@ class TestProduct:
     normal = np.array([0.6, 0.0, 0.8])
 
     def prepare(self, device, environment):
-        blocks = environment_blocks(environment, wp.get_device(device))
+        blocks = PreparedEnvironment(environment, device).blocks
         normals = wp.array(self.normal[None], dtype=wp.vec3, device=device)
         cumulative = wp.empty((1, 512), dtype=float, device=device)
         launch_accumulate_block_weights(blocks, normals, cumulative, device)

@@ -3,19 +3,18 @@
 import numpy as np
 import pytest
 import warp as wp
+from reference.light_sampling import environment_to_square, visible_reflection_to_square
 from scipy import stats
 
 from beam_warp.device.arrays import upload
 from beam_warp.kernels.light.environment_sampling import (
     EnvironmentDistribution,
-    environment_to_square,
     square_to_environment,
     square_to_environment_pdf,
 )
 from beam_warp.kernels.light.ggx_sampling import (
     square_to_visible_reflection,
     square_to_visible_reflection_pdf,
-    visible_reflection_to_square,
 )
 from beam_warp.light.sampled import environment_distribution
 from beam_warp.world.environment import EnvironmentMap

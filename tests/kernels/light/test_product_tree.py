@@ -13,7 +13,7 @@ from beam_warp.kernels.light.product_tree import (
     square_to_product_tree_pdf,
     total_weight,
 )
-from beam_warp.light.sampled import product_tree
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.world.environment import EnvironmentMap
 
 NORMALS = np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [-0.48, 0.6, -0.64]], np.float32)
@@ -53,7 +53,7 @@ def sunny_sky(height=64):
 def draw(device, sky, normal, count, seed=0):
     squares = np.random.default_rng(seed).uniform(size=(count, 2)).astype(np.float32)
     outs = [wp.empty(count, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, wp.vec2)]
-    tree = product_tree(sky, wp.get_device(device))
+    tree = PreparedEnvironment(sky, device).product_tree
     squares_array = wp.array(squares, dtype=wp.vec2, device=device)
     wp.launch(draw_kernel, count, inputs=[tree, wp.vec3(*normal.tolist()), squares_array], outputs=outs, device=device)
     return tuple(out.numpy() for out in outs)
@@ -62,7 +62,7 @@ def draw(device, sky, normal, count, seed=0):
 def density(device, sky, normal):
     directions = wp.array(sky.directions().reshape(-1, 3), dtype=wp.vec3, device=device)
     out = wp.empty(len(directions), dtype=float, device=device)
-    tree = product_tree(sky, wp.get_device(device))
+    tree = PreparedEnvironment(sky, device).product_tree
     wp.launch(
         density_kernel, len(out), inputs=[tree, wp.vec3(*normal.tolist()), directions], outputs=[out], device=device
     )

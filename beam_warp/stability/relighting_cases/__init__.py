@@ -1,0 +1,16 @@
+"""Subjects and lights on which relighting fails: small shots, and what must hold of their images.
+
+What must hold is a closed form, many samples of a path tracer, or a bound; each with the reason for how far an image
+may be off, derived and not fitted to what renderers give. Each family of cases is a module; a case is a function under
+`relighting_case`.
+"""
+
+from beam_warp.stability.relighting_cases import catchers, energy, gaussians, inputs, shadows
+from beam_warp.stability.relighting_cases.cases import RelightingCase
+
+FAMILIES = (shadows, energy, gaussians, catchers, inputs)
+
+RELIGHTING_CASES: list[RelightingCase] = [
+    case for family in FAMILIES for case in vars(family).values() if isinstance(case, RelightingCase)
+]
+"""Every case, family by family."""
