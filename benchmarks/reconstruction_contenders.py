@@ -26,7 +26,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 class StepsLike(Protocol):
-    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.job.FrameSteps`."""
+    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.protocols.FrameSteps`."""
 
     def begin(self, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
         """Fit a key frame."""

@@ -19,7 +19,7 @@ from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.image_motion import motion_in_pixels
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.job import StepProgress
+from beam_warp.reconstruction.protocols import StepProgress
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -33,7 +33,7 @@ coarsest level of tracking a pixel is as many as its reduction."""
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitAndTrack:
-    """The steps that `beam_warp.reconstruction.job.reconstruct` takes; see `beam_warp.reconstruction.job.FrameSteps`.
+    """The steps that `beam_warp.reconstruction.job.reconstruct` takes: fit key frames, track the others.
 
     Attributes:
         fitting: How key frames are fitted.

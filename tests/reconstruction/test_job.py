@@ -18,15 +18,11 @@ from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
-from beam_warp.reconstruction.job import (
-    ID_BITS,
-    Part,
-    ReconstructOptions,
-    plan_segments,
-    reconstruct,
-    reconstruct_part,
-    stored_cloud,
-)
+from beam_warp.reconstruction import job as job_module
+from beam_warp.reconstruction import stored_frames
+from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare, reconstruct, reconstruct_part
+from beam_warp.reconstruction.plan import plan_segments
+from beam_warp.reconstruction.stored_frames import ID_BITS, stored_cloud
 
 FRAMES = (0, 1, 2, 3)
 PAIRS = ReconstructOptions(segment_length=2)
@@ -184,8 +180,6 @@ class Stop(BaseException):
 
 def killed_at(monkeypatch, event, *, after):
     """Make the event-th write of a run raise, before or after it is done; return how many there were."""
-    import beam_warp.reconstruction.job as module
-
     seen = []
 
     def watched(function):
@@ -200,8 +194,10 @@ def killed_at(monkeypatch, event, *, after):
 
         return write
 
-    for name in ("write_frame", "write_png", "write_json", "write_report"):
-        monkeypatch.setattr(module, name, watched(getattr(module, name)))
+    writes = {stored_frames: ("write_frame", "write_png", "write_json"), job_module: ("write_report",)}
+    for module, names in writes.items():
+        for name in names:
+            monkeypatch.setattr(module, name, watched(getattr(module, name)))
     return seen
 
 
@@ -261,16 +257,16 @@ class TestResuming:
 
     def test_parts_and_a_final_call_are_the_whole(self, capture, tmp_path):
         reconstruct(capture, tmp_path / "whole", FakeSteps(), PAIRS)
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(2, 2), PAIRS) == (2, 3)
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(2, 2), PAIRS) == (2, 3)
         assert not (tmp_path / "out" / "gaussians.usda").exists()
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2), PAIRS) == (0, 1)
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2), PAIRS) == (0, 1)
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps, PAIRS)
         assert steps.calls == []
         assert not differing(results(tmp_path / "whole"), results(tmp_path / "out"))
 
     def test_more_parts_than_segments(self, capture, tmp_path):
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(3, 3), PAIRS) == ()
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(3, 3), PAIRS) == ()
 
     def test_a_damaged_frame_is_made_again(self, capture, tmp_path):
         reconstruct(capture, tmp_path / "out", FakeSteps())
@@ -380,9 +376,9 @@ class TestMistakes:
 
     def test_parts(self, capture, tmp_path):
         with pytest.raises(InvalidOptionError, match="part must be I/N"):
-            Part(0, 2)
+            SegmentShare(0, 2)
         with pytest.raises(InvalidOptionError, match="segment_length must be at least 1 to work in parts"):
-            reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2))
+            reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2))
 
     def test_a_folder_that_cannot_be_made(self, capture, tmp_path):
         with pytest.raises(OutputError, match="out must be a folder that can be made"):
