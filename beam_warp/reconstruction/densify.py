@@ -1,4 +1,4 @@
-"""Which Gaussians are dropped and which are split, under a budget: rows of the dead are given to the strained."""
+"""Which Gaussians are dropped and which are split: second halves take the rows of those that were dropped."""
 
 from __future__ import annotations
 
@@ -54,11 +54,58 @@ def hidden(shares: NDArray[np.floating], part: float) -> NDArray[np.bool_]:
     return result
 
 
-def choose_strained(stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
-    """Return the rows of largest stress among those that may be split, at most ``count``; ties by row."""
-    candidates = np.flatnonzero(eligible & (stress > 0.0))
-    order = np.argsort(-stress[candidates], kind="stable")
+def largest_gradients(gradients: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Return the rows of largest gradients among those that may be split, at most ``count``; ties by row.
+
+    Args:
+        gradients: Mean length of the gradients of each row's position, ``(N,)``; rows of 0 and NaN are not chosen.
+        eligible: Which rows may be split, ``(N,)``.
+        count: Most rows.
+    """
+    candidates = np.flatnonzero(eligible & (gradients > 0.0))
+    order = np.argsort(-gradients[candidates], kind="stable")
     return candidates[order[:count]]
+
+
+def refine(
+    rows: dict[str, NDArray[Any]],
+    alive: NDArray[np.bool_],
+    unwanted: NDArray[np.bool_],
+    gradients: NDArray[np.floating],
+    split_fraction: float,
+) -> NDArray[np.bool_]:
+    """Drop Gaussians and split others into free rows, in place; return which rows changed, ``(N,)``.
+
+    Args:
+        rows: As `beam_warp.reconstruction.parameters.GaussianParameters.rows` returns them.
+        alive: Which rows hold a Gaussian, ``(N,)``.
+        unwanted: Which of those are dropped, ``(N,)``; none where it would be all of them.
+        gradients: As for `largest_gradients`.
+        split_fraction: Most of the remaining Gaussians that are split.
+    """
+    if unwanted.sum() == alive.sum():  # nothing to go on from
+        unwanted = np.zeros_like(unwanted)
+    prune(rows, unwanted)
+    alive = alive & ~unwanted
+    free = np.flatnonzero(~alive)
+    most = min(len(free), int(np.ceil(split_fraction * alive.sum())))
+    sources = largest_gradients(gradients, alive, most)
+    targets = free[: len(sources)]
+    split(rows, sources, targets)
+    changed = unwanted.copy()
+    changed[sources] = changed[targets] = True
+    return changed
+
+
+def with_more_rows(
+    rows: dict[str, NDArray[Any]], gradients: NDArray[np.floating], count: int
+) -> dict[str, NDArray[Any]]:
+    """Return rows of Gaussians with those of largest gradients split, ``count`` in all, at most twice as many."""
+    present = len(gradients)
+    sources = largest_gradients(gradients + 1e-30, np.ones(present, bool), max(count - present, 0))
+    grown = {name: np.concatenate([array, array[sources]]) for name, array in rows.items()}
+    split(grown, sources, present + np.arange(len(sources)))
+    return grown
 
 
 def _rotate(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -9,10 +9,9 @@ within a budget.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -20,17 +19,17 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
-from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidArrayError
-from beam_warp.kernels.reconstruction.pull import launch_add_stress
+from beam_warp.kernels.reconstruction.gradient_lengths import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import GaussianGradients, RasterOptions
-from beam_warp.reconstruction.densify import choose_strained, hidden, prune, split
+from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
 from beam_warp.reconstruction.initial import DISC_WIDTH
-from beam_warp.reconstruction.motion_losses import TemporalLoss
+from beam_warp.reconstruction.motion_losses import TemporalTerms
 from beam_warp.reconstruction.parameters import GaussianParameters
+from beam_warp.reconstruction.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.regularizers import AnisotropyLoss, OpacityLoss
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
@@ -56,13 +55,6 @@ LEAST_GAIN = 0.15
 
 FEWEST_GAUSSIANS = 2_000
 """Where a search for a number of Gaussians begins, at least."""
-
-
-class FitProgress(Protocol):
-    """Hears how far a fit is."""
-
-    def __call__(self, done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
-        """Take ``done`` of ``total`` steps; facts: ``psnr`` [dB], ``gaussians``."""
 
 
 @dataclass(frozen=True)
@@ -228,17 +220,13 @@ def mean_psnr(psnr: NDArray[np.float64]) -> float:
     return float(known.mean()) if len(known) else NO_PSNR
 
 
-def no_fit_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
-    """Report to nobody."""
-
-
 def fit_gaussians(
     views: Sequence[CapturedView],
     start: GaussianCloud,
     options: FitOptions | None = None,
     *,
     device: str | None = None,
-    progress: FitProgress = no_fit_progress,
+    progress: StepProgress = no_step_progress,
 ) -> Fit:
     """Fit Gaussians to the photographs of one moment.
 
@@ -276,7 +264,7 @@ def fit_gaussians(
 
 
 def _grow(
-    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: FitProgress
+    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: StepProgress
 ) -> tuple[Fitter, dict[str, Any]]:
     """Fit few Gaussians, and twice as many from there, until more do not pay."""
     wanted = options.target_psnr
@@ -337,16 +325,16 @@ class Fitter:
             "bands": rates.bands,
         }
         self._adam: Adam = self.parameters.optimizer(self._rates)
-        self._stress = wp.zeros(count, dtype=float, device=device)
-        self._seen = wp.zeros(count, dtype=float, device=device)
+        self._gradient_sums = wp.zeros(count, dtype=float, device=device)
+        self._gradient_counts = wp.zeros(count, dtype=float, device=device)
         self._anisotropy = AnisotropyLoss(count, device=device)
         self._opacity = OpacityLoss(count, device=device)
-        self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._temporal = TemporalTerms(self.parameters, spacing) if options.temporal > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._taken = 0
 
-    def run(self, progress: FitProgress = no_fit_progress) -> None:
+    def run(self, progress: StepProgress = no_step_progress) -> None:
         """Take all steps."""
         chosen = self.options
         total = chosen.color_iterations + chosen.normal_iterations
@@ -395,25 +383,23 @@ class Fitter:
         return self._targets.gaps(self.parameters.drawn)
 
     def doubled(self, count: int) -> GaussianCloud:
-        """Return what was fitted with the most strained Gaussians split, ``count`` in all."""
-        rows = self.parameters.rows()
+        """Return what was fitted with the Gaussians of largest gradients split, ``count`` in all."""
         alive = self.parameters.alive()
-        rows = {name: array[alive] for name, array in rows.items()}
-        present = int(alive.sum())
-        stress = (self._stress.numpy() / np.maximum(self._seen.numpy(), 1.0))[alive]
-        strained = choose_strained(stress + 1e-30, np.ones(present, bool), max(count - present, 0))
-        grown = {name: np.concatenate([array, array[strained]]) for name, array in rows.items()}
-        split(grown, strained, present + np.arange(len(strained)))
-        orientations = grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True)
+        rows = {name: array[alive] for name, array in self.parameters.rows().items()}
+        grown = with_more_rows(rows, self._mean_gradients()[alive], count)
         return GaussianCloud(
             positions=grown["positions"],
-            orientations=orientations,
+            orientations=grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True),
             scales=np.exp(grown["log_scales"]),
             opacities=(1.0 / (1.0 + np.exp(-grown["logits"]))).astype(np.float32),
             radiance=grown["radiance"],
             radiance_color_space=self.parameters.cloud().radiance_color_space,
             ids=np.arange(len(grown["positions"])),
         )
+
+    def _mean_gradients(self) -> NDArray[np.float32]:
+        """Return the mean length of each row's position gradients since the last refinement, ``(N,)``."""
+        return self._gradient_sums.numpy() / np.maximum(self._gradient_counts.numpy(), 1.0)
 
     def _order(self, total: int) -> NDArray[np.int64]:
         """Return which view each step looks at: all of them, shuffled, again and again."""
@@ -447,7 +433,7 @@ class Fitter:
         group.rasterizer.redraw()
         group.add_losses(index, self._weights)
         drawn = group.rasterizer.backward()
-        launch_add_stress(drawn.positions, self._stress, self._seen, self.device)
+        launch_add_gradient_lengths(drawn.positions, self._gradient_sums, self._gradient_counts, self.device)
         self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
@@ -464,61 +450,17 @@ class Fitter:
             self._opacity(gaussians.opacities, weight=chosen.opacity, gradient=drawn.opacities)
 
     def _refine(self) -> None:
-        """Drop Gaussians that are not seen, and split strained ones into their rows."""
+        """Drop Gaussians that are not seen, and split those of large gradients into their rows."""
         chosen = self.options
-        rows = self.parameters.rows()
-        stress, seen = self._stress.numpy(), self._seen.numpy()
-        alive = self.parameters.alive()
+        rows, alive = self.parameters.rows(), self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
-        dead = alive & ~(opacity >= chosen.dead_opacity)
+        unwanted = alive & ~(opacity >= chosen.dead_opacity)
         if chosen.hidden_share > 0.0:
-            dead |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
-        if dead.sum() == alive.sum():  # all of them: nothing to go on from
-            dead[:] = False
-        prune(rows, dead)
-        alive &= ~dead
-        free = np.flatnonzero(~alive)
-        most = min(len(free), int(np.ceil(chosen.split_fraction * alive.sum())))
-        strained = choose_strained(stress / np.maximum(seen, 1.0), alive, most)
-        taken = free[: len(strained)]
-        split(rows, strained, taken)
+            unwanted |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
+        changed = refine(rows, alive, unwanted, self._mean_gradients(), chosen.split_fraction)
         self.parameters.set_rows(rows)
-        changed = dead.copy()
-        changed[strained] = changed[taken] = True
         self._adam.restart(changed)
         if self._temporal is not None:
             self._temporal.hold(changed)
-        self._stress.zero_()
-        self._seen.zero_()
-
-
-class _Anchored:
-    """Terms that hold Gaussians to what they were in the frame before (E_temp)."""
-
-    UNITS: Mapping[str, float] = MappingProxyType({"radiance": 0.1, "log_scales": 0.1, "logits": 0.5})
-
-    def __init__(self, parameters: GaussianParameters, spacing: float) -> None:
-        self._parameters = parameters
-        self._units = {**self.UNITS, "positions": 0.1 * spacing}
-        self._terms = {}
-        for name in self._units:
-            rows = float_rows(getattr(parameters, name))
-            self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
-
-    def hold(self, changed: NDArray[np.bool_]) -> None:
-        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
-        for name, (_, reference) in self._terms.items():
-            held = reference.numpy().copy()
-            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
-            reference.assign(held)
-
-    def add_gradients(self, weight: float) -> None:
-        for name, (term, reference) in self._terms.items():
-            values, gradients = getattr(self._parameters, name), self._parameters.gradient(name)
-            term(
-                float_rows(values),
-                reference,
-                weight=weight,
-                unit=self._units[name],
-                gradient=float_rows(gradients),
-            )
+        self._gradient_sums.zero_()
+        self._gradient_counts.zero_()

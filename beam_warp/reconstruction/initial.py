@@ -18,8 +18,8 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.device.morton import morton_order
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.kernels.reconstruction.even_points import launch_push_apart
-from beam_warp.kernels.reconstruction.seen_colors import launch_agree_colors, launch_sample_colors
+from beam_warp.kernels.reconstruction.even_points import ShadedMesh, launch_push_apart
+from beam_warp.kernels.reconstruction.seen_colors import SeenImage, launch_agree_colors, launch_sample_colors
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
@@ -46,8 +46,7 @@ HEXAGONAL = (2.0 / np.sqrt(3.0)) ** 0.5
 """Distance of neighbours in the densest arrangement of one point for each unit of area."""
 
 RELAXATIONS = 3
-PUSHES = 2
-"""Times that neighbours are looked up, and that they then push each other: they hardly change from push to push."""
+"""Rounds in which points look up their neighbours and push each other apart."""
 
 NEIGHBORS = 10
 """Points that a point may have to keep away from, itself included: six surround it where all is even."""
@@ -203,8 +202,10 @@ def even_surface_points(
     weights = np.concatenate([1.0 - root, root * (1.0 - part), root * part], axis=1)[:, :, None]
     spacing = float(np.sqrt(ends[-1] / count))
 
-    surface = wp.Mesh(upload(vertices, wp.vec3, target), upload(faces.ravel(), int, target))
-    shading = upload(vertex_normals, wp.vec3, target)
+    triangles = wp.Mesh(upload(vertices, wp.vec3, target), upload(faces.ravel(), int, target))
+    surface = ShadedMesh()
+    surface.mesh, surface.faces = triangles.id, triangles.indices
+    surface.normals = upload(vertex_normals, wp.vec3, target)
     positions = upload((weights * corners[face]).sum(axis=1), wp.vec3, target)
     normals = (weights * vertex_normals[faces[face]]).sum(axis=1)
     normals = upload(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300), wp.vec3, target)
@@ -213,7 +214,7 @@ def even_surface_points(
         found = cKDTree(places, balanced_tree=False).query(places, k=min(NEIGHBORS, count), workers=-1)[1]
         neighbors = upload(found.reshape(count, -1).astype(np.int32), int, target)
         moved, turned = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
-        launch_push_apart(positions, normals, neighbors, HEXAGONAL * spacing, surface, shading, moved, turned, target)
+        launch_push_apart(positions, normals, neighbors, HEXAGONAL * spacing, surface, moved, turned, target)
         positions, normals = moved, turned
     return positions.numpy(), normals.numpy(), spacing
 
@@ -284,19 +285,12 @@ def _samples(
         pixels = view.camera.width * view.camera.height
         alpha = np.ones(pixels, np.float32) if view.alpha is None else view.alpha.reshape(-1)
         images = Rasterizer(count, [view.camera], device=target).draw(gaussians)
-        launch_sample_colors(
-            gaussians.positions,
-            directions,
-            ViewLayout.of([view.camera]).views[0],
-            upload(view.color.reshape(-1, 3), wp.vec3, target),
-            upload(alpha, float, target),
-            images.median_depth,
-            slack,
-            LEAST_FACING,
-            row,
-            samples,
-            target,
-        )
+        image = SeenImage()
+        image.view = ViewLayout.of([view.camera]).views[0]
+        image.color = upload(view.color.reshape(-1, 3), wp.vec3, target)
+        image.alpha = upload(alpha, float, target)
+        image.depth = images.median_depth
+        launch_sample_colors(gaussians.positions, directions, image, slack, LEAST_FACING, row, samples, target)
     return samples
 
 

@@ -12,9 +12,13 @@ Gaussians and any unit of length.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.device.array_checks import float_rows, require_vectors
@@ -24,6 +28,7 @@ from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.rigidity import EdgeArrays, JointPoses, launch_add_rigidity
 from beam_warp.kernels.reconstruction.squared_difference import launch_add_squared_difference
 from beam_warp.reconstruction.joints import JointGraph
+from beam_warp.reconstruction.parameters import GaussianParameters
 
 MOST_FLOATS = 2**31 - 1
 """Most floats of one term: their indices are 32-bit."""
@@ -189,3 +194,38 @@ class TemporalLoss:
         if rows.shape != self._shape:
             raise InvalidArrayError(f"{name} must have {self._shape} floats, got {rows.shape}. Pass one row each.")
         return rows
+
+
+class TemporalTerms:
+    """Temporal losses that hold each attribute of Gaussians to its value in the frame before (E_temp)."""
+
+    UNITS: Mapping[str, float] = MappingProxyType({"radiance": 0.1, "log_scales": 0.1, "logits": 0.5})
+    """The change of each attribute that counts as 1."""
+
+    def __init__(self, parameters: GaussianParameters, spacing: float) -> None:
+        """Hold Gaussians to what they are now.
+
+        Args:
+            parameters: The Gaussians.
+            spacing: Distance of neighbouring ones [m]; a tenth of it counts as 1.
+        """
+        self._parameters = parameters
+        self._units = {**self.UNITS, "positions": 0.1 * spacing}
+        self._terms = {}
+        for name in self._units:
+            rows = float_rows(getattr(parameters, name))
+            self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
+
+    def hold(self, changed: NDArray[np.bool_]) -> None:
+        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
+        for name, (_, reference) in self._terms.items():
+            held = reference.numpy().copy()
+            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
+            reference.assign(held)
+
+    def add_gradients(self, weight: float) -> None:
+        """Add the gradients of all terms, times a weight, to those of the Gaussians."""
+        for name, (term, reference) in self._terms.items():
+            values, gradients = getattr(self._parameters, name), self._parameters.gradient(name)
+            unit = self._units[name]
+            term(float_rows(values), reference, weight=weight, unit=unit, gradient=float_rows(gradients))

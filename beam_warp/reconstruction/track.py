@@ -28,17 +28,16 @@ from beam_warp.reconstruction.fit import (
     NO_PSNR,
     PRESETS,
     FitOptions,
-    FitProgress,
     Fitter,
     LearningRates,
     mean_psnr,
-    no_fit_progress,
 )
 from beam_warp.reconstruction.initial import DISC_WIDTH
 from beam_warp.reconstruction.joint_selection import select_joints
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.joints import JointGraph, stretch
 from beam_warp.reconstruction.parameters import require_scene_linear
+from beam_warp.reconstruction.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.skinning import Anchors
 from beam_warp.reconstruction.targets import TargetSet, sample_side
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, sh_degree_of
@@ -221,7 +220,7 @@ def advance_track(
     options: TrackOptions,
     *,
     device: str | None = None,
-    progress: FitProgress = no_fit_progress,
+    progress: StepProgress = no_step_progress,
 ) -> tuple[Track, dict[str, Any]]:
     """Find the Gaussians of the next frame.
 

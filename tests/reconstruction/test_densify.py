@@ -1,4 +1,4 @@
-"""Densification: halves in closed form, the image that they leave, what is hidden, ties of the strained."""
+"""Densification: halves in closed form, the image that they leave, what is hidden, ties of gradients."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from support.moving_ball import ball_cloud
 
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
-from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, choose_strained, hidden, prune, split
+from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, hidden, largest_gradients, prune, split
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -128,17 +128,17 @@ class TestHidden:
         assert not hidden(np.array([1.0, np.nan, 2.0]), 0.5).any()
 
 
-class TestChooseStrained:
+class TestLargestGradients:
     def test_largest_first_ties_by_row(self):
-        stress = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0])
+        gradients = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0])
         everyone = np.ones(6, bool)
-        assert choose_strained(stress, everyone, 4).tolist() == [1, 3, 2, 4]
-        assert choose_strained(stress, everyone, 0).tolist() == []
-        assert len(choose_strained(stress, everyone, 100)) == 6
+        assert largest_gradients(gradients, everyone, 4).tolist() == [1, 3, 2, 4]
+        assert largest_gradients(gradients, everyone, 0).tolist() == []
+        assert len(largest_gradients(gradients, everyone, 100)) == 6
 
-    def test_only_the_eligible_and_pulled(self):
-        stress = np.array([0.0, 9.0, np.nan, 2.0])
-        assert choose_strained(stress, np.array([True, False, True, True]), 4).tolist() == [3]
+    def test_only_the_eligible_with_gradients(self):
+        gradients = np.array([0.0, 9.0, np.nan, 2.0])
+        assert largest_gradients(gradients, np.array([True, False, True, True]), 4).tolist() == [3]
 
 
 def test_pruned_rows_are_no_gaussians(device):

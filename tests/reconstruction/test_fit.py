@@ -195,6 +195,7 @@ class TestBits:
     def test_same_bits_every_time_for_every_number_of_threads(self, device, monkeypatch):
         views = ball_views(rig(2, 48))  # 9,216 samples, 1,100 rows: several chunks of every kernel
         options = few_steps(gaussian_count=1100, normal_iterations=4, refine_every=2, refine_until=1.0, samples=2)
+        options = replace(options, anisotropy=0.1, opacity=0.1)
         expected = fitted_bits(views, options, device)
         for threads in ("1", "3"):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)

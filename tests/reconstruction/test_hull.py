@@ -1,4 +1,4 @@
-"""The visual hull: silhouettes' distances, balls between two bounds, bad masks, crops, refusals, threads, a capture."""
+"""The visual hull: distances to silhouettes, balls between two bounds, empty masks, crops, refusals, a capture."""
 
 from dataclasses import replace
 
@@ -107,8 +107,6 @@ class TestBall:
         assert (radii <= RADIUS * reach + slack(hull, views) * reach).all()
         assert hull.mesh.is_watertight
         assert hull.mesh.volume > 0.0
-        assert hull.used == tuple(view.name for view in views)
-        assert hull.ignored == ()
 
     def test_converges_to_the_ball(self, device):
         volume = 4.0 / 3.0 * np.pi * RADIUS**3
@@ -169,19 +167,7 @@ class TestMasks:
         kept = visual_hull(views[2:], resolution=32, device=device)
         black = with_alpha(views[0], np.zeros_like(views[0].alpha))
         hull = visual_hull([black, replace(views[1], alpha=None), *views[2:]], resolution=32, device=device)
-        assert hull.ignored == ("view_0", "view_1")
         np.testing.assert_array_equal(hull.mesh.vertices, kept.mesh.vertices)
-
-    def test_a_wrong_one_is_outvoted(self, device):
-        views = ball_views(12)
-        half = views[3].alpha.copy()
-        half[:, :32] = 0.0
-        broken = [*views[:3], with_alpha(views[3], half), *views[4:]]
-        exact = visual_hull(broken, resolution=32, device=device)
-        assert exact.mesh.volume < 0.7 * 4.0 / 3.0 * np.pi * RADIUS**3  # one view's word is enough to take half away
-        hull = visual_hull(broken, resolution=32, tolerance=1, device=device)
-        radii = np.linalg.norm(hull.mesh.vertices, axis=1)
-        assert radii.min() >= RADIUS - 0.5 * hull.voxel - slack(hull, views)
 
     def test_what_a_view_crops_is_left_to_others(self, device):
         views = ball_views(16)
@@ -190,12 +176,6 @@ class TestMasks:
         radii = np.linalg.norm(hull.mesh.vertices, axis=1)
         assert radii.min() >= RADIUS - 0.5 * hull.voxel - slack(hull, views)
         assert hull.mesh.volume < 1.3 * 4.0 / 3.0 * np.pi * RADIUS**3
-
-    def test_a_box_cuts_and_closes(self, device):
-        views = ball_views(12)
-        hull = visual_hull(views, resolution=32, box=[[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]], device=device)
-        assert hull.mesh.is_watertight
-        assert -1e-6 <= hull.mesh.bounds[0, 2] <= hull.voxel
 
 
 class TestRefusals:
@@ -219,10 +199,9 @@ class TestRefusals:
             visual_hull(views, device="cpu")
 
     def test_options(self):
-        views = ball_views(3)
-        for options in ({"resolution": 8}, {"tolerance": 4}, {"tolerance": -1}, {"box": [[0, 0, 0], [1, 0, 1]]}):
+        for options in ({"resolution": 8}, {"quorum": 1}):
             with pytest.raises(InvalidOptionError):
-                visual_hull(views, device="cpu", **options)
+                visual_hull(ball_views(3), device="cpu", **options)
 
 
 def test_walker_contains_the_truth(data_dir, device):
