@@ -1,4 +1,4 @@
-"""Which Gaussians are dropped and which are split: second halves take the rows of those that were dropped."""
+"""Dropping and splitting of Gaussians: second halves take the rows of those that were dropped."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from beam_warp.reconstruction.parameters import DEAD_LOGIT
 
 SPLIT_OFFSET = 0.6
-"""Halves of a split Gaussian lie that many of its longest deviations to either side of its centre."""
+"""Distance of either half of a split Gaussian from its centre, in its longest deviations."""
 
 SPLIT_SHRINK = 0.65
-"""And their longest deviation is this part of it: variance offset^2 + shrink^2 is 0.8 of what it was, for halves are
-composited over one another and so look wider than their sum."""
+"""Longest deviation of a half, as a part of the longest of the split Gaussian: variance offset^2 + shrink^2 is 0.8 of
+what it was, for halves are composited over one another and so look wider than their sum."""
 
 
 def prune(rows: dict[str, NDArray[Any]], unused: NDArray[np.bool_]) -> None:
-    """Make rows wait for a Gaussian, in place."""
+    """Remove the Gaussians of some rows, in place: the rows wait for another."""
     rows["logits"][unused] = DEAD_LOGIT
     rows["orientations"][unused] = 0.0
     rows["radiance"][unused] = 0.0

@@ -1,9 +1,9 @@
-"""The first frame: Gaussians that look like the photographs of a moment, with the geometry that these imply.
+"""Fitting of key frames: Gaussians that look like the photographs of a moment, with the geometry that these imply.
 
 Steps look at one view each. The discs of a visual hull are moved until renders agree with the photographs in colour,
 structure and coverage, and the Gaussians' normals with those of the depth that they draw. Every so many steps those
-that nobody sees are dropped, and those that the images pull at most are split into their places: their number stays
-within a budget.
+that no view sees are dropped, and those of largest position gradients are split into their places: the number of
+Gaussians stays within a budget.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from beam_warp.world.gaussians import GaussianCloud
 PRESETS = ("fast", "draft", "paper", "rade")
 
 FIT_RASTER = RasterOptions(antialiased=True, low_pass=0.1)
-"""How splats are drawn while they are fitted, and should be afterwards: the pixel filter's variance is about that of
-a pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
+"""Raster options of splats while they are fitted, and afterwards: the pixel filter's variance is about that of a
+pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
 
 NO_PSNR = 120.0
-"""What is said where there is nothing to meet [dB]."""
+"""PSNR that is reported where no view shows the subject [dB]."""
 
 PROGRESS_EVERY = 50
-"""Steps from one report of progress, and change of the learning rates, to the next."""
+"""Steps between two reports of progress, and between two changes of the learning rates."""
 
 RENEW_EVERY = 250
-"""Most steps between looks whether the Gaussians still find room, and the sampling filter fits them."""
+"""Most steps between two updates of the room for splats and of the sampling filter."""
 
 LEAST_GAIN = 0.15
-"""Gain of twice as many Gaussians below which more of them do not pay [dB]."""
+"""Least gain of PSNR for which the number of Gaussians is doubled again [dB]."""
 
 FEWEST_GAUSSIANS = 2_000
-"""Where a search for a number of Gaussians begins, at least."""
+"""Fewest Gaussians with which a fit to a target PSNR begins."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class LearningRates:
     """Sizes of steps, each in the units of what is moved.
 
     Attributes:
-        positions: In distances of the cameras from the subject.
-        orientations: Of quaternions.
-        scales: Of logarithms.
-        opacities: Of logits.
-        color: Of the spherical harmonics' band 0.
-        bands: Of all other bands.
+        positions: Rate of positions, in distances of the cameras from the subject.
+        orientations: Rate of quaternions.
+        scales: Rate of the logarithms of scales.
+        opacities: Rate of the logits of opacities.
+        color: Rate of the spherical harmonics' band 0.
+        bands: Rate of all other bands.
         final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
-        final_others: The same of all other rates.
+        final_others: Part of all other rates that is left at the end, likewise.
 
     Raises:
         InvalidOptionError: A rate is negative or no number.
@@ -92,17 +92,17 @@ class LearningRates:
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """How Gaussians are fitted to the photographs of one moment.
+    """Options of fitting Gaussians to the photographs of one moment.
 
     Attributes:
         gaussian_count: Most Gaussians there may be.
         target_psnr: Begin with few Gaussians and double them until the views are met so well [dB], or doubling gains
             less than `LEAST_GAIN`, or there are as many as allowed; None for all of them at once.
         color_iterations: Steps without the term of normals.
-        normal_iterations: Steps with it.
-        weights: What the terms count.
+        normal_iterations: Steps with the term of normals, after those.
+        weights: Weights of the terms.
         rates: Sizes of steps.
-        sh_degree: Of the captured radiance.
+        sh_degree: Degree of the captured radiance.
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
@@ -202,11 +202,11 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What came out of a fit.
+    """The result of a fit.
 
     Attributes:
         cloud: Gaussians with scene-linear radiance and ids.
-        report: What was done and how well it went, JSON-able: ``psnr`` of the training views' crops [dB], lowest
+        report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest
             ``view_psnr``, ``gaussians``, ``iterations``, ``samples``, ``seconds``; ``growth`` with a target.
     """
 
@@ -362,7 +362,7 @@ class Fitter:
         progress(total, total, facts)
 
     def report(self) -> dict[str, Any]:
-        """Return what was done and how well it went, JSON-able."""
+        """Return what was done, and the PSNR of the views, JSON-able."""
         psnr = self.psnr()
         return {
             "psnr": mean_psnr(psnr),

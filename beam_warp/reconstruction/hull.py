@@ -39,13 +39,13 @@ AUTO_RESOLUTION = (64, 256)
 """Least and most voxels along the longest side where the resolution follows the pixels."""
 
 SEARCH_BLOCKS = 48
-"""Blocks along each side of the box while it is searched for."""
+"""Blocks along the longest side of the box while the box is searched for."""
 
 SEARCH_ROUNDS = 8
 """Most times that the box is drawn closer."""
 
 ENOUGH = 0.8
-"""A round that leaves more than this of the longest side was the last one."""
+"""Part of the longest side above which a round of the search that leaves it is the last."""
 
 SEARCH_SIDE = 320
 """Longest side of the masks [pixel] while the box is searched for: larger ones are reduced by whole factors."""
@@ -63,8 +63,8 @@ class VisualHull:
     """A visual hull.
 
     Attributes:
-        mesh: Its surface [m], closed, faces outward.
-        voxel: Size of the cells that it was found on [m].
+        mesh: Surface of the hull [m], closed, faces outward.
+        voxel: Size of the cells that the surface was found on [m].
     """
 
     mesh: trimesh.Trimesh
@@ -218,7 +218,7 @@ def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
 
 
 class _Cones:
-    """The silhouettes on a device, and what can be asked of them."""
+    """The silhouettes of views on a device: the box that they allow, and the surface inside it."""
 
     def __init__(self, views: Sequence[CapturedView], factor: int, quorum: int, device: Any) -> None:
         self.captured = list(views)
@@ -311,7 +311,7 @@ class _Cones:
 
 
 def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
-    """Say that nothing is left, and which views are to blame where leaving out one is enough."""
+    """Return the error that nothing is left; it names the views of which leaving out one is enough."""
     size, count = _blocks(box)
     views = cones.captured
     left = np.zeros(len(views), np.int64)

@@ -25,22 +25,21 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
 from beam_warp.reconstruction.hull import masked_views, viewing_focus, visual_hull
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
-
-SH_CONSTANT = 0.28209479177387814
-"""The spherical harmonic of degree 0: colour = 0.5 + SH_CONSTANT * coefficient."""
+from beam_warp.world.harmonics import SH_C0
 
 DISC_WIDTH = 0.7
-"""Standard deviation across a disc, of the spacing: neighbours overlap, so that light does not pass between them."""
+"""Standard deviation across a disc, in spacings: neighbours overlap, so that light does not pass between them."""
 
 DISC_THICKNESS = 0.15
-"""Standard deviation along the normal, of the spacing: a surface to the eye, and room to learn in both directions."""
+"""Standard deviation of a disc along its normal, in spacings: a surface to the eye, with room to learn
+in both directions."""
 
 DISC_OPACITY = 0.8
-"""With discs of `DISC_WIDTH` at each spacing, the alphas over a point add up to 2 pi 0.7^2 0.8 = 2.5: one layer leaves
-less than exp(-2.5) = 8 % of the light, front and back together less than 1 %."""
+"""Opacity of a disc. With discs of `DISC_WIDTH` at each spacing, the alphas over a point add up to 2 pi 0.7^2 0.8 =
+2.5: one layer leaves less than exp(-2.5) = 8 % of the light, front and back together less than 1 %."""
 
 BALL_OPACITY = 0.1
-"""Kerbl et al. 2023: given points may be wrong, and are easily pruned when they start faint."""
+"""Opacity of a ball: given points may be wrong, and are easily pruned when they start faint (Kerbl et al. 2023)."""
 
 HEXAGONAL = (2.0 / np.sqrt(3.0)) ** 0.5
 """Distance of neighbours in the densest arrangement of one point for each unit of area."""
@@ -52,10 +51,10 @@ NEIGHBORS = 10
 """Points that a point may have to keep away from, itself included: six surround it where all is even."""
 
 HIDING_OPACITY = 0.9
-"""What Gaussians are drawn with to find what hides what: one is enough to be the median surface."""
+"""Opacity with which Gaussians are drawn to find which ones are hidden: one is enough to be the median surface."""
 
 DEPTH_SLACK = 3.0
-"""Largest scales that a Gaussian's centre may lie behind the median surface and still be of it."""
+"""Distance by which a Gaussian's centre may lie behind the median surface and still be seen, in largest scales."""
 
 LEAST_FACING = 0.2
 """Cosine between normal and view below which a view says nothing about a point's colour."""
@@ -126,7 +125,7 @@ def initial_gaussians(
         colors = table[rows]
     return shapes.with_arrays(
         normals=None,
-        radiance=((colors - 0.5) / SH_CONSTANT)[:, None, :],
+        radiance=((colors - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
     )
 

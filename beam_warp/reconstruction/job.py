@@ -1,9 +1,9 @@
-"""From a multi-view capture to a Gaussian sequence: frame by frame, in segments, resumable after any kill.
+"""The reconstruction job: a multi-view capture becomes a Gaussian sequence, frame by frame, resumable after any kill.
 
 A job reads a frame's images, fits the Gaussians of a key frame from a start that those images give, tracks every
-further frame of the segment from the one before, and writes the sequence as an asset. Segments depend on nothing of
-each other and may be worked on by several processes, and what tracking loses, the next key frame finds again. A frame
-in which tracking says that it is lost becomes a key frame itself.
+further frame of the segment from the one before, and writes the sequence as an asset. Segments do not depend on each
+other: several processes may work on them, and what tracking loses, the next key frame finds again. A frame in which
+tracking is lost becomes a key frame itself.
 
     read            frame_reader    images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
@@ -53,7 +53,7 @@ ASSET_NAME = "gaussians.usda"
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """Which frames are reconstructed, and where key frames are planned.
+    """Options of a reconstruction: its frames, and where key frames are planned.
 
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
@@ -192,7 +192,7 @@ def reconstruct_part(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What every frame of one call needs."""
+    """The state that all frames of one call share."""
 
     plan: FramePlan
     steps: FrameSteps

@@ -1,4 +1,4 @@
-"""How implausible a motion is, and how every joint and Gaussian should change: terms of a loss of tracking.
+"""Terms of the loss of tracking: motion that is not rigid around a joint, and change of Gaussians between frames.
 
 As in `beam_warp.raster.losses`, a term called adds its gradients to arrays that other terms add to as well, and returns
 its value in an array of one element that it owns: valid until its next call. Nothing is allocated in a call and nothing
@@ -38,7 +38,7 @@ SMALLEST_UNIT = 1e-12
 
 
 class RigidityLoss:
-    """Unlikeness of the joints' motion to one that is rigid around each of them (E_smooth, as rigid as possible).
+    """The part of the joints' motion that is not rigid around each of them (E_smooth, as rigid as possible).
 
     Source: Jiang et al. 2024, DualGS, E_smooth; there a sum over all edges in squared units of the world, here a mean
     over the joints in squared joint spacings. `docs/tracking.md` says which weight is which.
@@ -48,7 +48,7 @@ class RigidityLoss:
         """Upload a graph.
 
         Args:
-            graph: Of the joints; its spacing is the unit of length.
+            graph: Graph of the joints; its spacing is the unit of length.
             device: Warp device; the first GPU without, or the CPU where there is none.
 
         Raises:
@@ -83,10 +83,10 @@ class RigidityLoss:
         at rest as the previous one (rotations of 0, 0, 0, 1) it is how far the shape is from the one at rest.
 
         Args:
-            rotations: Of the joints now, against rest, xyzw, ``(M,)`` quat or vec4; of any length but 0.
-            positions: Now, ``(M,)`` vec3.
-            previous_rotations: Before, like ``rotations``. It has no gradient.
-            previous_positions: Before, like ``positions``. It has no gradient.
+            rotations: Rotations of the joints now, against rest, xyzw, ``(M,)`` quat or vec4; of any length but 0.
+            positions: Positions of the joints now, ``(M,)`` vec3.
+            previous_rotations: Rotations before, like ``rotations``, without a gradient.
+            previous_positions: Positions before, like ``positions``, without a gradient.
             weight: The factor of the term, at least 0.
             rotation_gradients: The derivative with respect to ``rotations`` is added to it, ``(M,)`` quat or vec4;
                 orthogonal to them, as their length changes nothing.
@@ -120,28 +120,24 @@ class RigidityLoss:
 
 
 class TemporalLoss:
-    """Mean squared change of an attribute since another time (E_temp), in units of a change that matters.
+    """Mean squared change of an attribute since an earlier frame (E_temp), in units of a change that matters.
 
     Source: Jiang et al. 2024, DualGS, E_temp; there the norm of all changes of an attribute together, before its
     activation, here the mean of their squares, and the caller says before or after.
     """
 
-    def __init__(self, shape: int | tuple[int, ...], *, device: Any = None) -> None:
+    def __init__(self, shape: tuple[int, int], *, device: Any = None) -> None:
         """Make buffers, 4 bytes for each float.
 
         Args:
-            shape: N rows of one float, or ``(N, K)``: vec3 have K = 3, quaternions 4.
+            shape: Rows and floats of each, ``(N, K)``: vec3 have K = 3, quaternions 4.
             device: Warp device; the first GPU without, or the CPU where there is none.
 
         Raises:
             InvalidOptionError: A size is out of range.
             DeviceError: The device is not there.
         """
-        sizes = (shape,) if isinstance(shape, int) else tuple(shape)
-        if len(sizes) not in (1, 2):
-            raise InvalidOptionError(f"shape must be (N,) or (N, K), got {shape!r}. Flatten what is within a row.")
-        rows, width = (*sizes, 1)[:2]
-        self._shape = (require_count("shape[0]", rows), require_count("shape[1]", width))
+        self._shape = (require_count("shape[0]", shape[0]), require_count("shape[1]", shape[1]))
         if math.prod(self._shape) > MOST_FLOATS:
             raise InvalidOptionError(f"shape must have at most {MOST_FLOATS} floats, got {self._shape}. Use two terms.")
         self.device = resolve_device(device)
@@ -164,7 +160,7 @@ class TemporalLoss:
 
         Args:
             values: N floats, vectors or quaternions, contiguous, or ``(N, K)`` floats of any strides.
-            reference: What they were, like ``values`` or its rows as ``(N, K)`` floats. It has no gradient.
+            reference: The earlier values, like ``values`` or its rows as ``(N, K)`` floats, without a gradient.
             weight: The factor of the term, at least 0.
             unit: The change that counts as 1, in the units of the values; at least 1e-12.
             gradient: The derivative with respect to ``values`` is added to it, like ``reference``.

@@ -1,4 +1,4 @@
-"""Which records of a capture are reconstructed, and in which segments."""
+"""Plan of a reconstruction: the records of each frame, and the segments that frames are worked on in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reconstruction asks of its parts: steps that find the Gaussians of frames, and listeners to progress."""
+"""Protocols of a reconstruction: the steps that find the Gaussians of frames, and listeners to progress."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StepProgress(Protocol):
 
 
 class FrameTrack(Protocol):
-    """What the next frame needs of this one."""
+    """The state of tracking in one frame: what the next frame needs of it."""
 
     @property
     def cloud(self) -> GaussianCloud:
@@ -41,7 +41,7 @@ class FrameTrack(Protocol):
 
 
 class FrameSteps(Protocol):
-    """How the Gaussians of a frame are found; the same input gives the same bits.
+    """Steps that find the Gaussians of a frame; the same input gives the same bits.
 
     Reports are JSON-able. Their ``psnr`` and ``gaussians`` are shown and summed up. The report of a tracked frame says
     in ``lost`` why tracking is lost; the text is empty if it is not. ``findings`` holds the findings about the frame,
@@ -56,7 +56,7 @@ class FrameSteps(Protocol):
 
     @property
     def raster(self) -> RasterOptions | None:
-        """How splats are drawn; None for the defaults."""
+        """Raster options of the splats; None for the defaults."""
         ...
 
     def options(self) -> Mapping[str, Any]:

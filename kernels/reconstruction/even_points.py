@@ -1,4 +1,4 @@
-"""How points on a surface push each other apart until they lie evenly on it."""
+"""Points on a surface push each other apart until they lie evenly on it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What colour of a point each view shows, and one colour that most views agree on."""
+"""Colours of points in each view, and one colour for each point that most views agree on."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ LEAST_SPREAD = wp.constant(0.01)
 
 @wp.struct
 class SeenImage:
-    """What a view shows, and how far it sees."""
+    """The image of a view, and the depth of the surface that it shows."""
 
     view: View
     color: wp.array[wp.vec3]  # premultiplied, row by row

@@ -1,4 +1,4 @@
-"""How deep a point is inside the cones of all silhouettes, and which blocks of a grid the hull's surface may pass.
+"""Depths of points inside the cones of all silhouettes, and the blocks of a grid that the hull's surface may pass.
 
 The depth of a point in one view's cone is the signed distance of its pixel to the silhouette, brought to metres at the
 point's depth; inside all cones is where the least of them is positive. A block is judged by its enclosing ball: where
@@ -27,7 +27,7 @@ NEAR = wp.constant(0.01)
 """Depth [m] before which a camera sees nothing, as for the rasteriser."""
 
 PIXEL_MARGIN = wp.constant(1.5)
-"""What the measured distance may be off between pixels [pixel]: interpolation over a cell's half diagonal, 0.71, and
+"""Largest error of the measured distance between pixels [pixel]: interpolation over a cell's half diagonal, 0.71, and
 the spacing of the silhouette's crossings, 0.5."""
 
 OUTSIDE = wp.constant(0)

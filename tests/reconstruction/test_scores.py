@@ -7,8 +7,9 @@ from skimage.metrics import structural_similarity
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
+from beam_warp.image.metrics import block_means
 from beam_warp.raster.gbuffer import GBuffer, rasterize
-from beam_warp.reconstruction.scores import block_means, read_truth_mesh, score_frame, seen_radiance, truth_frames
+from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -114,7 +115,7 @@ class TestViews:
         }  # fmt: skip
 
     def test_a_pixel_is_the_mean_of_its_samples(self, tiny_capture, discs, device):
-        """In linear light, before it is encoded; what geometry says is measured as without samples."""
+        """The mean is taken in linear light, before it is encoded; geometry is measured as without samples."""
         records = tiny_capture.select(split="test", frames=[0])
         once, fine = (score_frame(discs, records, samples=samples, device=device).as_dict() for samples in (1, 3))
         buffer = rasterize(discs, records[0].camera.supersampled(3), channels=("radiance",), device=device)
