@@ -24,13 +24,12 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.reconstruction.gradient_lengths import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
-from beam_warp.raster.records import GaussianGradients, RasterOptions
+from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
 from beam_warp.reconstruction.initial import DISC_WIDTH
 from beam_warp.reconstruction.motion_losses import TemporalTerms
 from beam_warp.reconstruction.parameters import GaussianParameters
 from beam_warp.reconstruction.protocols import StepProgress, no_step_progress
-from beam_warp.reconstruction.regularizers import AnisotropyLoss, OpacityLoss
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
 from beam_warp.world.gaussians import GaussianCloud
@@ -106,8 +105,6 @@ class FitOptions:
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
-        anisotropy: Weight of needles (`AnisotropyLoss`).
-        opacity: Weight of opacity (`OpacityLoss`).
         temporal: Weight of changes against the start, for the frames after the first (E_temp).
         refine_every: Steps from one refinement to the next; 0 for none.
         refine_until: Part of all steps after which there is none.
@@ -131,8 +128,6 @@ class FitOptions:
     samples: int | Literal["auto"] = "auto"
     raster: RasterOptions = FIT_RASTER
     sampling_filter: bool = True
-    anisotropy: float = 0.0
-    opacity: float = 0.0
     temporal: float = 0.0
     refine_every: int = 250
     refine_until: float = 0.6
@@ -153,8 +148,7 @@ class FitOptions:
             require_count("samples", self.samples, 1, 8)
         for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("anisotropy", "opacity", "temporal"):
-            require_number(name, getattr(self, name), 0.0)
+        require_number("temporal", self.temporal, 0.0)
 
     @classmethod
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
@@ -327,8 +321,6 @@ class Fitter:
         self._adam: Adam = self.parameters.optimizer(self._rates)
         self._gradient_sums = wp.zeros(count, dtype=float, device=device)
         self._gradient_counts = wp.zeros(count, dtype=float, device=device)
-        self._anisotropy = AnisotropyLoss(count, device=device)
-        self._opacity = OpacityLoss(count, device=device)
         self._temporal = TemporalTerms(self.parameters, spacing) if options.temporal > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
@@ -427,27 +419,18 @@ class Fitter:
     def _step(self, view: int) -> None:
         """Draw a view, compare, and move the Gaussians."""
         group, index = self._targets[view]
-        parameters, chosen = self.parameters, self.options
+        parameters = self.parameters
         parameters.activate()
         group.select(index)
         group.rasterizer.redraw()
         group.add_losses(index, self._weights)
         drawn = group.rasterizer.backward()
         launch_add_gradient_lengths(drawn.positions, self._gradient_sums, self._gradient_counts, self.device)
-        self._add_regularizers(drawn)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
         if self._temporal is not None:
-            self._temporal.add_gradients(chosen.temporal)
+            self._temporal.add_gradients(self.options.temporal)
         self._adam.step()
-
-    def _add_regularizers(self, drawn: GaussianGradients) -> None:
-        """Add the gradients of terms on what is drawn."""
-        chosen, gaussians = self.options, self.parameters.drawn
-        if chosen.anisotropy > 0.0:
-            self._anisotropy(gaussians.scales, weight=chosen.anisotropy, gradient=drawn.scales)
-        if chosen.opacity > 0.0:
-            self._opacity(gaussians.opacities, weight=chosen.opacity, gradient=drawn.opacities)
 
     def _refine(self) -> None:
         """Drop Gaussians that are not seen, and split those of large gradients into their rows."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -189,21 +189,9 @@ def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]
 
 def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
     """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced` but no colour."""
-    camera, alpha = view.camera, np.asarray(view.alpha)
-    if factor == 1:
-        return camera, alpha
-    width, height = camera.width // factor, camera.height // factor
-    blocks = alpha[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    smaller = replace(
-        camera,
-        width=width,
-        height=height,
-        focal_x=camera.focal_x / factor,
-        focal_y=camera.focal_y / factor,
-        center_x=camera.center_x / factor,
-        center_y=camera.center_y / factor,
-    )
-    return smaller, blocks.mean(axis=(1, 3), dtype=np.float32)
+    camera, alpha = view.camera.reduced(factor), np.asarray(view.alpha)
+    whole = alpha[: camera.height * factor, : camera.width * factor]
+    return camera, whole.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3), dtype=np.float32)
 
 
 def _listed(start: str, views: Sequence[CapturedView]) -> str:

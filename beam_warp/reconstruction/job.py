@@ -38,8 +38,8 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.report import device_facts, versions, write_report
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frame_reader import FrameReader
-from beam_warp.reconstruction.keys import FrameKeys
-from beam_warp.reconstruction.modelling import PreviousFrame, model_frame
+from beam_warp.reconstruction.keys import common_inputs, key_of_frame
+from beam_warp.reconstruction.modelling import model_frame
 from beam_warp.reconstruction.plan import FramePlan, plan_frames
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
 from beam_warp.reconstruction.protocols import FrameSteps, Progress, no_progress
@@ -198,7 +198,7 @@ class _Job:
     steps: FrameSteps
     device: Any
     store: FrameStore
-    keys: FrameKeys
+    common_inputs: str
     progress: Progress
 
 
@@ -206,7 +206,7 @@ def _prepare(capture: Capture, out: Path, steps: FrameSteps, options: Reconstruc
     """Check everything, and then make the folders."""
     device = resolve_device(steps.device)
     plan = plan_frames(capture, options.frames, options.segment_length)
-    return _Job(plan, steps, device, FrameStore(out), FrameKeys.of(steps, device), progress)
+    return _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
 
 
 def _reconstruct_segments(job: _Job, segments: Sequence[Sequence[int]]) -> int:
@@ -217,7 +217,7 @@ def _reconstruct_segments(job: _Job, segments: Sequence[Sequence[int]]) -> int:
     key, resumed = "", 0
     with FrameReader(job.plan.records, job.store.digests) as reader:
         for done, (frame, previous) in enumerate(order):
-            key = job.keys.key(frame, reader.digest(frame), "" if previous is None else key)
+            key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "" if previous is None else key)
             views, seconds = None, None
             if job.store.key(frame) == key:
                 resumed += 1
@@ -238,7 +238,7 @@ def _model_and_store(job: _Job, frame: int, key: str, views: Sequence[CapturedVi
     before = None
     if previous is not None:
         track = job.steps.restore(job.store.track_arrays(previous))
-        before = PreviousFrame(track, int(job.store.report(previous)["segment"]))
+        before = track, int(job.store.report(previous)["segment"])
     job.store.write(frame, key, model_frame(job.steps, frame, views, before, job.progress))
     return time.perf_counter() - started
 

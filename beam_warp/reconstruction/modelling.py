@@ -29,24 +29,11 @@ class FrameModel:
     report: dict[str, Any]
 
 
-@dataclass(frozen=True, eq=False)
-class PreviousFrame:
-    """The frame that tracking goes on from.
-
-    Attributes:
-        track: What the steps restored from the store.
-        segment: The key frame of its segment.
-    """
-
-    track: FrameTrack
-    segment: int
-
-
 def model_frame(
     steps: FrameSteps,
     frame: int,
     views: Sequence[CapturedView],
-    previous: PreviousFrame | None,
+    previous: tuple[FrameTrack, int] | None,
     progress: Progress,
 ) -> FrameModel:
     """Find the Gaussians of a frame; a frame in which tracking is lost is fitted as a key frame.
@@ -55,15 +42,16 @@ def model_frame(
         steps: How they are found.
         frame: Its number.
         views: Its images.
-        previous: The frame before in the segment; None for a key frame.
+        previous: Track of the frame before, and the key frame of its segment; None for a key frame.
         progress: Called with (stage, done, total, note), the stages "track" and "fit".
     """
     lost, segment = "", frame
     track, report = None, {}
     findings: list[Any] = []
     if previous is not None:
-        track, report = steps.advance(previous.track, views, _within(progress, "track", frame))
-        lost, segment = str(report.get("lost", "")), previous.segment
+        before, segment = previous
+        track, report = steps.advance(before, views, _within(progress, "track", frame))
+        lost = str(report.get("lost", ""))
         findings = list(report.get("findings", []))
     if track is None or lost:
         track, report = steps.begin(views, _within(progress, "fit", frame))

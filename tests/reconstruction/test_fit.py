@@ -10,7 +10,6 @@ from support.moving_ball import ball_cloud, ball_view, ball_views, rig
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.reconstruction import fit as fit_module
 from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, fit_gaussians
 from beam_warp.reconstruction.initial import initial_gaussians
@@ -155,9 +154,8 @@ class TestBudget:
 
 
 class TestRowsWithoutAGaussian:
-    @pytest.mark.parametrize("terms", [{}, {"anisotropy": 0.1}])
-    def test_they_never_move_and_never_count(self, device, views, terms):
-        options = few_steps(gaussian_count=90, normal_iterations=20, refine_every=1000, **terms)
+    def test_they_never_move_and_never_count(self, device, views):
+        options = few_steps(gaussian_count=90, normal_iterations=20, refine_every=1000)
         fitter = fitter_of(views, ball_cloud(60), options, device)
         before = {name: array[60:].copy() for name, array in fitter.parameters.rows().items()}
         fitter.run()
@@ -195,7 +193,6 @@ class TestBits:
     def test_same_bits_every_time_for_every_number_of_threads(self, device, monkeypatch):
         views = ball_views(rig(2, 48))  # 9,216 samples, 1,100 rows: several chunks of every kernel
         options = few_steps(gaussian_count=1100, normal_iterations=4, refine_every=2, refine_until=1.0, samples=2)
-        options = replace(options, anisotropy=0.1, opacity=0.1)
         expected = fitted_bits(views, options, device)
         for threads in ("1", "3"):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)
@@ -292,8 +289,6 @@ OUT_OF_RANGE = {
     "split_fraction": (-0.1, 1.1, np.nan),
     "hidden_share": (-0.1, 1.1, np.nan),
     "dead_opacity": (-0.1, 1.1, np.nan),
-    "anisotropy": (-0.1, np.nan),
-    "opacity": (-0.1, np.nan),
     "temporal": (-0.1, np.nan),
 }
 
@@ -339,9 +334,3 @@ class TestRefusals:
             fit_gaussians([], ball_cloud(60), few_steps(), device=device)
         with pytest.raises(InvalidArrayError, match="got 6 views and 0 Gaussians"):
             fit_gaussians(views, ball_cloud(60).select(np.zeros(0, int)), few_steps(), device=device)
-
-    def test_a_start_without_light(self, device, views):
-        """Display colours and none at all are refused, not converted."""
-        for changes in ({"radiance_color_space": DISPLAY_SRGB}, {"radiance": None, "radiance_color_space": None}):
-            with pytest.raises(InvalidArrayError, match="start must have radiance in lin_rec709_scene"):
-                fit_gaussians(views, ball_cloud(60).with_arrays(**changes), few_steps(), device=device)

@@ -83,11 +83,3 @@ class TestViews:
         assert np.isnan(gains.stops).all()
         assert judge_gains(gains, views[:1]) == []
         assert matched(views[:1], gains)[0] is views[0]
-
-    def test_the_same_bits_with_any_number_of_threads(self, seen, monkeypatch):
-        views, cloud, normals = seen
-        found = []
-        for threads in ("1", "3"):
-            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            found.append(view_gains(cloud, normals, views, device="cpu").stops.tobytes())
-        assert found[0] == found[1]

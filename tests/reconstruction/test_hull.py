@@ -26,7 +26,7 @@ def distances(alpha, device, limit=40.0):
 
 
 class TestSilhouettes:
-    @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 90.0, 200.0])
+    @pytest.mark.parametrize("angle", [0.0, 20.0, 200.0])
     def test_straight_edge(self, device, angle):
         size, s = 33, 8
         x = (np.arange(size * s) + 0.5) / s - 16.3
@@ -50,7 +50,7 @@ class TestSilhouettes:
         np.testing.assert_allclose(found, [[-4.0 / 3.0, -1.0 / 3.0, 2.0 / 3.0, 5.0 / 3.0]], rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize(("value", "sign"), [(0.0, -1.0), (1.0, 1.0)])
-    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (300, 1), (20, 70)])
+    @pytest.mark.parametrize("shape", [(1, 1), (20, 70)])
     def test_no_edge(self, device, shape, value, sign):
         np.testing.assert_array_equal(distances(np.full(shape, value, np.float32), device, 30.0), sign * 30.0)
 
@@ -96,7 +96,7 @@ def slack(hull, views):
 
 
 class TestBall:
-    @pytest.mark.parametrize("count", [4, 6, 12, 24])
+    @pytest.mark.parametrize("count", [4, 24])
     def test_lies_between_the_ball_and_its_tangent_planes(self, device, count):
         views = ball_views(count)
         hull = visual_hull(views, resolution=48, quorum=count, device=device)
@@ -146,15 +146,6 @@ class TestBall:
         # Middles of masks are whole or half pixels.
         np.testing.assert_allclose(focus, center, rtol=0, atol=0.5 * 2.0 / cameras[0].focal_x)
         assert abs(reach - 2.0) < 0.05
-
-    def test_threads_make_no_difference(self, monkeypatch):
-        meshes = []
-        for threads in ("1", "2", "5"):
-            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            meshes.append(visual_hull(ball_views(7), resolution=40, device="cpu").mesh)
-        for mesh in meshes[1:]:
-            np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
-            np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
 
 
 def with_alpha(view, alpha):

@@ -116,7 +116,7 @@ class TestRigidity:
         expected = 0.3 * twin.rigidity(graph.neighbors, graph.weights, graph.spacing, *poses)
         assert found == pytest.approx(expected, rel=200.0 * EPSILON)
 
-    @pytest.mark.parametrize(("count", "neighbor_count"), [(2, 8), (5, 8), (40, 3), (60, 8)])
+    @pytest.mark.parametrize(("count", "neighbor_count"), [(2, 8), (40, 3)])
     @pytest.mark.parametrize(("angle", "shift"), [(0.5, 0.1), (1e-3, 1e-3)])
     def test_gradients(self, device, rng, count, neighbor_count, angle, shift):
         """Also between two frames, where the motion is a thousandth of the edges."""

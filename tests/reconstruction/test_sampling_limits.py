@@ -74,15 +74,6 @@ def test_equals_the_twin(device, rng, count):
     assert edge.mean() < 1e-2
 
 
-def test_threads_make_no_difference(monkeypatch, rng):
-    positions = rng.normal(0.0, 1.0, (5000, 3))
-    found = []
-    for threads in ("1", "3"):
-        monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-        found.append(limits(positions, [camera()], "cpu"))
-    np.testing.assert_array_equal(*found)
-
-
 def test_refusals():
     with pytest.raises(InvalidOptionError, match="cameras must be at least one"):
         SamplingLimits([], device="cpu")

@@ -98,9 +98,7 @@ class TestWarp:
         assert np.abs(found[1] - expected[1]).max() <= 2.0 * 40.0 * EPSILON
 
     @pytest.mark.parametrize("parts", ["both", "positions", "orientations"])
-    @pytest.mark.parametrize(
-        ("skin_count", "joint_count", "neighbor_count"), [(1, 1, 8), (9, 3, 8), (70, 6, 4), (200, 3, 2)]
-    )
+    @pytest.mark.parametrize(("skin_count", "joint_count", "neighbor_count"), [(1, 1, 8), (9, 3, 8), (200, 3, 2)])
     def test_gradients(self, device, rng, blend, skin_count, joint_count, neighbor_count, parts):
         rest, rotations, positions = scene(rng, skin_count, joint_count, neighbor_count)
         to_positions = None if parts == "orientations" else single(rng.standard_normal((skin_count, 3)))
@@ -218,7 +216,7 @@ class TestWarp:
         for one, other in zip(*found, strict=True):
             assert (one == other).all()
 
-    @pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65])
+    @pytest.mark.parametrize("count", [1, 32, 33, 65])
     def test_runs_of_one_joint(self, device, rng, blend, count):
         """Every skin on one joint, as many as straddle runs: the joint's gradient is the sum of them."""
         rest, rotations, positions = scene(rng, count, 1)

@@ -369,23 +369,3 @@ class TestSampleSide:
         views = ball_views(rig(1))
         behind = views[0].camera.position - views[0].camera.forward
         assert sample_side(views, behind, 0.1) == 1
-
-
-@pytest.mark.parametrize("threads", ["1", "3"])
-def test_same_bits_for_every_number_of_threads(device, rng, monkeypatch, threads):
-    """Twice in a row, and against one thread; 1,300 rows and 3,136 samples are several chunks."""
-    target, views = wp.get_device(device), ball_views(rig(1, 28))
-
-    def bits():
-        parameters = GaussianParameters(ball_cloud(1300), target)
-        targets = TargetSet(views, 1300, RASTER, 2, target)
-        group, index = targets[0]
-        group.draw(index, parameters.drawn)
-        terms = group.add_losses(index, LossWeights(normal=0.3))
-        parameters.add_gradients(group.rasterizer.backward())
-        arrays = [*terms, *(parameters.gradient(name) for name in NAMES)]
-        return b"".join(array.numpy().tobytes() for array in arrays) + targets.shares(parameters.drawn).tobytes()
-
-    expected = bits()
-    monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-    assert bits() == expected
