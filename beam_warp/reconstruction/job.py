@@ -5,10 +5,11 @@ further frame of the segment from the one before, and writes the sequence as an 
 other: several processes may work on them, and what tracking loses, the next key frame finds again. A frame in which
 tracking is lost becomes a key frame itself.
 
-    read            frame_reader    images and digests of a frame
+    plan            frames.plan     the records of each frame, and the segments
+    read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
-    store           stored_frames   one file a frame, under a key (keys)
+    store           frames.store    one file a frame, under a key (frames.keys)
     write           this module     asset, previews, report
 
 The key of a frame covers everything it depends on: the version, the kind of device, the options, what the capture
@@ -37,14 +38,14 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.report import device_facts, versions, write_report
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.frame_reader import FrameReader
-from beam_warp.reconstruction.keys import common_inputs, key_of_frame
-from beam_warp.reconstruction.modelling import model_frame
-from beam_warp.reconstruction.plan import FramePlan, plan_frames
+from beam_warp.reconstruction.frames.keys import common_inputs, key_of_frame
+from beam_warp.reconstruction.frames.model import model_frame
+from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
+from beam_warp.reconstruction.frames.reader import FrameReader
+from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
+from beam_warp.reconstruction.frames.store import FrameStore, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
 from beam_warp.reconstruction.protocols import FrameSteps, Progress, no_progress
-from beam_warp.reconstruction.report import frame_line, sequence_facts, warnings_of
-from beam_warp.reconstruction.stored_frames import FrameStore, stored_cloud, stored_sequence
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 

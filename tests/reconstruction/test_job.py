@@ -21,10 +21,10 @@ from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
 from beam_warp.reconstruction import job as job_module
-from beam_warp.reconstruction import stored_frames
+from beam_warp.reconstruction.frames import store as frame_store
+from beam_warp.reconstruction.frames.plan import plan_segments
+from beam_warp.reconstruction.frames.store import ID_BITS, stored_cloud
 from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare, reconstruct, reconstruct_part
-from beam_warp.reconstruction.plan import plan_segments
-from beam_warp.reconstruction.stored_frames import ID_BITS, stored_cloud
 
 FRAMES = (0, 1, 2, 3)
 PAIRS = ReconstructOptions(segment_length=2)
@@ -201,7 +201,7 @@ def killed_at(monkeypatch, event):
 
         return write
 
-    writes = {stored_frames: ("write_frame", "write_png", "write_json"), job_module: ("write_report",)}
+    writes = {frame_store: ("write_frame", "write_png", "write_json"), job_module: ("write_report",)}
     for module, names in writes.items():
         for name in names:
             monkeypatch.setattr(module, name, watched(getattr(module, name)))

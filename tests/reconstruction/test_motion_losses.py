@@ -10,8 +10,9 @@ from reference.skinning import product
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joints import JointGraph
-from beam_warp.reconstruction.motion_losses import RigidityLoss, TemporalLoss
+from beam_warp.reconstruction.joint_motion.graph import JointGraph
+from beam_warp.reconstruction.joint_motion.rigidity import RigidityLoss
+from beam_warp.reconstruction.temporal import TemporalLoss
 
 EPSILON = 2.0**-24
 """Largest relative rounding of a float32."""

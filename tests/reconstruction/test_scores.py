@@ -12,8 +12,7 @@ from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-
-SH_BASIS_0 = 0.28209479177387814
+from beam_warp.world.harmonics import SH_C0
 
 DISCS = 20_000
 
@@ -33,7 +32,7 @@ def discs(tiny_capture):
         orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
         scales=np.tile([spacing, spacing, 0.05 * spacing], (DISCS, 1)),
         opacities=np.full(DISCS, 0.99),
-        radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
+        radiance=((color - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
     )
 

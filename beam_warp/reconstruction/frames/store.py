@@ -1,7 +1,7 @@
 """The folder of a reconstruction that may be stopped at any time and continued: finished frames and their previews.
 
 Each finished frame is one file with its Gaussians and all that the next frame needs, under a key that covers
-everything it depends on; see `beam_warp.reconstruction.keys`.
+everything it depends on; see `beam_warp.reconstruction.frames.keys`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import frame_key, frame_names, make_folders, read_frame, write_frame
-from beam_warp.reconstruction.modelling import FrameModel
+from beam_warp.reconstruction.frames.model import FrameModel
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud, GaussianSequence
 
 ID_BITS = 32
