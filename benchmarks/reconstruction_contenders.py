@@ -26,7 +26,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 class StepsLike(Protocol):
-    """Steps that find the Gaussians of a frame; see `beam_warp.reconstruction.protocols.FrameSteps`."""
+    """Steps that find the Gaussians of a frame; see `beam_warp.reconstruction.frames.protocols.FrameSteps`."""
 
     def begin(self, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
         """Fit a key frame."""

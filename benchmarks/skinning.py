@@ -24,15 +24,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from beam_warp.device.arrays import device_label, resolve_device
-from beam_warp.reconstruction.joint_motion.graph import (
+from beam_warp.reconstruction.joints.graph import (
     JointGraph,
     joint_spacing,
     nearest_joints,
     proximity_weights,
     torn_fraction,
 )
-from beam_warp.reconstruction.joint_motion.selection import select_joints
-from beam_warp.reconstruction.joint_motion.skinning import Anchors, Skin
+from beam_warp.reconstruction.joints.selection import select_joints
+from beam_warp.reconstruction.joints.skinning import Anchors, Skin
 
 AROUND = 40
 """Points that a joint's true rotation is fitted to."""

@@ -14,8 +14,8 @@ from beam_warp.cli.console import print_json, progress
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
+    from beam_warp.reconstruction.frames.protocols import FrameSteps
     from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare
-    from beam_warp.reconstruction.protocols import FrameSteps
 
 
 @dataclass(frozen=True)

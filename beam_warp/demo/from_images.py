@@ -30,7 +30,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions, LearningRates
 from beam_warp.reconstruction.job import reconstruct
-from beam_warp.reconstruction.joint_motion.tracker import JointOptions
+from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, seen_radiance
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions

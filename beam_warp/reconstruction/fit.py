@@ -26,9 +26,9 @@ from beam_warp.kernels.reconstruction.gradient_lengths import launch_add_gradien
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.initial import DISC_WIDTH
 from beam_warp.reconstruction.parameters import GaussianParameters
-from beam_warp.reconstruction.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
 from beam_warp.reconstruction.temporal import TemporalTerms

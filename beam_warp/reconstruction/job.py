@@ -41,11 +41,11 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.keys import common_inputs, key_of_frame
 from beam_warp.reconstruction.frames.model import model_frame
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
+from beam_warp.reconstruction.frames.protocols import FrameSteps, Progress, no_progress
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
 from beam_warp.reconstruction.frames.store import FrameStore, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
-from beam_warp.reconstruction.protocols import FrameSteps, Progress, no_progress
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 

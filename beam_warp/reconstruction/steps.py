@@ -16,10 +16,10 @@ from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
+from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.joint_motion.image_motion import motion_in_pixels
-from beam_warp.reconstruction.protocols import StepProgress
+from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -32,13 +32,13 @@ from beam_warp.reconstruction.fit import (
     LearningRates,
     mean_psnr,
 )
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.initial import DISC_WIDTH
-from beam_warp.reconstruction.joint_motion.graph import JointGraph, torn_fraction
-from beam_warp.reconstruction.joint_motion.selection import select_joints
-from beam_warp.reconstruction.joint_motion.skinning import Anchors
-from beam_warp.reconstruction.joint_motion.tracker import JointOptions, JointPose, JointTracker
+from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
+from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
+from beam_warp.reconstruction.joints.selection import select_joints
+from beam_warp.reconstruction.joints.skinning import Anchors
 from beam_warp.reconstruction.parameters import require_scene_linear
-from beam_warp.reconstruction.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.targets import TargetSet, sample_side
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, sh_degree_of
 

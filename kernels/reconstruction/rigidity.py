@@ -29,7 +29,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class EdgeArrays:
-    """`beam_warp.reconstruction.joint_motion.graph.JointGraph` on a device."""
+    """`beam_warp.reconstruction.joints.graph.JointGraph` on a device."""
 
     neighbors: wp.array2d[int]
     weights: wp.array2d[float]

@@ -8,8 +8,8 @@ import pytest
 
 from beam_warp.reconstruction import steps
 from beam_warp.reconstruction.fit import FitOptions
+from beam_warp.reconstruction.frames.protocols import no_step_progress
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.protocols import no_step_progress
 from beam_warp.reconstruction.steps import MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
 
 STEPS = FitAndTrack(fitting=FitOptions(gaussian_count=200, color_iterations=1, normal_iterations=0), device="cpu")

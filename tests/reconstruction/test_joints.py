@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joint_motion.graph import JointGraph, torn_fraction
-from beam_warp.reconstruction.joint_motion.selection import select_joints
+from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
+from beam_warp.reconstruction.joints.selection import select_joints
 
 EPSILON = 2.0**-24
 """Largest relative rounding of a float32."""

@@ -10,8 +10,8 @@ from reference.skinning import product
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joint_motion.graph import JointGraph
-from beam_warp.reconstruction.joint_motion.rigidity import RigidityLoss
+from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.temporal import TemporalLoss
 
 EPSILON = 2.0**-24

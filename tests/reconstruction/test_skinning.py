@@ -9,7 +9,7 @@ from reference import skinning as twin
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joint_motion.skinning import Anchors, Skin
+from beam_warp.reconstruction.joints.skinning import Anchors, Skin
 
 EPSILON = 2.0**-24
 """Largest relative rounding of a float32."""

@@ -8,8 +8,8 @@ from support.moving_ball import ball_views, rig
 
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.joint_motion.tracker import JointOptions
-from beam_warp.reconstruction.protocols import no_step_progress
+from beam_warp.reconstruction.frames.protocols import no_step_progress
+from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
 

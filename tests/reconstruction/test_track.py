@@ -12,7 +12,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.reconstruction.fit import FitOptions, LearningRates, fit_gaussians
-from beam_warp.reconstruction.joint_motion.tracker import JointOptions, JointPose, JointTracker
+from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 
 CAMERAS = rig()

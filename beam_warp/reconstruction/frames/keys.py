@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from beam_warp._version import __version__
-from beam_warp.reconstruction.protocols import FrameSteps
+from beam_warp.reconstruction.frames.protocols import FrameSteps
 
 
 def common_inputs(steps: FrameSteps, device: Any) -> str:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.reconstruction.frames.protocols import FrameSteps, FrameTrack, Progress, StepProgress
 from beam_warp.reconstruction.frames.report import known_numbers
-from beam_warp.reconstruction.protocols import FrameSteps, FrameTrack, Progress, StepProgress
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.reconstruction.joint_motion.graph import JointGraph
-from beam_warp.reconstruction.joint_motion.rigidity import RigidityLoss
-from beam_warp.reconstruction.joint_motion.skinning import BLENDS, Anchors, Skin
+from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.rigidity import RigidityLoss
+from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
 from beam_warp.reconstruction.targets import LossWeights, TargetSet
 from beam_warp.world.gaussians import GaussianCloud
 

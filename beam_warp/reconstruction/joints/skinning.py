@@ -24,7 +24,7 @@ from beam_warp.kernels.reconstruction.skinning import (
     launch_warp_skin,
     launch_write_messages,
 )
-from beam_warp.reconstruction.joint_motion.graph import (
+from beam_warp.reconstruction.joints.graph import (
     REACH,
     SMALLEST_COSINE,
     group_by,

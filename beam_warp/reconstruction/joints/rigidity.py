@@ -20,7 +20,7 @@ from beam_warp.device.array_checks import require_vectors
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.rigidity import EdgeArrays, JointPoses, launch_add_rigidity
-from beam_warp.reconstruction.joint_motion.graph import JointGraph
+from beam_warp.reconstruction.joints.graph import JointGraph
 
 
 class RigidityLoss:
