@@ -91,7 +91,7 @@ def view_gains(
     Source: iteratively reweighted least squares, Holland and Welsch 1977.
     """
     reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
-    samples = view_samples(reduced, cloud, normals, device=device)
+    samples = view_samples(reduced, cloud, normals, device=device).numpy()
     seen = (samples[..., 3] > 0.0).sum(axis=0)
     picked = samples[:, np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_POINTS)).astype(int)].astype(np.float64)
     luminance, weights = picked[..., :3] @ np.array(LUMINANCE), picked[..., 3]

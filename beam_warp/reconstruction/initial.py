@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -223,7 +222,7 @@ def seen_colors(
 ) -> NDArray[np.float32]:
     """Return the colour of every Gaussian that most of the views that see it agree on.
 
-    What hides what is found by drawing the Gaussians. Those that no view sees take the colour of the nearest seen one;
+    Drawing the Gaussians shows which ones are hidden. Those that no view sees take the colour of the nearest seen one;
     grey if none is.
 
     Args:
@@ -236,7 +235,8 @@ def seen_colors(
     """
     target = resolve_device(device)
     count = len(cloud)
-    samples = _samples(views, cloud, np.zeros((count, 3)) if cloud.normals is None else cloud.normals, target)
+    normals = np.zeros((count, 3)) if cloud.normals is None else cloud.normals
+    samples = view_samples(views, cloud, normals, device=device)
     colors = wp.empty(count, dtype=wp.vec3, device=target)
     seen = wp.empty(count, dtype=int, device=target)
     launch_agree_colors(samples, colors, seen, target)
@@ -250,27 +250,20 @@ def seen_colors(
 
 def view_samples(
     views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], *, device: str | None = None
-) -> NDArray[np.float32]:
-    """Return what each view shows of every Gaussian.
+) -> wp.array:
+    """Return the colour of every Gaussian in each view, on the device.
 
     Args:
         views: What the cameras saw.
         cloud: Gaussians.
-        normals: From which side each is seen, ``(N, 3)``; from all where it is 0.
+        normals: Side from which each Gaussian is seen, ``(N, 3)``; all sides where it is 0.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
         Scene-linear Rec.709, not premultiplied, and a weight in [0, 1], 0 where the view does not see the Gaussian:
-        ``(V, N, 4)`` float32.
+        ``(V, N)`` vec4.
     """
-    return _samples(views, cloud, normals, resolve_device(device)).numpy()
-
-
-def _samples(
-    views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], target: Any
-) -> wp.array:
-    """Return what each view shows of every Gaussian, on the device."""
-    count = len(cloud)
+    target, count = resolve_device(device), len(cloud)
     gaussians = GaussianArrays(
         upload(cloud.positions, wp.vec3, target),
         upload(cloud.orientations, wp.quat, target),

@@ -1,9 +1,6 @@
 """The temporal term of tracking: attributes of Gaussians are held to their values in the frame before (E_temp).
 
-A term called adds its gradients to arrays that other terms add to as well, and returns its value in an array of one
-element that it owns: valid until its next call. Nothing is allocated in a call and nothing waits for the device: calls
-may be captured in a CUDA graph, where weights stay as they were captured. Sums go in a fixed order: same device, same
-input, same bits.
+Terms add their gradients and return their values as `beam_warp.reconstruction.joints.rigidity` does.
 """
 
 from __future__ import annotations
@@ -20,13 +17,10 @@ from numpy.typing import NDArray
 from beam_warp.checks import require_count, require_number
 from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.squared_difference import launch_add_squared_difference
 from beam_warp.reconstruction.parameters import GaussianParameters
-
-MOST_FLOATS = 2**31 - 1
-"""Most floats of one term: their indices are 32-bit."""
 
 SMALLEST_UNIT = 1e-12
 """Smallest unit of a difference; its inverse square is a float32."""
@@ -51,8 +45,6 @@ class TemporalLoss:
             DeviceError: The device is not there.
         """
         self._shape = (require_count("shape[0]", shape[0]), require_count("shape[1]", shape[1]))
-        if math.prod(self._shape) > MOST_FLOATS:
-            raise InvalidOptionError(f"shape must have at most {MOST_FLOATS} floats, got {self._shape}. Use two terms.")
         self.device = resolve_device(device)
         self._terms = wp.empty(math.prod(self._shape), dtype=float, device=self.device)
         self._value = wp.zeros(1, dtype=float, device=self.device)
