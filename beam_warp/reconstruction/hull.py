@@ -188,7 +188,7 @@ def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]
 
 
 def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
-    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced` but no colour."""
+    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced`, without colour."""
     camera, alpha = view.camera.reduced(factor), np.asarray(view.alpha)
     whole = alpha[: camera.height * factor, : camera.width * factor]
     return camera, whole.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3), dtype=np.float32)

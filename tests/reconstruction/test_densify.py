@@ -75,7 +75,7 @@ class TestSplit:
 
     @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
     def test_the_image_of_a_disc_hardly_changes(self, device, opacity):
-        """Its middle and its height stay; it is 1 to 1.3 times as much, since two halves hold 2 x 0.65 of the light.
+        """The image keeps its middle and its height; it gets up to 1.3 times as bright: halves hold 2 x 0.65 of it.
 
         Where they overlap, in the middle, one hides a part of the other: less light, and more of it outside. So the
         variance is at least that of their sum, offset^2 + shrink^2 of what it was, and below what it was.
@@ -111,7 +111,7 @@ class TestSplit:
 
 class TestHidden:
     def test_those_that_show_least(self):
-        """Of 100, at most 5: 1 + 1 + 2 are 4, and the next would make it 14."""
+        """At most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
         shares = np.array([50.0, 1.0, 10.0, 2.0, 36.0, 1.0])
         assert np.flatnonzero(hidden(shares, 0.05)).tolist() == [1, 3, 5]
         assert np.flatnonzero(hidden(shares, 0.01)).tolist() == [1]  # of the equal ones, the first

@@ -90,7 +90,7 @@ class TestProgress:
         assert fit.report["iterations"] == 0
 
     def test_positions_come_to_rest(self, device, views):
-        """With a last rate far below the first, late steps move them far less than early ones."""
+        """Late steps move them far less than early ones, with a last rate far below the first."""
         rates = LearningRates(1e-3, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0)
         options = few_steps(normal_iterations=200, rates=rates, sampling_filter=False)
         fitter = fitter_of(views, ball_cloud(40), options, device)
@@ -164,7 +164,7 @@ class TestRowsWithoutAGaussian:
         assert fitter.report()["gaussians"] == len(fitter.parameters.cloud()) == 60
 
     def test_the_start_does_not_call_them_back(self, device, views):
-        """What was dropped is held to the start no more, nor is the half that took its row."""
+        """A dropped Gaussian is no longer held to the start, nor is the half that took its row."""
         options = few_steps(
             gaussian_count=150,
             normal_iterations=60,

@@ -65,7 +65,7 @@ class TestViews:
 
     @pytest.mark.parametrize("stops", [-1.0, 1.0])
     def test_each_wrong_view_is_found_and_undone(self, seen, stops):
-        """Of the gain that was put in, what is left is what the view was off by before: below what is reported."""
+        """A gain that was put in is found but for what the view was off by before, which is below what is reported."""
         views, cloud, normals = seen
         for index in range(len(views)):
             wrong = list(views)

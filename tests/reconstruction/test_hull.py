@@ -71,7 +71,7 @@ class TestSilhouettes:
 
 
 def widest(views, unit):
-    """How far a hull may reach along unit vectors, of a ball of radius 1.
+    """Reach of a hull along unit vectors, of a ball of radius 1, at most.
 
     A view's cone touches the ball on the circle of directions at acos(R / D) from the camera's. Along a direction at
     the angle e from the nearest of those the tangent plane there is met at 1 / cos(e).
@@ -86,7 +86,7 @@ def widest(views, unit):
 
 
 def slack(hull, views):
-    """How far masks and voxels may move the surface [m]: the edge's error at the ball, and a part of a voxel.
+    """Distance by which masks and voxels may move the surface [m]: the edge's error at the ball, and a part of a voxel.
 
     Interpolated between points at a pixel's distance, where the distances' own error is largest (1.41 to 1), a crossing
     moves by 0.09 voxel.

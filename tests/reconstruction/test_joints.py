@@ -59,7 +59,7 @@ class TestSelection:
         assert (rows < 10_000).all()
 
     def test_second_object(self, rng):
-        """What is apart, but a surface itself, is not isolated."""
+        """A surface apart from the others is not isolated."""
         ball = 0.1 * sphere(rng, 200) + np.array([3.0, 0, 0])
         rows = select_joints(np.concatenate([sphere(rng, 10_000), ball]), 1000)
         assert 1 <= (rows >= 10_000).sum() <= 50

@@ -21,7 +21,7 @@ def parameters_of(cloud, device, **options):
 
 
 def random_gradients(rng, parameters):
-    """As a rasteriser writes them."""
+    """Random gradients as a rasteriser writes them."""
     count, bands = parameters.radiance.shape
     kinds = (("positions", wp.vec3, (3,)), ("orientations", wp.quat, (4,)), ("scales", wp.vec3, (3,)))
     arrays = {

@@ -203,7 +203,7 @@ class Twin:
     ],
 )
 def test_the_gradient_of_a_step_is_that_of_its_loss(device, samples, weights):
-    """From photographs to what is moved: encoding, samples, four terms, rasteriser, activation, all at once.
+    """Encoding, samples, four terms, rasteriser and activation at once: from photographs to the parameters.
 
     1e-5 of every gradient's length is the goal that all gradients here have; 3.5e-6 was the most in twelve scenes.
     """
@@ -248,7 +248,7 @@ def test_terms_that_count_nothing_ask_for_nothing(device):
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (16, 33)])
 @pytest.mark.parametrize("samples", [1, 2])
 def test_small_images(device, rng, size, samples):
-    """What a reduction leaves of small photographs: every loss and gradient is finite."""
+    """Every loss and gradient of small, reduced photographs is finite."""
     target = wp.get_device(device)
     parameters = GaussianParameters(near_cloud(rng), target)
     targets = ViewTargets([random_view(rng, camera_of(*size))], 6, RASTER, samples, target)

@@ -18,7 +18,7 @@ from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, b
 CAMERAS = rig()
 
 PIXEL = 2.5 / CAMERAS[0].focal_x
-"""What a pixel is wide at the ball [m]."""
+"""Width of a pixel at the ball [m]."""
 
 REFINEMENT = replace(TrackOptions().refinement, normal_iterations=40, samples=1)
 

@@ -26,7 +26,7 @@ def upload(array, device):
 
 
 def strided(array, device, columns=7):
-    """The same image as some channels of wider rows, as a rasteriser has it."""
+    """Upload an image as some channels of wider rows, as a rasteriser has it."""
     wide = np.full((*array.shape[:2], columns), np.nan, np.float32)
     wide[..., 2 : 2 + array.shape[2]] = array
     return upload(wide, device)[:, :, 2 : 2 + array.shape[2]]
@@ -103,7 +103,7 @@ class TestImages:
 
 
 def test_gradients_are_central_differences(device, rng):
-    """Of the float64 curve, whose step at the knee no difference reaches: means stay 1e-3 of it away."""
+    """Differences of the float64 curve do not reach its step at the knee: means stay 1e-3 of it away."""
     samples = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (6, 8, 3))).astype(np.float32)
     values = means(samples, 2)
     samples[0::2, 0::2][np.abs(values / KNEE - 1.0) < 0.1] += 1e-3
