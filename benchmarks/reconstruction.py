@@ -1,4 +1,4 @@
-"""How good a reconstruction is, how it holds while it tracks, and how long it takes.
+"""Quality of a reconstruction, its loss over tracked frames, and its time.
 
     python benchmarks/reconstruction.py [--device cuda:0] [--data DIR] [--out results.json] [--only SECTION] [--quick]
 
@@ -56,23 +56,23 @@ TARGETS = {
     "normals_median_degrees": (6.0, "at most"),
     "chamfer_mm": (2.0, "at most"),
 }
-"""Of the first frame; PSNR in the subject's box, and of whole images."""
+"""Targets of the first frame: PSNR in the subject's box, and of whole images."""
 
 LARGEST_LOSS = {"psnr": 1.0, "chamfer_mm": 1.0}
-"""By how much the last frame may be worse."""
+"""Largest loss of the last frame."""
 
 PAPER = {"psnr_20_cameras": 34.56, "psnr_30_cameras": 38.40}
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """Amount that is measured.
 
     Attributes:
-        gaussians: Of every measurement but the ablation over them.
+        gaussians: Gaussians of every measurement but the ablation over them.
         counts: Gaussians of that ablation.
         cameras: Cameras of the other one.
-        large_gaussians: Of the capture at full resolution.
+        large_gaussians: Gaussians of the capture at full resolution.
         large_size: Its images.
         large_views: Its training cameras.
         large_frames: Its frames.
@@ -125,11 +125,11 @@ QUICK = Effort(
 
 @dataclass(frozen=True)
 class Bench:
-    """What sections share.
+    """Arguments that all sections share.
 
     Attributes:
         capture: The capture with truth.
-        effort: How much is measured.
+        effort: Amount that is measured.
         make: Makes contenders.
         device: Where they run.
         say: Hears what is being done.

@@ -1,4 +1,4 @@
-"""What reconstructs in the reconstruction benchmark: the only place where it calls fitting, tracking and meshing.
+"""The contenders of the reconstruction benchmark: the only place where it calls fitting, tracking and meshing.
 
 Settings of others are ours run with their choices where these can be made here: they say what the choices are worth,
 not how fast other people's programs are.
@@ -26,7 +26,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 class StepsLike(Protocol):
-    """How the Gaussians of a frame are found; see `beam_warp.reconstruction.job.FrameSteps`."""
+    """Steps that find the Gaussians of a frame; see `beam_warp.reconstruction.frames.protocols.FrameSteps`."""
 
     def begin(self, views: Sequence[CapturedView], progress: Any) -> tuple[Any, dict[str, Any]]:
         """Fit a key frame."""

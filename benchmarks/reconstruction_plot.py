@@ -23,7 +23,7 @@ MEASURES: tuple[tuple[str, Callable[[Row], float], float | None], ...] = (
     ("normals, median error [°]", lambda row: row["normals_median_degrees"], 6.0),
     ("Chamfer distance [mm]", lambda row: row["surface"]["chamfer_mm"], 2.0),
 )
-"""What is drawn over either ablation: a title, the value, and what was wanted."""
+"""Curves drawn over either ablation: a title, the value, and what was wanted."""
 
 
 def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How well do joints carry a surface whose motion is known, and what do their number, reach, blend and normals change?
+"""How well joints carry a surface whose motion is known, and what their number, reach, blend and normals change.
 
     python benchmarks/skinning.py [--capture walker] [--skins 40000] [--device cpu] [--out FILE.json]
 
@@ -24,9 +24,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from beam_warp.device.arrays import device_label, resolve_device
-from beam_warp.reconstruction.joint_selection import select_joints
-from beam_warp.reconstruction.joints import JointGraph, joint_spacing, nearest_joints, proximity_weights, stretch
-from beam_warp.reconstruction.skinning import Anchors, Skin
+from beam_warp.reconstruction.joints.graph import (
+    JointGraph,
+    joint_spacing,
+    nearest_joints,
+    proximity_weights,
+    torn_fraction,
+)
+from beam_warp.reconstruction.joints.selection import select_joints
+from beam_warp.reconstruction.joints.skinning import Anchors, Skin
 
 AROUND = 40
 """Points that a joint's true rotation is fitted to."""
@@ -81,7 +87,7 @@ def measure(folder: Path, skin_count: int, device: Any) -> dict[str, Any]:
         for cosine in (None, -0.2, 0.2, 0.5):
             facing = (None, None) if cosine is None else (normals, normals[joints])
             graph = JointGraph.build(rest, normals=facing[1], smallest_cosine=cosine or 0.0)
-            edges = stretch(graph, rest, after[joints])
+            torn = torn_fraction(graph, rest, after[joints])
             for reach in (1.0, 1.5, 2.0):
                 nearest, squared = nearest_joints(before, rest, 8, *facing, cosine or 0.0)
                 spacing = joint_spacing(rest, facing[1], cosine or 0.0)
@@ -97,7 +103,7 @@ def measure(folder: Path, skin_count: int, device: Any) -> dict[str, Any]:
                         "rms_mm": float(np.sqrt((error**2).mean())),
                         "median_mm": float(np.median(error)),
                         "p99_mm": float(np.quantile(error, 0.99)),
-                        "torn": edges.torn,
+                        "torn": torn,
                         "spacings_squared_per_area": joint_count * spacing**2 / area,
                         **times,
                     }

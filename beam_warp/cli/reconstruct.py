@@ -14,7 +14,8 @@ from beam_warp.cli.console import print_json, progress
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
-    from beam_warp.reconstruction.job import FrameSteps, Part, ReconstructOptions
+    from beam_warp.reconstruction.frames.protocols import FrameSteps
+    from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare
 
 
 @dataclass(frozen=True)
@@ -154,15 +155,15 @@ def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(found)
 
 
-def part_of(words: str) -> Part:
+def part_of(words: str) -> SegmentShare:
     """Return the part that ``I/N`` asks for.
 
     Raises:
         InvalidOptionError: It is none.
     """
-    from beam_warp.reconstruction.job import Part
+    from beam_warp.reconstruction.job import SegmentShare
 
     number, slash, count = words.partition("/")
     if not (slash and number.isdecimal() and count.isdecimal()):
         raise InvalidOptionError(f"part must be I/N with 1 <= I <= N, got {words}. Write 2/4 for the second of four.")
-    return Part(int(number), int(count))
+    return SegmentShare(int(number), int(count))

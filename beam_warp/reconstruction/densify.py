@@ -1,4 +1,4 @@
-"""Which Gaussians are dropped and which are split, under a budget: rows of the dead are given to the strained."""
+"""Dropping and splitting of Gaussians: second halves take the rows of those that were dropped."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from beam_warp.reconstruction.parameters import DEAD_LOGIT
 
 SPLIT_OFFSET = 0.6
-"""Halves of a split Gaussian lie that many of its longest deviations to either side of its centre."""
+"""Distance of either half of a split Gaussian from its centre, in its longest deviations."""
 
 SPLIT_SHRINK = 0.65
-"""And their longest deviation is this part of it: variance offset^2 + shrink^2 is 0.8 of what it was, for halves are
-composited over one another and so look wider than their sum."""
+"""Longest deviation of a half, as a part of the longest of the split Gaussian: variance offset^2 + shrink^2 is 0.8 of
+what it was, for halves are composited over one another and so look wider than their sum."""
 
 
 def prune(rows: dict[str, NDArray[Any]], unused: NDArray[np.bool_]) -> None:
-    """Make rows wait for a Gaussian, in place."""
+    """Remove the Gaussians of some rows, in place: the rows wait for another."""
     rows["logits"][unused] = DEAD_LOGIT
     rows["orientations"][unused] = 0.0
     rows["radiance"][unused] = 0.0
@@ -54,11 +54,58 @@ def hidden(shares: NDArray[np.floating], part: float) -> NDArray[np.bool_]:
     return result
 
 
-def choose_strained(stress: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
-    """Return the rows of largest stress among those that may be split, at most ``count``; ties by row."""
-    candidates = np.flatnonzero(eligible & (stress > 0.0))
-    order = np.argsort(-stress[candidates], kind="stable")
+def largest_gradients(gradients: NDArray[np.floating], eligible: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Return the rows of largest gradients among those that may be split, at most ``count``; ties by row.
+
+    Args:
+        gradients: Mean length of the gradients of each row's position, ``(N,)``; rows of 0 and NaN are not chosen.
+        eligible: Which rows may be split, ``(N,)``.
+        count: Most rows.
+    """
+    candidates = np.flatnonzero(eligible & (gradients > 0.0))
+    order = np.argsort(-gradients[candidates], kind="stable")
     return candidates[order[:count]]
+
+
+def refine(
+    rows: dict[str, NDArray[Any]],
+    alive: NDArray[np.bool_],
+    unwanted: NDArray[np.bool_],
+    gradients: NDArray[np.floating],
+    split_fraction: float,
+) -> NDArray[np.bool_]:
+    """Drop Gaussians and split others into free rows, in place; return which rows changed, ``(N,)``.
+
+    Args:
+        rows: As `beam_warp.reconstruction.parameters.GaussianParameters.rows` returns them.
+        alive: Which rows hold a Gaussian, ``(N,)``.
+        unwanted: Which of those are dropped, ``(N,)``; none where it would be all of them.
+        gradients: As for `largest_gradients`.
+        split_fraction: Most of the remaining Gaussians that are split.
+    """
+    if unwanted.sum() == alive.sum():  # nothing to go on from
+        unwanted = np.zeros_like(unwanted)
+    prune(rows, unwanted)
+    alive = alive & ~unwanted
+    free = np.flatnonzero(~alive)
+    most = min(len(free), int(np.ceil(split_fraction * alive.sum())))
+    sources = largest_gradients(gradients, alive, most)
+    targets = free[: len(sources)]
+    split(rows, sources, targets)
+    changed = unwanted.copy()
+    changed[sources] = changed[targets] = True
+    return changed
+
+
+def with_more_rows(
+    rows: dict[str, NDArray[Any]], gradients: NDArray[np.floating], count: int
+) -> dict[str, NDArray[Any]]:
+    """Return rows of Gaussians with those of largest gradients split, ``count`` in all, at most twice as many."""
+    present = len(gradients)
+    sources = largest_gradients(gradients + 1e-30, np.ones(present, bool), max(count - present, 0))
+    grown = {name: np.concatenate([array, array[sources]]) for name, array in rows.items()}
+    split(grown, sources, present + np.arange(len(sources)))
+    return grown
 
 
 def _rotate(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""How far tracked Gaussians slip over a surface whose points are known in every frame."""
+"""Drift: the slip of tracked Gaussians over a surface whose points are known in every frame."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Drift:
-    """How far things are from where the true surface carried them, in one frame [mm].
+    """Distances of points from where the true surface carried them, in one frame [mm].
 
     Attributes:
         mean_mm: Mean distance.
-        median_mm: Half are closer.
-        p95_mm: 95 % are closer.
-        count: Of how many.
+        median_mm: Median distance.
+        p95_mm: Distance below which 95 % are.
+        count: Number of points.
     """
 
     mean_mm: float
@@ -55,11 +55,12 @@ class Drift:
 
 @dataclass(frozen=True)
 class FrameDrift:
-    """What tracking did up to one frame.
+    """Drift from the first frame to another one.
 
     Attributes:
-        gaussians: Gaussians, from where the triangle they were next to in the first frame carried them.
-        vertices: Vertices of the true mesh, from where the Gaussians around them in the first frame carried them.
+        gaussians: Distances of Gaussians from where the triangle next to them in the first frame carried them.
+        vertices: Distances of the true mesh's vertices from where the Gaussians around them in the first frame carried
+            them.
         followed: Part of the first frame's Gaussians whose identity is still there, in [0, 1].
     """
 

@@ -1,18 +1,17 @@
-"""The first frame: Gaussians that look like the photographs of a moment, with the geometry that these imply.
+"""Fitting of key frames: Gaussians that look like the photographs of a moment, with the geometry that these imply.
 
 Steps look at one view each. The discs of a visual hull are moved until renders agree with the photographs in colour,
 structure and coverage, and the Gaussians' normals with those of the depth that they draw. Every so many steps those
-that nobody sees are dropped, and those that the images pull at most are split into their places: their number stays
-within a budget.
+that no view sees are dropped, and those of largest position gradients are split into their places: the number of
+Gaussians stays within a budget.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -20,49 +19,41 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
-from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidArrayError
-from beam_warp.kernels.reconstruction.pull import launch_add_stress
+from beam_warp.kernels.reconstruction.gradient_lengths import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
-from beam_warp.raster.records import GaussianGradients, RasterOptions
-from beam_warp.reconstruction.densify import choose_strained, hidden, prune, split
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.initial import DISC_WIDTH
-from beam_warp.reconstruction.motion_losses import TemporalLoss
 from beam_warp.reconstruction.parameters import GaussianParameters
-from beam_warp.reconstruction.regularizers import AnisotropyLoss, OpacityLoss
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
+from beam_warp.reconstruction.temporal import TemporalTerms
 from beam_warp.world.gaussians import GaussianCloud
 
 PRESETS = ("fast", "draft", "paper", "rade")
 
 FIT_RASTER = RasterOptions(antialiased=True, low_pass=0.1)
-"""How splats are drawn while they are fitted, and should be afterwards: the pixel filter's variance is about that of
-a pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
+"""Raster options of splats while they are fitted, and afterwards: the pixel filter's variance is about that of a
+pixel's area, 1/12, and what is smaller than a pixel keeps its light."""
 
 NO_PSNR = 120.0
-"""What is said where there is nothing to meet [dB]."""
+"""PSNR that is reported where no view shows the subject [dB]."""
 
 PROGRESS_EVERY = 50
-"""Steps from one report of progress, and change of the learning rates, to the next."""
+"""Steps between two reports of progress, and between two changes of the learning rates."""
 
 RENEW_EVERY = 250
-"""Most steps between looks whether the Gaussians still find room, and the sampling filter fits them."""
+"""Most steps between two updates of the room for splats and of the sampling filter."""
 
 LEAST_GAIN = 0.15
-"""Gain of twice as many Gaussians below which more of them do not pay [dB]."""
+"""Least gain of PSNR for which the number of Gaussians is doubled again [dB]."""
 
 FEWEST_GAUSSIANS = 2_000
-"""Where a search for a number of Gaussians begins, at least."""
-
-
-class FitProgress(Protocol):
-    """Hears how far a fit is."""
-
-    def __call__(self, done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
-        """Take ``done`` of ``total`` steps; facts: ``psnr`` [dB], ``gaussians``."""
+"""Fewest Gaussians with which a fit to a target PSNR begins."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +61,14 @@ class LearningRates:
     """Sizes of steps, each in the units of what is moved.
 
     Attributes:
-        positions: In distances of the cameras from the subject.
-        orientations: Of quaternions.
-        scales: Of logarithms.
-        opacities: Of logits.
-        color: Of the spherical harmonics' band 0.
-        bands: Of all other bands.
+        positions: Rate of positions, in distances of the cameras from the subject.
+        orientations: Rate of quaternions.
+        scales: Rate of the logarithms of scales.
+        opacities: Rate of the logits of opacities.
+        color: Rate of the spherical harmonics' band 0.
+        bands: Rate of all other bands.
         final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
-        final_others: The same of all other rates.
+        final_others: Part of all other rates that is left at the end, likewise.
 
     Raises:
         InvalidOptionError: A rate is negative or no number.
@@ -100,22 +91,20 @@ class LearningRates:
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """How Gaussians are fitted to the photographs of one moment.
+    """Options of fitting Gaussians to the photographs of one moment.
 
     Attributes:
         gaussian_count: Most Gaussians there may be.
         target_psnr: Begin with few Gaussians and double them until the views are met so well [dB], or doubling gains
             less than `LEAST_GAIN`, or there are as many as allowed; None for all of them at once.
         color_iterations: Steps without the term of normals.
-        normal_iterations: Steps with it.
-        weights: What the terms count.
+        normal_iterations: Steps with the term of normals, after those.
+        weights: Weights of the terms.
         rates: Sizes of steps.
-        sh_degree: Of the captured radiance.
+        sh_degree: Degree of the captured radiance.
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
-        anisotropy: Weight of needles (`AnisotropyLoss`).
-        opacity: Weight of opacity (`OpacityLoss`).
         temporal: Weight of changes against the start, for the frames after the first (E_temp).
         refine_every: Steps from one refinement to the next; 0 for none.
         refine_until: Part of all steps after which there is none.
@@ -139,8 +128,6 @@ class FitOptions:
     samples: int | Literal["auto"] = "auto"
     raster: RasterOptions = FIT_RASTER
     sampling_filter: bool = True
-    anisotropy: float = 0.0
-    opacity: float = 0.0
     temporal: float = 0.0
     refine_every: int = 250
     refine_until: float = 0.6
@@ -161,8 +148,7 @@ class FitOptions:
             require_count("samples", self.samples, 1, 8)
         for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
-        for name in ("anisotropy", "opacity", "temporal"):
-            require_number(name, getattr(self, name), 0.0)
+        require_number("temporal", self.temporal, 0.0)
 
     @classmethod
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
@@ -210,11 +196,11 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What came out of a fit.
+    """The result of a fit.
 
     Attributes:
         cloud: Gaussians with scene-linear radiance and ids.
-        report: What was done and how well it went, JSON-able: ``psnr`` of the training views' crops [dB], lowest
+        report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest
             ``view_psnr``, ``gaussians``, ``iterations``, ``samples``, ``seconds``; ``growth`` with a target.
     """
 
@@ -228,17 +214,13 @@ def mean_psnr(psnr: NDArray[np.float64]) -> float:
     return float(known.mean()) if len(known) else NO_PSNR
 
 
-def no_fit_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
-    """Report to nobody."""
-
-
 def fit_gaussians(
     views: Sequence[CapturedView],
     start: GaussianCloud,
     options: FitOptions | None = None,
     *,
     device: str | None = None,
-    progress: FitProgress = no_fit_progress,
+    progress: StepProgress = no_step_progress,
 ) -> Fit:
     """Fit Gaussians to the photographs of one moment.
 
@@ -276,7 +258,7 @@ def fit_gaussians(
 
 
 def _grow(
-    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: FitProgress
+    views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any, progress: StepProgress
 ) -> tuple[Fitter, dict[str, Any]]:
     """Fit few Gaussians, and twice as many from there, until more do not pay."""
     wanted = options.target_psnr
@@ -337,16 +319,14 @@ class Fitter:
             "bands": rates.bands,
         }
         self._adam: Adam = self.parameters.optimizer(self._rates)
-        self._stress = wp.zeros(count, dtype=float, device=device)
-        self._seen = wp.zeros(count, dtype=float, device=device)
-        self._anisotropy = AnisotropyLoss(count, device=device)
-        self._opacity = OpacityLoss(count, device=device)
-        self._temporal = _Anchored(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._gradient_sums = wp.zeros(count, dtype=float, device=device)
+        self._gradient_counts = wp.zeros(count, dtype=float, device=device)
+        self._temporal = TemporalTerms(self.parameters, spacing) if options.temporal > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._taken = 0
 
-    def run(self, progress: FitProgress = no_fit_progress) -> None:
+    def run(self, progress: StepProgress = no_step_progress) -> None:
         """Take all steps."""
         chosen = self.options
         total = chosen.color_iterations + chosen.normal_iterations
@@ -374,7 +354,7 @@ class Fitter:
         progress(total, total, facts)
 
     def report(self) -> dict[str, Any]:
-        """Return what was done and how well it went, JSON-able."""
+        """Return what was done, and the PSNR of the views, JSON-able."""
         psnr = self.psnr()
         return {
             "psnr": mean_psnr(psnr),
@@ -395,25 +375,23 @@ class Fitter:
         return self._targets.gaps(self.parameters.drawn)
 
     def doubled(self, count: int) -> GaussianCloud:
-        """Return what was fitted with the most strained Gaussians split, ``count`` in all."""
-        rows = self.parameters.rows()
+        """Return what was fitted with the Gaussians of largest gradients split, ``count`` in all."""
         alive = self.parameters.alive()
-        rows = {name: array[alive] for name, array in rows.items()}
-        present = int(alive.sum())
-        stress = (self._stress.numpy() / np.maximum(self._seen.numpy(), 1.0))[alive]
-        strained = choose_strained(stress + 1e-30, np.ones(present, bool), max(count - present, 0))
-        grown = {name: np.concatenate([array, array[strained]]) for name, array in rows.items()}
-        split(grown, strained, present + np.arange(len(strained)))
-        orientations = grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True)
+        rows = {name: array[alive] for name, array in self.parameters.rows().items()}
+        grown = with_more_rows(rows, self._mean_gradients()[alive], count)
         return GaussianCloud(
             positions=grown["positions"],
-            orientations=orientations,
+            orientations=grown["orientations"] / np.linalg.norm(grown["orientations"], axis=1, keepdims=True),
             scales=np.exp(grown["log_scales"]),
             opacities=(1.0 / (1.0 + np.exp(-grown["logits"]))).astype(np.float32),
             radiance=grown["radiance"],
             radiance_color_space=self.parameters.cloud().radiance_color_space,
             ids=np.arange(len(grown["positions"])),
         )
+
+    def _mean_gradients(self) -> NDArray[np.float32]:
+        """Return the mean length of each row's position gradients since the last refinement, ``(N,)``."""
+        return self._gradient_sums.numpy() / np.maximum(self._gradient_counts.numpy(), 1.0)
 
     def _order(self, total: int) -> NDArray[np.int64]:
         """Return which view each step looks at: all of them, shuffled, again and again."""
@@ -441,84 +419,31 @@ class Fitter:
     def _step(self, view: int) -> None:
         """Draw a view, compare, and move the Gaussians."""
         group, index = self._targets[view]
-        parameters, chosen = self.parameters, self.options
+        parameters = self.parameters
         parameters.activate()
         group.select(index)
         group.rasterizer.redraw()
         group.add_losses(index, self._weights)
         drawn = group.rasterizer.backward()
-        launch_add_stress(drawn.positions, self._stress, self._seen, self.device)
-        self._add_regularizers(drawn)
+        launch_add_gradient_lengths(drawn.positions, self._gradient_sums, self._gradient_counts, self.device)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
         if self._temporal is not None:
-            self._temporal.add_gradients(chosen.temporal)
+            self._temporal.add_gradients(self.options.temporal)
         self._adam.step()
 
-    def _add_regularizers(self, drawn: GaussianGradients) -> None:
-        """Add the gradients of terms on what is drawn."""
-        chosen, gaussians = self.options, self.parameters.drawn
-        if chosen.anisotropy > 0.0:
-            self._anisotropy(gaussians.scales, weight=chosen.anisotropy, gradient=drawn.scales)
-        if chosen.opacity > 0.0:
-            self._opacity(gaussians.opacities, weight=chosen.opacity, gradient=drawn.opacities)
-
     def _refine(self) -> None:
-        """Drop Gaussians that are not seen, and split strained ones into their rows."""
+        """Drop Gaussians that are not seen, and split those of large gradients into their rows."""
         chosen = self.options
-        rows = self.parameters.rows()
-        stress, seen = self._stress.numpy(), self._seen.numpy()
-        alive = self.parameters.alive()
+        rows, alive = self.parameters.rows(), self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
-        dead = alive & ~(opacity >= chosen.dead_opacity)
+        unwanted = alive & ~(opacity >= chosen.dead_opacity)
         if chosen.hidden_share > 0.0:
-            dead |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
-        if dead.sum() == alive.sum():  # all of them: nothing to go on from
-            dead[:] = False
-        prune(rows, dead)
-        alive &= ~dead
-        free = np.flatnonzero(~alive)
-        most = min(len(free), int(np.ceil(chosen.split_fraction * alive.sum())))
-        strained = choose_strained(stress / np.maximum(seen, 1.0), alive, most)
-        taken = free[: len(strained)]
-        split(rows, strained, taken)
+            unwanted |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
+        changed = refine(rows, alive, unwanted, self._mean_gradients(), chosen.split_fraction)
         self.parameters.set_rows(rows)
-        changed = dead.copy()
-        changed[strained] = changed[taken] = True
         self._adam.restart(changed)
         if self._temporal is not None:
             self._temporal.hold(changed)
-        self._stress.zero_()
-        self._seen.zero_()
-
-
-class _Anchored:
-    """Terms that hold Gaussians to what they were in the frame before (E_temp)."""
-
-    UNITS: Mapping[str, float] = MappingProxyType({"radiance": 0.1, "log_scales": 0.1, "logits": 0.5})
-
-    def __init__(self, parameters: GaussianParameters, spacing: float) -> None:
-        self._parameters = parameters
-        self._units = {**self.UNITS, "positions": 0.1 * spacing}
-        self._terms = {}
-        for name in self._units:
-            rows = float_rows(getattr(parameters, name))
-            self._terms[name] = (TemporalLoss(rows.shape, device=parameters.device), wp.clone(rows))
-
-    def hold(self, changed: NDArray[np.bool_]) -> None:
-        """Hold rows to what they became: another Gaussian, or none, which would be pulled back to life."""
-        for name, (_, reference) in self._terms.items():
-            held = reference.numpy().copy()
-            held[changed] = float_rows(getattr(self._parameters, name)).numpy()[changed]
-            reference.assign(held)
-
-    def add_gradients(self, weight: float) -> None:
-        for name, (term, reference) in self._terms.items():
-            values, gradients = getattr(self._parameters, name), self._parameters.gradient(name)
-            term(
-                float_rows(values),
-                reference,
-                weight=weight,
-                unit=self._units[name],
-                gradient=float_rows(gradients),
-            )
+        self._gradient_sums.zero_()
+        self._gradient_counts.zero_()

@@ -1,7 +1,7 @@
-"""How bright each view is against the others, by the points of the surface that several of them see.
+"""Exposures of views against each other, by the points of the surface that several of them see.
 
-Before anything is optimised: a fit paints the difference into colours that depend on direction, and little of it is
-left to be found.
+They are found before anything is optimised: a fit paints the difference into colours that depend on direction, and
+little of it is left to be found.
 """
 
 from __future__ import annotations
@@ -18,20 +18,23 @@ from beam_warp.reconstruction.initial import view_samples
 from beam_warp.world.gaussians import GaussianCloud
 
 EXPOSURE_STOPS = 0.3
-"""Exposures further than this from the middle one are said and undone [stop]. Of sound captures (walker, runner, demo
-figure) no view is off by more than 0.11 with 8 cameras or more, 0.19 with 4 or 6. One view that is wrong by half a stop
-is found at 0.40 to 0.55 with 8 or more, whichever it is, one by a stop at 0.72 or more with 4; the others then at 0.28
-at most with 4 and 0.10 with 8 (`docs/reconstruction.md`)."""
+"""Exposures further than this from the middle one are reported and undone [stop].
+
+Of sound captures (walker, runner, demo figure) no view is off by more than 0.11 with 8 cameras or more, 0.19 with 4 or
+6. One view that is wrong by half a stop is found at 0.40 to 0.55 with 8 or more, whichever it is, one by a stop at 0.72
+or more with 4; the others then at 0.28 at most with 4 and 0.10 with 8 (`docs/reconstruction.md`)."""
 
 CLEAR_OF_RESIDUALS = 2.0
-"""Exposures are said only if they are so many times the middle one of the differences that are left: where views share
-few points, at grazing angles or after much motion, these are as large (four cameras, five frames on: 0.69 of 0.47)."""
+"""Exposures are reported only if they are so many times the middle one of the differences that are left.
+
+Where views share few points, at grazing angles or after much motion, these are as large (four cameras, five frames on:
+0.69 of 0.47)."""
 
 LARGEST_SIDE = 320
-"""Views are compared at about so many pixels a side: each sample is the mean of some."""
+"""Pixels of a side at which views are compared, about: each sample is the mean of some."""
 
 MOST_POINTS = 4_096
-"""Gaussians that are compared, evenly chosen: an exposure is the middle of hundreds of samples then."""
+"""Most Gaussians that are compared, evenly chosen: an exposure is the middle of hundreds of samples then."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
@@ -39,7 +42,7 @@ DARKEST = 1e-3
 """Luminance below which a sample is left out: its logarithm is that of noise."""
 
 ROUNDS = 60
-"""Of reweighting, at most."""
+"""Rounds of reweighting, at most."""
 
 SETTLED = 1e-4
 """Change of exposures at which rounds end [stop]."""
@@ -50,7 +53,7 @@ LEAST_RESIDUAL = 0.02
 
 @dataclass(frozen=True, eq=False)
 class ViewGains:
-    """What the views' brightness is against each other.
+    """Brightness of views against each other.
 
     Attributes:
         stops: Exposure of each view over that of the middle one, as a power of two, ``(V,)``; NaN of a view that
@@ -65,7 +68,7 @@ class ViewGains:
 
     @property
     def off(self) -> NDArray[np.bool_]:
-        """Which views' exposure is wrong, ``(V,)``."""
+        """Whether each view's exposure is wrong, ``(V,)``."""
         return np.abs(self.stops) > np.maximum(EXPOSURE_STOPS, CLEAR_OF_RESIDUALS * self.residuals)
 
 
@@ -80,15 +83,15 @@ def view_gains(
     not move the others.
 
     Args:
-        cloud: Near the surface.
-        normals: From which side each Gaussian is seen, ``(N, 3)``; from all where it is 0.
-        views: Of one moment.
+        cloud: Gaussians near the surface.
+        normals: Side from which each Gaussian is seen, ``(N, 3)``; all sides where it is 0.
+        views: Photographs of one moment.
         device: Warp device; None takes the first CUDA device, or the CPU.
 
     Source: iteratively reweighted least squares, Holland and Welsch 1977.
     """
     reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
-    samples = view_samples(reduced, cloud, normals, device=device)
+    samples = view_samples(reduced, cloud, normals, device=device).numpy()
     seen = (samples[..., 3] > 0.0).sum(axis=0)
     picked = samples[:, np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_POINTS)).astype(int)].astype(np.float64)
     luminance, weights = picked[..., :3] @ np.array(LUMINANCE), picked[..., 3]
@@ -99,7 +102,7 @@ def view_gains(
 
 
 def judge_gains(gains: ViewGains, views: Sequence[CapturedView]) -> list[Finding]:
-    """Return what is said of views whose exposure is off, one finding for each."""
+    """Return the findings about views whose exposure is off, one for each."""
     return [
         Finding(
             "warning",
@@ -131,7 +134,7 @@ def agree_exposures(
 
     Args:
         levels: Row by column, a sum of one number for the row and one for the column, mostly, ``(V, N)``.
-        weights: Of each, 0 where there is none, ``(V, N)``.
+        weights: Weight of each level, 0 where there is none, ``(V, N)``.
     """
     shared = (weights > 0.0).sum(axis=0) >= 2
     levels, weights = levels[:, shared], weights[:, shared]

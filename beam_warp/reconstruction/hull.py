@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import trimesh
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from warp.geometry import sparse_marching_cubes_from_cells
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.checks import require_array, require_count, require_finite
+from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device, upload
-from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.reconstruction.silhouettes import launch_measure_silhouette
 from beam_warp.kernels.reconstruction.visual_hull import (
     BLOCK,
     BLOCK_CELLS,
     BLOCK_POINTS,
-    MOST_TOLERATED,
     OUTSIDE,
     SURFACE,
     launch_fill_blocks,
@@ -40,13 +39,13 @@ AUTO_RESOLUTION = (64, 256)
 """Least and most voxels along the longest side where the resolution follows the pixels."""
 
 SEARCH_BLOCKS = 48
-"""Blocks along each side of the box while it is searched for."""
+"""Blocks along the longest side of the box while the box is searched for."""
 
 SEARCH_ROUNDS = 8
 """Most times that the box is drawn closer."""
 
 ENOUGH = 0.8
-"""A round that leaves more than this of the longest side was the last one."""
+"""Part of the longest side above which a round of the search that leaves it is the last."""
 
 SEARCH_SIDE = 320
 """Longest side of the masks [pixel] while the box is searched for: larger ones are reduced by whole factors."""
@@ -64,36 +63,27 @@ class VisualHull:
     """A visual hull.
 
     Attributes:
-        mesh: Its surface [m], closed, faces outward.
-        voxel: Size of the cells that it was found on [m].
-        box: Corners of their grid [m], ``(2, 3)`` float64.
-        used: Names of the views whose masks count.
-        ignored: Names of the views that have no mask, or an empty one.
+        mesh: Surface of the hull [m], closed, faces outward.
+        voxel: Size of the cells that the surface was found on [m].
     """
 
     mesh: trimesh.Trimesh
     voxel: float
-    box: NDArray[np.float64]
-    used: tuple[str, ...]
-    ignored: tuple[str, ...]
 
 
 def visual_hull(
     views: Sequence[CapturedView],
     *,
     resolution: int | Literal["auto"] = "auto",
-    box: ArrayLike | None = None,
-    tolerance: int = 0,
     quorum: int | None = None,
     device: str | None = None,
 ) -> VisualHull:
     """Carve the visual hull out of the views' masks.
 
     A point is inside if every view that sees it (in its image, before its camera) has it inside its silhouette, where
-    coverage is one half; all but ``tolerance`` of them, if some masks are not to be trusted. Parts that a view's image
-    crops away are left to the others, of which a ``quorum`` has to agree: beyond what most cameras look at, a few see
-    nothing but each other's side of the room, where their cones share volume that is no subject's. A view whose mask is
-    empty says nothing and is ignored.
+    coverage is one half. Parts that a view's image crops away are left to the others, of which a ``quorum`` has to
+    agree: beyond what most cameras look at, a few see nothing but each other's side of the room, where their cones
+    share volume that is no subject's. A view whose mask is empty says nothing and is ignored.
 
     Depths in the cones are measured in metres from the silhouettes, to a part of a pixel, and marching cubes runs on
     their minimum: the surface is exact to a part of a voxel but for edges where cones meet, which it cuts by up to one.
@@ -103,9 +93,6 @@ def visual_hull(
         views: At least two with masks, of any sizes.
         resolution: Voxels along the longest side of the box; ``"auto"`` makes them as large as a pixel is at the
             subject, within `AUTO_RESOLUTION`.
-        box: Where to carve, lowest and highest corner [m], ``(2, 3)``; the surface is closed where it cuts. None
-            searches for the hull in what all cameras look at.
-        tolerance: Views that a point may contradict, at most 3.
         quorum: Views that have to see a point inside, at least 2; None for more than half of those with masks.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
@@ -119,7 +106,6 @@ def visual_hull(
 
     Source: Laurentini 1994 (the hull); Lorensen and Cline 1987 (marching cubes).
     """
-    require_count("tolerance", tolerance, 0, MOST_TOLERATED)
     if quorum is not None:
         require_count("quorum", quorum, 2)
     if resolution != "auto":
@@ -132,31 +118,21 @@ def visual_hull(
             f"{_listed(' (no mask, or an empty one: ', ignored)}. Pass views with alpha, or points to start from."
         )
     agreeing = len(used) // 2 + 1 if quorum is None else quorum
-    if box is None:
-        longest = max(max(view.camera.width, view.camera.height) for view in used)
-        lower, upper = _Cones(used, max(longest // SEARCH_SIDE, 1), tolerance, agreeing, target).search()
-    else:
-        lower, upper = _corners(box)
+    longest = max(max(view.camera.width, view.camera.height) for view in used)
+    lower, upper = _Cones(used, max(longest // SEARCH_SIDE, 1), agreeing, target).search()
     side = float((upper - lower).max())
     pixels = _pixels_per_metre(used, 0.5 * (lower + upper))
     count = int(np.clip(round(side * pixels), *AUTO_RESOLUTION)) if resolution == "auto" else resolution
     voxel = side / count
-    if box is None:
-        lower, upper = lower - voxel, upper + voxel  # the grid's outermost points count as outside
+    lower, upper = lower - voxel, upper + voxel  # the grid's outermost points count as outside
     blocks = np.maximum(np.ceil((upper - lower) / (voxel * BLOCK) - 1e-6).astype(int), 1)
     smallest = min(min(view.camera.width, view.camera.height) for view in used)
     factor = int(np.clip(voxel * pixels / VOXEL_PIXELS, 1, smallest))
-    cones = _Cones(used, factor, tolerance, agreeing, target)
+    cones = _Cones(used, factor, agreeing, target)
     mesh = cones.carve(lower, voxel, blocks)
     if mesh.is_empty:
         raise _no_volume(cones, np.stack([lower, upper]))
-    return VisualHull(
-        mesh,
-        voxel,
-        np.stack([lower, lower + voxel * BLOCK * blocks]),
-        tuple(view.name for view in used),
-        tuple(view.name for view in ignored),
-    )
+    return VisualHull(mesh, voxel)
 
 
 def masked_views(views: Sequence[CapturedView]) -> tuple[list[CapturedView], list[CapturedView]]:
@@ -212,32 +188,10 @@ def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]
 
 
 def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
-    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced` but no colour."""
-    camera, alpha = view.camera, np.asarray(view.alpha)
-    if factor == 1:
-        return camera, alpha
-    width, height = camera.width // factor, camera.height // factor
-    blocks = alpha[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    smaller = replace(
-        camera,
-        width=width,
-        height=height,
-        focal_x=camera.focal_x / factor,
-        focal_y=camera.focal_y / factor,
-        center_x=camera.center_x / factor,
-        center_y=camera.center_y / factor,
-    )
-    return smaller, blocks.mean(axis=(1, 3), dtype=np.float32)
-
-
-def _corners(box: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    corners = require_array("box", box, (2, 3), np.float64)
-    require_finite("box", corners)
-    if not (corners[1] > corners[0]).all():
-        raise InvalidOptionError(
-            f"box must hold its lowest and its highest corner, got {corners.tolist()}. Order them along every axis."
-        )
-    return corners[0], corners[1]
+    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced`, without colour."""
+    camera, alpha = view.camera.reduced(factor), np.asarray(view.alpha)
+    whole = alpha[: camera.height * factor, : camera.width * factor]
+    return camera, whole.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3), dtype=np.float32)
 
 
 def _listed(start: str, views: Sequence[CapturedView]) -> str:
@@ -252,11 +206,10 @@ def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
 
 
 class _Cones:
-    """The silhouettes on a device, and what can be asked of them."""
+    """The silhouettes of views on a device: the box that they allow, and the surface inside it."""
 
-    def __init__(self, views: Sequence[CapturedView], factor: int, tolerance: int, quorum: int, device: Any) -> None:
+    def __init__(self, views: Sequence[CapturedView], factor: int, quorum: int, device: Any) -> None:
         self.captured = list(views)
-        self.tolerance = tolerance
         self.quorum = quorum
         self.device = device
         cameras, masks = zip(*(_reduced(view, factor) for view in views), strict=True)
@@ -301,7 +254,6 @@ class _Cones:
             wp.vec3i(*count),
             self.views,
             self.distances,
-            self.tolerance,
             self.quorum,
             states,
             self.device,
@@ -328,7 +280,6 @@ class _Cones:
             wp.vec3i(*count),
             self.views,
             self.distances,
-            self.tolerance,
             self.quorum,
             depths,
             device,
@@ -348,11 +299,11 @@ class _Cones:
 
 
 def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
-    """Say that nothing is left, and which views are to blame where leaving out one is enough."""
+    """Return the error that nothing is left; it names the views of which leaving out one is enough."""
     size, count = _blocks(box)
     views = cones.captured
     left = np.zeros(len(views), np.int64)
-    cones.tolerance, cones.quorum = 0, len(views) - 1
+    cones.quorum = len(views) - 1
     for i in range(len(views) if len(views) > 2 else 0):
         cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=RasterView, device=cones.device)
         left[i] = np.count_nonzero(cones.judge(box[0], size, count) != OUTSIDE)
@@ -362,6 +313,4 @@ def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
         found = f"cones that share no volume unless {' or '.join(blamed)} is left out"
     else:
         found = f"cones that share no volume: {', '.join(view.name for view in views)}"
-    return InvalidArrayError(
-        f"masks must show one subject, got {found}. Correct poses or masks, or raise tolerance or lower quorum."
-    )
+    return InvalidArrayError(f"masks must show one subject, got {found}. Correct poses or masks.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,45 +17,43 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.device.morton import morton_order
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.kernels.reconstruction.even_points import launch_push_apart
-from beam_warp.kernels.reconstruction.seen_colors import launch_agree_colors, launch_sample_colors
+from beam_warp.kernels.reconstruction.even_points import ShadedMesh, launch_push_apart
+from beam_warp.kernels.reconstruction.seen_colors import SeenImage, launch_agree_colors, launch_sample_colors
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
 from beam_warp.reconstruction.hull import masked_views, viewing_focus, visual_hull
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
-
-SH_CONSTANT = 0.28209479177387814
-"""The spherical harmonic of degree 0: colour = 0.5 + SH_CONSTANT * coefficient."""
+from beam_warp.world.harmonics import SH_C0
 
 DISC_WIDTH = 0.7
-"""Standard deviation across a disc, of the spacing: neighbours overlap, so that light does not pass between them."""
+"""Standard deviation across a disc, in spacings: neighbours overlap, so that light does not pass between them."""
 
 DISC_THICKNESS = 0.15
-"""Standard deviation along the normal, of the spacing: a surface to the eye, and room to learn in both directions."""
+"""Standard deviation of a disc along its normal, in spacings: a surface to the eye, with room to learn
+in both directions."""
 
 DISC_OPACITY = 0.8
-"""With discs of `DISC_WIDTH` at each spacing, the alphas over a point add up to 2 pi 0.7^2 0.8 = 2.5: one layer leaves
-less than exp(-2.5) = 8 % of the light, front and back together less than 1 %."""
+"""Opacity of a disc. With discs of `DISC_WIDTH` at each spacing, the alphas over a point add up to 2 pi 0.7^2 0.8 =
+2.5: one layer leaves less than exp(-2.5) = 8 % of the light, front and back together less than 1 %."""
 
 BALL_OPACITY = 0.1
-"""Kerbl et al. 2023: given points may be wrong, and are easily pruned when they start faint."""
+"""Opacity of a ball: given points may be wrong, and are easily pruned when they start faint (Kerbl et al. 2023)."""
 
 HEXAGONAL = (2.0 / np.sqrt(3.0)) ** 0.5
 """Distance of neighbours in the densest arrangement of one point for each unit of area."""
 
 RELAXATIONS = 3
-PUSHES = 2
-"""Times that neighbours are looked up, and that they then push each other: they hardly change from push to push."""
+"""Rounds in which points look up their neighbours and push each other apart."""
 
 NEIGHBORS = 10
 """Points that a point may have to keep away from, itself included: six surround it where all is even."""
 
 HIDING_OPACITY = 0.9
-"""What Gaussians are drawn with to find what hides what: one is enough to be the median surface."""
+"""Opacity with which Gaussians are drawn to find which ones are hidden: one is enough to be the median surface."""
 
 DEPTH_SLACK = 3.0
-"""Largest scales that a Gaussian's centre may lie behind the median surface and still be of it."""
+"""Distance by which a Gaussian's centre may lie behind the median surface and still be seen, in largest scales."""
 
 LEAST_FACING = 0.2
 """Cosine between normal and view below which a view says nothing about a point's colour."""
@@ -127,7 +124,7 @@ def initial_gaussians(
         colors = table[rows]
     return shapes.with_arrays(
         normals=None,
-        radiance=((colors - 0.5) / SH_CONSTANT)[:, None, :],
+        radiance=((colors - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
     )
 
@@ -203,8 +200,10 @@ def even_surface_points(
     weights = np.concatenate([1.0 - root, root * (1.0 - part), root * part], axis=1)[:, :, None]
     spacing = float(np.sqrt(ends[-1] / count))
 
-    surface = wp.Mesh(upload(vertices, wp.vec3, target), upload(faces.ravel(), int, target))
-    shading = upload(vertex_normals, wp.vec3, target)
+    triangles = wp.Mesh(upload(vertices, wp.vec3, target), upload(faces.ravel(), int, target))
+    surface = ShadedMesh()
+    surface.mesh, surface.faces = triangles.id, triangles.indices
+    surface.normals = upload(vertex_normals, wp.vec3, target)
     positions = upload((weights * corners[face]).sum(axis=1), wp.vec3, target)
     normals = (weights * vertex_normals[faces[face]]).sum(axis=1)
     normals = upload(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300), wp.vec3, target)
@@ -213,7 +212,7 @@ def even_surface_points(
         found = cKDTree(places, balanced_tree=False).query(places, k=min(NEIGHBORS, count), workers=-1)[1]
         neighbors = upload(found.reshape(count, -1).astype(np.int32), int, target)
         moved, turned = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
-        launch_push_apart(positions, normals, neighbors, HEXAGONAL * spacing, surface, shading, moved, turned, target)
+        launch_push_apart(positions, normals, neighbors, HEXAGONAL * spacing, surface, moved, turned, target)
         positions, normals = moved, turned
     return positions.numpy(), normals.numpy(), spacing
 
@@ -223,7 +222,7 @@ def seen_colors(
 ) -> NDArray[np.float32]:
     """Return the colour of every Gaussian that most of the views that see it agree on.
 
-    What hides what is found by drawing the Gaussians. Those that no view sees take the colour of the nearest seen one;
+    Drawing the Gaussians shows which ones are hidden. Those that no view sees take the colour of the nearest seen one;
     grey if none is.
 
     Args:
@@ -236,7 +235,8 @@ def seen_colors(
     """
     target = resolve_device(device)
     count = len(cloud)
-    samples = _samples(views, cloud, np.zeros((count, 3)) if cloud.normals is None else cloud.normals, target)
+    normals = np.zeros((count, 3)) if cloud.normals is None else cloud.normals
+    samples = view_samples(views, cloud, normals, device=device)
     colors = wp.empty(count, dtype=wp.vec3, device=target)
     seen = wp.empty(count, dtype=int, device=target)
     launch_agree_colors(samples, colors, seen, target)
@@ -250,27 +250,20 @@ def seen_colors(
 
 def view_samples(
     views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], *, device: str | None = None
-) -> NDArray[np.float32]:
-    """Return what each view shows of every Gaussian.
+) -> wp.array:
+    """Return the colour of every Gaussian in each view, on the device.
 
     Args:
         views: What the cameras saw.
         cloud: Gaussians.
-        normals: From which side each is seen, ``(N, 3)``; from all where it is 0.
+        normals: Side from which each Gaussian is seen, ``(N, 3)``; all sides where it is 0.
         device: Warp device; the first GPU without, or the CPU where there is none.
 
     Returns:
         Scene-linear Rec.709, not premultiplied, and a weight in [0, 1], 0 where the view does not see the Gaussian:
-        ``(V, N, 4)`` float32.
+        ``(V, N)`` vec4.
     """
-    return _samples(views, cloud, normals, resolve_device(device)).numpy()
-
-
-def _samples(
-    views: Sequence[CapturedView], cloud: GaussianCloud, normals: NDArray[np.floating], target: Any
-) -> wp.array:
-    """Return what each view shows of every Gaussian, on the device."""
-    count = len(cloud)
+    target, count = resolve_device(device), len(cloud)
     gaussians = GaussianArrays(
         upload(cloud.positions, wp.vec3, target),
         upload(cloud.orientations, wp.quat, target),
@@ -284,19 +277,12 @@ def _samples(
         pixels = view.camera.width * view.camera.height
         alpha = np.ones(pixels, np.float32) if view.alpha is None else view.alpha.reshape(-1)
         images = Rasterizer(count, [view.camera], device=target).draw(gaussians)
-        launch_sample_colors(
-            gaussians.positions,
-            directions,
-            ViewLayout.of([view.camera]).views[0],
-            upload(view.color.reshape(-1, 3), wp.vec3, target),
-            upload(alpha, float, target),
-            images.median_depth,
-            slack,
-            LEAST_FACING,
-            row,
-            samples,
-            target,
-        )
+        image = SeenImage()
+        image.view = ViewLayout.of([view.camera]).views[0]
+        image.color = upload(view.color.reshape(-1, 3), wp.vec3, target)
+        image.alpha = upload(alpha, float, target)
+        image.depth = images.median_depth
+        launch_sample_colors(gaussians.positions, directions, image, slack, LEAST_FACING, row, samples, target)
     return samples
 
 

@@ -1,4 +1,4 @@
-"""Coarse motion: where joints must be for the Gaussians that they carry to look like the next photographs."""
+"""Coarse motion: joints are moved until the Gaussians that they carry look like the next photographs."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.reconstruction.joints import JointGraph
-from beam_warp.reconstruction.motion_losses import RigidityLoss
-from beam_warp.reconstruction.skinning import BLENDS, Anchors, Skin
+from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.rigidity import RigidityLoss
+from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
 from beam_warp.reconstruction.targets import LossWeights, TargetSet
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -30,8 +30,8 @@ class JointPose:
     """Poses of all joints.
 
     Attributes:
-        rotations: Against the frame before, quaternions xyzw, ``(M, 4)`` float32.
-        positions: ``(M, 3)`` float32 [m].
+        rotations: Rotations against the frame before, quaternions xyzw, ``(M, 4)`` float32.
+        positions: Positions, ``(M, 3)`` float32 [m].
     """
 
     rotations: NDArray[np.float32]
@@ -40,16 +40,16 @@ class JointPose:
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions:
-    """How joints are moved.
+    """Options of moving joints.
 
     Attributes:
         levels: Reductions of the images, coarse to fine: the coarser, the further a motion is found.
         iterations: Steps at each of them.
-        weights: What the images' terms count.
-        rigidity: What motion that is not rigid around each joint counts at full resolution (E_smooth); on reduced
-            images as many times less as these have fewer pixels: stiff joints turn too slowly for what is far away.
+        weights: Weights of the images' terms.
+        rigidity: Weight of motion that is not rigid around each joint, at full resolution (E_smooth); on reduced images
+            as many times less as these have fewer pixels: stiff joints turn too slowly for what is far away.
         rotation_rate: Size of steps of quaternions at full resolution; at others as many times as they are reduced.
-        position_rate: Likewise, in distances between joints.
+        position_rate: Size of steps of positions, likewise, in distances between joints.
         final_rate: Part of both that is left at the end of each level.
         blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
 
@@ -98,10 +98,10 @@ class JointTracker:
         """Bring the frame before to a device.
 
         Args:
-            cloud: Its Gaussians.
-            anchors: Of the Gaussians to the joints.
-            graph: Of the joints.
-            joints: Where they were, ``(M, 3)``.
+            cloud: Gaussians of the frame before.
+            anchors: Anchors of the Gaussians to the joints.
+            graph: Graph of the joints.
+            joints: Positions of the joints in the frame before, ``(M, 3)``.
             options: See `JointOptions`.
             raster: How splats are drawn.
             device: Warp device.
@@ -137,7 +137,7 @@ class JointTracker:
             views: The photographs.
             start: Poses to begin with.
             samples: Side of the square of samples of a pixel at full resolution.
-            seed: Of the order of views.
+            seed: Seed of the order of views.
         """
         chosen = self._options
         wp.copy(self._rotations, upload(start.rotations, wp.quat, self.device))

@@ -1,4 +1,4 @@
-"""Gaussians as an optimiser moves them: raw arrays on a device, what is drawn of them, and gradients back to them."""
+"""Gaussians as an optimiser moves them: raw arrays on a device, the splats drawn from them, and their gradients."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from beam_warp.raster.records import GaussianArrays, GaussianGradients
 from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
 
 SMALLEST_SCALE = 1e-7
-"""What a thickness of 0 is moved from [m]."""
+"""Scale from which a scale of 0 is moved [m]."""
 
 LOGIT_LIMIT = 9.0
-"""Opacities of 0 and 1 are moved from sigmoid(-9) and sigmoid(9)."""
+"""Largest logit of an opacity: those of 0 and 1 are moved from sigmoid(-9) and sigmoid(9)."""
 
 DEAD_LOGIT = -30.0
 """Logit of a row that is no Gaussian: it is not drawn, and has no gradient."""
@@ -37,11 +37,11 @@ class GaussianParameters:
     """Rows of Gaussians that steps of an optimiser move; rows without a Gaussian wait for one.
 
     Attributes:
-        device: Where they are.
+        device: Warp device that holds them.
         positions: ``(N,)`` vec3 [m].
         orientations: ``(N,)`` quat xyzw, of any length.
         radiance: ``(N, B)`` vec3 spherical harmonics, scene-linear.
-        drawn: What the rasteriser is given; `activate` brings scales and opacities up to date.
+        drawn: Gaussians as the rasteriser takes them; `activate` brings scales and opacities up to date.
     """
 
     def __init__(self, cloud: GaussianCloud, device: Any, *, row_count: int | None = None, sh_degree: int = 2) -> None:
@@ -127,7 +127,7 @@ class GaussianParameters:
         return self._gradients[name]
 
     def optimizer(self, rates: dict[str, float]) -> Adam:
-        """Return what moves the rows.
+        """Return an optimiser of the rows.
 
         Args:
             rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0)
@@ -146,11 +146,11 @@ class GaussianParameters:
         return Adam({name: Parameters(*groups[name], rate) for name, rate in rates.items() if name in groups})
 
     def rows(self) -> dict[str, Any]:
-        """Return what is moved as NumPy arrays, by name, row by row."""
+        """Return the arrays that are moved, by name, as NumPy."""
         return {name: getattr(self, name).numpy() for name in self._gradients}
 
     def set_rows(self, rows: dict[str, Any]) -> None:
-        """Overwrite what is moved; arrays stay where they are, so that captured steps go on."""
+        """Overwrite the arrays that are moved; they stay at their addresses, so that captured steps go on."""
         for name, array in rows.items():
             target = getattr(self, name)
             wp.copy(target, upload(array, target.dtype, self.device))
@@ -177,7 +177,7 @@ class GaussianParameters:
 
 
 def require_scene_linear(name: str, cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return a cloud's radiance after checking that it is light: display colours would be taken for it.
+    """Return a cloud's radiance after checking that it is scene-linear: display colours would be taken for light.
 
     Raises:
         InvalidArrayError: There is none, or not in scene-linear Rec.709.

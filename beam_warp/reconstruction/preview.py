@@ -1,4 +1,4 @@
-"""One picture of a reconstructed frame: photograph, render, what differs, and normals, from two sides."""
+"""One picture of a reconstructed frame: photograph, render, their difference, and normals, from two sides."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
 AMPLIFICATION = 8
-"""By how much differences are brightened: 1/8 of the display's range comes to white."""
+"""Factor by which differences are brightened: 1/8 of the display's range comes to white."""
 
 MOST_ROWS = 540
-"""Panels are reduced to at most so many rows of pixels."""
+"""Most rows of pixels of a panel: larger ones are reduced."""
 
 FEWEST_ROWS = 240
-"""Panels of fewer rows are enlarged, so that their titles fit."""
+"""Fewest rows of pixels of a panel: smaller ones are enlarged, so that their titles fit."""
 
 
 def opposite_cameras(cameras: Sequence[Camera]) -> list[int]:
@@ -51,11 +51,11 @@ def reconstruction_preview(
 
     Args:
         cloud: Gaussians with scene-linear radiance, axes "rfu".
-        views: What to compare with; images of one size.
+        views: Photographs to compare with, of one size.
         shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
             column out.
         options: How splats are drawn: as they were when the Gaussians were fitted.
-        samples: Side of the square of samples of a pixel: likewise.
+        samples: Side of the square of samples of a pixel: as it was when the Gaussians were fitted.
         device: Warp device.
 
     Returns:
@@ -99,8 +99,8 @@ def mesh_shadings(
 
     Args:
         cloud: Gaussians.
-        cameras: From where its depth is drawn, with as few pixels as a preview shows.
-        shown: Which of them are shown.
+        cameras: Cameras that its depth is drawn for, with as few pixels as a preview shows.
+        shown: Numbers of the cameras whose pictures are returned.
         options: How splats are drawn.
         device: Warp device.
 

@@ -1,4 +1,4 @@
-"""How fine Gaussians may become before no training view can tell: the 3D filter of Mip-Splatting."""
+"""The finest scales of Gaussians that training views can show: the 3D filter of Mip-Splatting."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.checks import require_number
 from beam_warp.device.array_checks import require_device_array
 from beam_warp.device.arrays import resolve_device, upload_vectors
 from beam_warp.errors import InvalidOptionError
@@ -17,12 +16,15 @@ from beam_warp.raster.layout import ViewLayout
 from beam_warp.world.camera import Camera
 
 FILTER_VARIANCE = 0.2
-"""Of the 3D filter, in squared pixels (Yu et al. 2024): with the rasteriser's low-pass of 0.3 about as much
+"""Variance of the 3D filter, in squared pixels (Yu et al. 2024): with the rasteriser's low-pass of 0.3 about as much
 as a pixel's own box filter blurs."""
+
+NEAR = 0.01
+"""Depth from which on a camera sees [m]."""
 
 IMAGE_MARGIN = 0.15
 """A view counts for Gaussians whose centre is outside its image by up to this part of its sides: they still reach in.
-Also the part that the rasteriser grows the image by."""
+The rasteriser grows the image by the same part."""
 
 
 class SamplingLimits:
@@ -37,26 +39,20 @@ class SamplingLimits:
     no view sees take the largest limit of all others; here they have none, 0: what nothing trains does not get finer.
     """
 
-    def __init__(
-        self, cameras: Sequence[Camera], *, near: float = 0.01, margin: float = IMAGE_MARGIN, device: Any = None
-    ) -> None:
+    def __init__(self, cameras: Sequence[Camera], *, device: Any = None) -> None:
         """Prepare cameras.
 
         Args:
-            cameras: The training views', at least one.
-            near: Depth from which on they see [m].
-            margin: See `IMAGE_MARGIN`.
+            cameras: The training views' cameras, at least one.
             device: Warp device; the first GPU without, or the CPU where there is none.
 
         Raises:
-            InvalidOptionError: There is no camera, or an option is out of range.
+            InvalidOptionError: There is no camera.
             DeviceError: The device is not there.
         """
         if not len(cameras):
             raise InvalidOptionError("cameras must be at least one, got none. Pass the training views' cameras.")
         self.device = resolve_device(device)
-        self.near = require_number("near", near, 1e-9, 1e9)
-        self.margin = require_number("margin", margin, 0.0, 1e3)
         self._views = wp.array(ViewLayout.of(cameras).views, dtype=RasterView, device=self.device)
 
     def write(self, positions: wp.array, limits: wp.array) -> None:
@@ -71,6 +67,4 @@ class SamplingLimits:
         """
         centers = upload_vectors("positions", positions, self.device)
         out = require_device_array("limits", limits, (len(centers),), self.device)
-        launch_write_sampling_limits(
-            centers, self._views, self.near, self.margin, FILTER_VARIANCE**0.5, out, self.device
-        )
+        launch_write_sampling_limits(centers, self._views, NEAR, IMAGE_MARGIN, FILTER_VARIANCE**0.5, out, self.device)

@@ -1,10 +1,9 @@
-"""How good one reconstructed frame is, against views that training did not see and against the true surface."""
+"""Scores of one reconstructed frame, against views that training did not see and against the true surface."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,18 +24,18 @@ from beam_warp.world.gaussians import GaussianCloud
 
 @dataclass(frozen=True)
 class ViewScores:
-    """One view that training did not see.
+    """Scores of one view that training did not see.
 
     Attributes:
-        name: Of its record.
-        novel_view: Colour inside the subject's bounding box and where it is solid, as `Score` says.
-        whole_psnr: Of the whole image, composited on black [dB].
-        whole_ssim: There.
+        name: Name of the view's record.
+        novel_view: Scores of colour inside the subject's bounding box and where it is solid, as `Score` says.
+        whole_psnr: PSNR of the whole image, composited on black [dB].
+        whole_ssim: Structural similarity of the whole image, composited on black.
         normals_mean_degrees: Mean angle between normals of geometry and the truth, where the truth is solid; None
             without truth.
-        normals_median_degrees: Its median.
-        depth_median_mm: Median of the absolute error of expected depth there [mm].
-        median_depth_median_mm: The same of median depth.
+        normals_median_degrees: Median of those angles.
+        depth_median_mm: Median of the absolute error of expected depth, where the truth is solid [mm].
+        median_depth_median_mm: Median of the absolute error of median depth, likewise [mm].
         alpha_error: Mean absolute error of coverage over the whole image.
     """
 
@@ -53,10 +52,10 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class FrameScores:
-    """One reconstructed frame: means over its views, and its surface.
+    """Scores of one reconstructed frame: means over its views, and its surface.
 
     Attributes:
-        views: The views one by one.
+        views: Scores of each view.
         surface: Distances between the extracted and the true mesh; None where either is not given.
     """
 
@@ -167,15 +166,6 @@ def read_truth_mesh(capture: Capture, frame: int) -> trimesh.Trimesh:
         AssetFormatError: The file is damaged.
     """
     path = capture.folder / f"truth/mesh_{frame:04d}.npz"
-    return _read_mesh(path)
-
-
-def truth_frames(capture: Capture) -> tuple[int, ...]:
-    """Return the frames whose test views have exact channels, ascending."""
-    return tuple(sorted({record.frame for record in capture.select(split="test") if record.truth_path is not None}))
-
-
-def _read_mesh(path: Path) -> trimesh.Trimesh:
     try:
         with np.load(path, allow_pickle=False) as file:
             return trimesh.Trimesh(file["vertices"], file["faces"], process=False)
@@ -187,6 +177,11 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         raise AssetFormatError(
             f"truth mesh must be an npz of vertices and faces, got {error} at {path}. Copy it again."
         ) from error
+
+
+def truth_frames(capture: Capture) -> tuple[int, ...]:
+    """Return the frames whose test views have exact channels, ascending."""
+    return tuple(sorted({record.frame for record in capture.select(split="test") if record.truth_path is not None}))
 
 
 def _score_view(

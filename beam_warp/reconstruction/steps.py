@@ -1,4 +1,4 @@
-"""How the Gaussians of a frame are found: the first one from a visual hull, by fitting; the next ones by tracking."""
+"""Steps that find the Gaussians of a frame: a key frame by fitting from its visual hull, the next ones by tracking."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
+from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
-from beam_warp.reconstruction.image_motion import motion_in_pixels
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.job import StepProgress
+from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.world.gaussians import GaussianCloud
 
 MOST_UNPAIRED = 0.5
-"""Part of the Gaussians that fewer than two views see from which on that is said: most of the surface."""
+"""Part of the Gaussians seen by fewer than two views above which there is a finding: most of the surface."""
 
 STRUCTURE_REACH = 5
-"""Half a window of structural similarity [pixel]: what lies farther from its place has no pull towards it. At the
+"""Half a window of structural similarity [pixel]: a Gaussian farther from its place has no gradient towards it. At the
 coarsest level of tracking a pixel is as many as its reduction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitAndTrack:
-    """The steps that `beam_warp.reconstruction.job.reconstruct` takes; see `beam_warp.reconstruction.job.FrameSteps`.
+    """The steps that `beam_warp.reconstruction.job.reconstruct` takes: fit key frames, track the others.
 
     Attributes:
         fitting: How key frames are fitted.
         tracking: How other frames follow from the one before; drawn and compared as `fitting` says.
-        points: What is known of the surfaces before, for images without masks; None if nothing is.
+        points: Known points of the surfaces, for images without masks; None if there are none.
         device: Warp device; None takes the first CUDA device, or the CPU.
     """
 
@@ -117,7 +117,7 @@ class FitAndTrack:
         return following, {**report, **said}
 
     def _start(self, views: Sequence[CapturedView]) -> GaussianCloud:
-        """Return what a fit begins with."""
+        """Return the Gaussians that a fit begins with."""
         known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
         return initial_gaussians(
             views,
@@ -134,7 +134,7 @@ class FitAndTrack:
 
 
 def _few_cameras(unpaired: float) -> Finding:
-    """Say that cameras are too few, or too far apart, to see depth."""
+    """Return the finding that cameras are too few, or too far apart, to see depth."""
     return Finding(
         "warning",
         "few-cameras",
@@ -144,7 +144,7 @@ def _few_cameras(unpaired: float) -> Finding:
 
 
 def _exposures(gains: ViewGains) -> dict[str, float]:
-    """Return what a report says of exposures [stop]."""
+    """Return the largest difference of exposures [stop], as far as it is known."""
     off = np.abs(gains.stops)
     return {"exposure_spread": float(np.nanmax(off))} if np.isfinite(off).any() else {}
 

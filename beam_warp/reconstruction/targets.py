@@ -1,4 +1,4 @@
-"""What the renders of Gaussians should look like: photographs on a device, cropped, encoded, and the losses to them."""
+"""Targets of fitting: photographs on a device, cropped and encoded, and the losses of renders against them."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ CROP_MARGIN = 8
 """Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
 
 CROP_STEP = 16
-"""Crops are multiples of it: a tile of the rasteriser."""
+"""Sides of crops are multiples of a tile of the rasteriser [pixel]."""
 
 
 MOST_SAMPLES = 4
-"""Side of the square of samples of a pixel."""
+"""Largest side of the square of samples of a pixel."""
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """What the terms of a step count.
+    """Weights of the terms of a step.
 
     Attributes:
         l1: Mean absolute difference of encoded colours.
@@ -105,8 +105,8 @@ class ViewTargets:
     Attributes:
         rasterizer: Draws one view at a time: `select` says which.
         cameras: What it draws for, with as many pixels as there are samples.
-        height: Of every view [pixel].
-        width: Of every view [pixel].
+        height: Height of every view [pixel].
+        width: Width of every view [pixel].
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ViewTargets:
         """Bring views to a device.
 
         Args:
-            views: Of one size.
+            views: Photographs of one size.
             gaussian_count: Rows that are drawn.
             options: How splats are drawn.
             samples: Side of the square of samples that a pixel is the mean of.
@@ -259,7 +259,7 @@ class TargetSet:
     """Views of any sizes, each at hand by its number.
 
     Attributes:
-        device: Where they are.
+        device: Warp device that holds the views.
     """
 
     def __init__(
@@ -344,7 +344,7 @@ def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spa
 
     Args:
         views: What is fitted.
-        center: Of the subject [m], ``(3,)``.
+        center: Middle of the subject [m], ``(3,)``.
         spacing: Distance of neighbouring Gaussians [m].
     """
     footprints = [float((center - view.camera.position) @ view.camera.forward) / view.camera.focal_x for view in views]

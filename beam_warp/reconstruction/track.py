@@ -1,4 +1,4 @@
-"""From one frame to the next: joints find the coarse motion, the Gaussians that they carry the rest.
+"""Tracking from one frame to the next: joints find the coarse motion, the Gaussians that they carry find the rest.
 
 A track keeps identities: row i is the same Gaussian in all of its frames. Where the photographs can no longer be met so
 - too much worse than in the key frame, a part of the subject that nothing covers, joints torn apart - it says that it
@@ -28,45 +28,46 @@ from beam_warp.reconstruction.fit import (
     NO_PSNR,
     PRESETS,
     FitOptions,
-    FitProgress,
     Fitter,
     LearningRates,
     mean_psnr,
-    no_fit_progress,
 )
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.initial import DISC_WIDTH
-from beam_warp.reconstruction.joint_selection import select_joints
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
-from beam_warp.reconstruction.joints import JointGraph, stretch
+from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
+from beam_warp.reconstruction.joints.selection import select_joints
+from beam_warp.reconstruction.joints.skinning import Anchors
 from beam_warp.reconstruction.parameters import require_scene_linear
-from beam_warp.reconstruction.skinning import Anchors
 from beam_warp.reconstruction.targets import TargetSet, sample_side
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, sh_degree_of
 
 GAUSSIANS_PER_JOINT = 25
-"""A joint for so many Gaussians, within the limits below."""
+"""Gaussians for each joint, as far as `JOINT_LIMITS` allow."""
 
 JOINT_LIMITS = (60, 4_000)
+"""Fewest and most joints."""
 
 NOISE_PSNR = 44.0
-"""What the noise of good photographs allows, of encoded colours: 1.6 of 255 [dB]."""
+"""PSNR that the noise of good photographs allows [dB]: encoded colours are off by 1.6 of 255."""
 
 SMALLEST_COSINE = 0.2
-"""Of the normals of neighbours on a body: two limbs in contact are not one."""
+"""Least cosine between the normals of neighbours on a body: two limbs in contact are not one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
-    """How a frame follows from the one before.
+    """Options of tracking a frame from the one before.
 
     Attributes:
-        joint_count: Joints; None for one for every `GAUSSIANS_PER_JOINT` Gaussians.
+        joint_count: Number of joints; None for one for every `GAUSSIANS_PER_JOINT` Gaussians.
         joints: How they are moved.
         refinement: How the Gaussians that they carried are fitted; counts, refinements and the degree of the radiance,
             which is the key frame's, are not used.
-        largest_drop: PSNR may be so much below the key frame's [dB].
-        largest_gap: Connected part of the subject that may stay uncovered in a view, beyond the key frame's.
-        largest_tear: Part of the joints that may be torn from a neighbour.
+        largest_drop: A frame whose PSNR is further below the key frame's is lost [dB].
+        largest_gap: A frame is lost where a larger connected part of the subject, beyond the key frame's, stays
+            uncovered in a view.
+        largest_tear: A frame is lost where a larger part of the joints is torn from a neighbour.
         raster: How splats are drawn.
 
     Raises:
@@ -122,17 +123,17 @@ class TrackOptions:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What the next frame needs of this one.
+    """The state of tracking in one frame: what the next frame needs of it.
 
     Attributes:
         cloud: This frame's Gaussians; row i is the same one in every frame of the track.
-        anchors: Of the Gaussians to the joints, from the key frame.
-        graph: Of the joints, from the key frame.
+        anchors: Anchors of the Gaussians to the joints, from the key frame.
+        graph: Graph of the joints, from the key frame.
         local_normals: Which way the surface faces, in each Gaussian's own axes, ``(N, 3)`` float32; 0 where unknown.
         key_joints: Where the joints were in the key frame, ``(M, 3)`` float32 [m].
-        joints: Where they are, ``(M, 3)``.
-        previous_joints: Where they were a frame before; where they are in a key frame.
-        turns: How they turned since then, quaternions xyzw, ``(M, 4)``.
+        joints: Where the joints are, ``(M, 3)``.
+        previous_joints: Where the joints were a frame before, ``(M, 3)``; where they are, in a key frame.
+        turns: Turns of the joints since the frame before, quaternions xyzw, ``(M, 4)``.
         baseline: PSNR [dB] and largest gap in the key frame, ``(2,)`` float64.
     """
 
@@ -221,15 +222,15 @@ def advance_track(
     options: TrackOptions,
     *,
     device: str | None = None,
-    progress: FitProgress = no_fit_progress,
+    progress: StepProgress = no_step_progress,
 ) -> tuple[Track, dict[str, Any]]:
     """Find the Gaussians of the next frame.
 
     Args:
-        track: Of the frame before.
+        track: Track of the frame before.
         views: The photographs of the frame.
-        options: As the track began.
-        device: As the track began.
+        options: The options that the track began with.
+        device: The device that the track began on.
         progress: Called with (done, total, facts).
 
     Returns:
@@ -263,13 +264,13 @@ def advance_track(
     fitter.run(progress)
     cloud = fitter.parameters.cloud().with_arrays(ids=track.cloud.ids)
     psnr, gaps = fitter.psnr(), fitter.gaps()
-    torn = stretch(track.graph, track.key_joints, pose.positions).torn
+    torn = torn_fraction(track.graph, track.key_joints, pose.positions)
     following = replace(track, cloud=cloud, joints=pose.positions, previous_joints=track.joints, turns=pose.rotations)
     report = {
         "psnr": mean_psnr(psnr),
         "view_psnr": float(np.nanmin(psnr, initial=NO_PSNR)),
         "gap": float(gaps.max()),
-        "torn": float(torn),
+        "torn": torn,
         "gaussians": len(cloud),
         "samples": samples,
         "lost": _why_lost(track, mean_psnr(psnr), gaps, torn, views, options),

@@ -11,7 +11,8 @@ from typing import Any
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.findings import Finding
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.job import FrameSteps, reconstruct
+from beam_warp.reconstruction.frames.protocols import FrameSteps
+from beam_warp.reconstruction.job import reconstruct
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.stability.capture_cases import (

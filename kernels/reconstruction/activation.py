@@ -1,4 +1,4 @@
-"""From what an optimiser moves to what the rasteriser draws, and the gradients back.
+"""Activation: from the parameters that an optimiser moves to the splats that the rasteriser draws, and gradients back.
 
 Scales are moved as logarithms and opacities as logits, so that no step leaves their range. The sampling filter widens a
 Gaussian to what its training images can show, and takes the opacity that this adds away again: with f the filter's

@@ -1,4 +1,4 @@
-"""How points on a surface push each other apart until they lie evenly on it."""
+"""Points on a surface push each other apart until they lie evenly on it."""
 
 from typing import Any
 
@@ -12,7 +12,16 @@ STEP = wp.constant(0.4)
 """Part of its neighbours' overlaps that a point moves by: above a half, two points would jump over each other."""
 
 LONGEST_STEP = wp.constant(0.5)
-"""Of the spacing: a point stays in its neighbourhood."""
+"""Longest step, in spacings: a point stays in its neighbourhood."""
+
+
+@wp.struct
+class ShadedMesh:
+    """A mesh that points are brought back to, and the normals that they take there."""
+
+    mesh: wp.uint64
+    faces: wp.array[int]  # three corners each
+    normals: wp.array[wp.vec3]  # of the vertices
 
 
 @wp.kernel
@@ -22,9 +31,7 @@ def push_apart_kernel(
     normals: wp.array[wp.vec3],
     neighbors: wp.array2d[int],
     spacing: float,
-    mesh: wp.uint64,
-    vertex_normals: wp.array[wp.vec3],
-    faces: wp.array[int],
+    surface: ShadedMesh,
     out_positions: wp.array[wp.vec3],
     out_normals: wp.array[wp.vec3],
 ):
@@ -45,14 +52,15 @@ def push_apart_kernel(
         push = push * (LONGEST_STEP * spacing / length)
     moved = here + push
     turned = normal
-    nearest = wp.mesh_query_point_no_sign(mesh, moved, 4.0 * spacing)
+    nearest = wp.mesh_query_point_no_sign(surface.mesh, moved, 4.0 * spacing)
     if nearest.result:
-        a = faces[3 * nearest.face]
-        b = faces[3 * nearest.face + 1]
-        c = faces[3 * nearest.face + 2]
+        a = surface.faces[3 * nearest.face]
+        b = surface.faces[3 * nearest.face + 1]
+        c = surface.faces[3 * nearest.face + 2]
         w = 1.0 - nearest.u - nearest.v
-        moved = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
-        turned = wp.normalize(vertex_normals[a] * nearest.u + vertex_normals[b] * nearest.v + vertex_normals[c] * w)
+        moved = wp.mesh_eval_position(surface.mesh, nearest.face, nearest.u, nearest.v)
+        normals = surface.normals
+        turned = wp.normalize(normals[a] * nearest.u + normals[b] * nearest.v + normals[c] * w)
     else:
         moved = here
     out_positions[i] = moved
@@ -64,8 +72,7 @@ def launch_push_apart(
     normals: Any,
     neighbors: Any,
     spacing: float,
-    mesh: Any,
-    vertex_normals: Any,
+    surface: ShadedMesh,
     out_positions: Any,
     out_normals: Any,
     device: Any,
@@ -74,7 +81,7 @@ def launch_push_apart(
     launch(
         push_apart_kernel,
         len(positions),
-        inputs=[positions, normals, neighbors, spacing, mesh.id, vertex_normals, mesh.indices],
+        inputs=[positions, normals, neighbors, spacing, surface],
         outputs=[out_positions, out_normals],
         device=device,
     )

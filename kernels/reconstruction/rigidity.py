@@ -1,4 +1,4 @@
-"""How far joints are from moving rigidly with their neighbours, and how that changes with their poses.
+"""Energy of joints that do not move rigidly with their neighbours, and its gradients with respect to their poses.
 
 An edge from joint i to joint j leaves, with D_i = q_i conj(q_i,previous), the residual
 
@@ -29,7 +29,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class EdgeArrays:
-    """`beam_warp.reconstruction.joints.JointGraph` on a device."""
+    """`beam_warp.reconstruction.joints.graph.JointGraph` on a device."""
 
     neighbors: wp.array2d[int]
     weights: wp.array2d[float]

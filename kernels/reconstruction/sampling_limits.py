@@ -1,4 +1,4 @@
-"""How fine a Gaussian may become before no training view can tell: the 3D filter of Mip-Splatting."""
+"""The finest scale of a Gaussian that a training view can show: the 3D filter of Mip-Splatting."""
 
 from typing import Any
 

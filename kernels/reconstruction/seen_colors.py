@@ -1,4 +1,4 @@
-"""What colour of a point each view shows, and one colour that most views agree on."""
+"""Colours of points in each view, and one colour for each point that most views agree on."""
 
 from typing import Any
 
@@ -14,11 +14,21 @@ LEAST_COVERAGE = wp.constant(0.5)
 """Coverage below which a pixel shows more of the background."""
 
 ROUNDS = wp.constant(3)
-"""Of reweighting around the most central sample: by then the weights have settled."""
+"""Rounds of reweighting around the most central sample: by then the weights have settled."""
 
 RELATIVE_SPREAD = wp.constant(0.1)
 LEAST_SPREAD = wp.constant(0.01)
 """Deviation of a colour at which it counts half: a tenth of the mean, and for dark ones no less than this."""
+
+
+@wp.struct
+class SeenImage:
+    """The image of a view, and the depth of the surface that it shows."""
+
+    view: RasterView
+    color: wp.array[wp.vec3]  # premultiplied, row by row
+    alpha: wp.array[float]
+    depth: wp.array[float]  # of the surface [m]; 0 where there is none
 
 
 @wp.kernel
@@ -26,10 +36,7 @@ def sample_colors_kernel(
     first: int,
     positions: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    view: RasterView,
-    color: wp.array[wp.vec3],
-    alpha: wp.array[float],
-    depth: wp.array[float],
+    image: SeenImage,
     slack: float,
     least_facing: float,
     row: int,
@@ -37,6 +44,7 @@ def sample_colors_kernel(
 ):
     i = first + wp.tid()
     sample = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    view = image.view
     p = camera_point(view, positions[i])
     z = p[2]
     normal = normals[i]
@@ -47,10 +55,10 @@ def sample_colors_kernel(
         place = image_point(view, p)
         if room_around(view, place) > 0.0:
             pixel = int(place[1]) * view.width + int(place[0])
-            coverage = alpha[pixel]
-            seen = depth[pixel]
+            coverage = image.alpha[pixel]
+            seen = image.depth[pixel]
             if coverage >= LEAST_COVERAGE and seen > 0.0 and z <= seen + slack:
-                straight = color[pixel] / coverage
+                straight = image.color[pixel] / coverage
                 sample = wp.vec4(straight[0], straight[1], straight[2], facing * facing)
     out_samples[row, i] = sample
 
@@ -107,10 +115,7 @@ def agree_colors_kernel(
 def launch_sample_colors(
     positions: Any,
     normals: Any,
-    view: Any,
-    color: Any,
-    alpha: Any,
-    depth: Any,
+    image: SeenImage,
     slack: float,
     least_facing: float,
     row: int,
@@ -119,13 +124,13 @@ def launch_sample_colors(
 ) -> None:
     """Write the straight colour and the weight of every point in one view; a weight of 0 where it is not seen.
 
-    A point is seen where it is not farther than ``depth`` by more than ``slack`` [m], and its normal faces the camera
-    by a cosine above ``least_facing``; points whose normal is 0 face all cameras.
+    A point is seen where it is not farther than the image's depth by more than ``slack`` [m], and its normal faces the
+    camera by a cosine above ``least_facing``; points whose normal is 0 face all cameras.
     """
     launch(
         sample_colors_kernel,
         len(positions),
-        inputs=[positions, normals, view, color, alpha, depth, slack, least_facing, row],
+        inputs=[positions, normals, image, slack, least_facing, row],
         outputs=[out_samples],
         device=device,
     )

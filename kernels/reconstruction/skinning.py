@@ -49,7 +49,7 @@ MOST_JOINTS = 2**24
 
 @wp.struct
 class RestSkin:
-    """Skins and joints at rest, and what hangs on what. Slots are (k, N): neighbouring threads read neighbours."""
+    """Skins and joints at rest, and their anchors. Slots are (k, N): neighbouring threads read neighbours."""
 
     positions: wp.array[wp.vec3]  # of the skins
     orientations: wp.array[wp.vec4]
@@ -62,7 +62,7 @@ class RestSkin:
 
 @wp.struct
 class Runs:
-    """What hangs on each joint, cut into runs: pairs of a run are neighbours, and so are the runs of a joint."""
+    """Pairs of skins and joints, cut into runs: pairs of a run are neighbours, and so are the runs of a joint."""
 
     places: wp.array[int]  # of each pair: where its skin's message is; ascending in each joint
     weights: wp.array[float]

@@ -1,4 +1,4 @@
-"""How deep a point is inside the cones of all silhouettes, and which blocks of a grid the hull's surface may pass.
+"""Depths of points inside the cones of all silhouettes, and the blocks of a grid that the hull's surface may pass.
 
 The depth of a point in one view's cone is the signed distance of its pixel to the silhouette, brought to metres at the
 point's depth; inside all cones is where the least of them is positive. A block is judged by its enclosing ball: where
@@ -23,14 +23,11 @@ BLOCK_POINTS = wp.constant(125)
 
 BLOCK_CELLS = wp.constant(64)
 
-MOST_TOLERATED = wp.constant(3)
-"""Most views that a point may contradict: the least four depths are kept."""
-
 NEAR = wp.constant(0.01)
 """Depth [m] before which a camera sees nothing, as for the rasteriser."""
 
 PIXEL_MARGIN = wp.constant(1.5)
-"""What the measured distance may be off between pixels [pixel]: interpolation over a cell's half diagonal, 0.71, and
+"""Largest error of the measured distance between pixels [pixel]: interpolation over a cell's half diagonal, 0.71, and
 the spacing of the silhouette's crossings, 0.5."""
 
 OUTSIDE = wp.constant(0)
@@ -62,14 +59,12 @@ def mean_focal(view: RasterView) -> float:
 
 
 @wp.func
-def hull_depth(
-    point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], tolerance: int, quorum: int, unseen: float
-) -> float:
-    """Depth [m] in the cones: the least of all views that see the point, up to ``tolerance`` lesser ones left out.
+def hull_depth(point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], quorum: int, unseen: float) -> float:
+    """Depth [m] in the cones: the least of all views that see the point.
 
-    At least ``quorum`` views have to agree; a point that fewer see is as far outside as ``unseen`` says.
+    A point that fewer than ``quorum`` views see is as far outside as ``unseen`` says.
     """
-    least = wp.vec4(wp.inf, wp.inf, wp.inf, wp.inf)
+    least = float(wp.inf)
     seen = int(0)
     for i in range(views.shape[0]):
         view = views[i]
@@ -79,14 +74,10 @@ def hull_depth(
             if room_around(view, pixel) >= 0.0:
                 seen += 1
                 depth = silhouette_distance(view, distances, pixel) * p[2] / mean_focal(view)
-                for k in range(4):
-                    if depth < least[k]:
-                        swapped = least[k]
-                        least[k] = depth
-                        depth = swapped
+                least = wp.min(least, depth)
     if seen < quorum:
         return -unseen
-    return least[wp.min(tolerance, seen - quorum)]
+    return least
 
 
 @wp.kernel
@@ -97,7 +88,6 @@ def judge_blocks_kernel(
     count: wp.vec3i,
     views: wp.array[RasterView],
     distances: wp.array[float],
-    tolerance: int,
     quorum: int,
     out_states: wp.array[int],
 ):
@@ -132,7 +122,7 @@ def judge_blocks_kernel(
         elif z > -radius:
             possible += 1
     state = SURFACE
-    if against > tolerance or possible - against < quorum:
+    if against > 0 or possible - against < quorum:
         state = OUTSIDE
     elif agreeing == possible:  # a quorum, by the line before
         state = INSIDE
@@ -148,7 +138,6 @@ def fill_blocks_kernel(
     count: wp.vec3i,
     views: wp.array[RasterView],
     distances: wp.array[float],
-    tolerance: int,
     quorum: int,
     out_depths: wp.array[float],
 ):
@@ -160,7 +149,7 @@ def fill_blocks_kernel(
     j = block[1] * BLOCK + corner / side % side
     k = block[2] * BLOCK + corner % side
     point = origin + voxel * wp.vec3(float(i), float(j), float(k))
-    depth = hull_depth(point, views, distances, tolerance, quorum, voxel)
+    depth = hull_depth(point, views, distances, quorum, voxel)
     # The grid ends outside, so that the surface is closed where the box cuts it.
     ends = count * BLOCK
     if i == 0 or j == 0 or k == 0 or i == ends[0] or j == ends[1] or k == ends[2]:
@@ -228,7 +217,6 @@ def launch_judge_blocks(
     count: Any,
     views: Any,
     distances: Any,
-    tolerance: int,
     quorum: int,
     out_states: Any,
     device: Any,
@@ -237,7 +225,7 @@ def launch_judge_blocks(
     launch(
         judge_blocks_kernel,
         len(out_states),
-        inputs=[origin, size, count, views, distances, tolerance, quorum],
+        inputs=[origin, size, count, views, distances, quorum],
         outputs=[out_states],
         device=device,
     )
@@ -250,7 +238,6 @@ def launch_fill_blocks(
     count: Any,
     views: Any,
     distances: Any,
-    tolerance: int,
     quorum: int,
     out_depths: Any,
     device: Any,
@@ -259,7 +246,7 @@ def launch_fill_blocks(
     launch(
         fill_blocks_kernel,
         len(out_depths),
-        inputs=[blocks, origin, voxel, count, views, distances, tolerance, quorum],
+        inputs=[blocks, origin, voxel, count, views, distances, quorum],
         outputs=[out_depths],
         device=device,
     )

@@ -1,4 +1,4 @@
-"""Densification: halves in closed form, the image that they leave, what is hidden, ties of the strained."""
+"""Densification: halves in closed form, the image that they leave, what is hidden, ties of gradients."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from support.moving_ball import ball_cloud
 
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
-from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, choose_strained, hidden, prune, split
+from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, hidden, largest_gradients, prune, split
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -75,7 +75,7 @@ class TestSplit:
 
     @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
     def test_the_image_of_a_disc_hardly_changes(self, device, opacity):
-        """Its middle and its height stay; it is 1 to 1.3 times as much, since two halves hold 2 x 0.65 of the light.
+        """The image keeps its middle and its height; it gets up to 1.3 times as bright: halves hold 2 x 0.65 of it.
 
         Where they overlap, in the middle, one hides a part of the other: less light, and more of it outside. So the
         variance is at least that of their sum, offset^2 + shrink^2 of what it was, and below what it was.
@@ -111,7 +111,7 @@ class TestSplit:
 
 class TestHidden:
     def test_those_that_show_least(self):
-        """Of 100, at most 5: 1 + 1 + 2 are 4, and the next would make it 14."""
+        """At most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
         shares = np.array([50.0, 1.0, 10.0, 2.0, 36.0, 1.0])
         assert np.flatnonzero(hidden(shares, 0.05)).tolist() == [1, 3, 5]
         assert np.flatnonzero(hidden(shares, 0.01)).tolist() == [1]  # of the equal ones, the first
@@ -128,17 +128,17 @@ class TestHidden:
         assert not hidden(np.array([1.0, np.nan, 2.0]), 0.5).any()
 
 
-class TestChooseStrained:
+class TestLargestGradients:
     def test_largest_first_ties_by_row(self):
-        stress = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0])
+        gradients = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0])
         everyone = np.ones(6, bool)
-        assert choose_strained(stress, everyone, 4).tolist() == [1, 3, 2, 4]
-        assert choose_strained(stress, everyone, 0).tolist() == []
-        assert len(choose_strained(stress, everyone, 100)) == 6
+        assert largest_gradients(gradients, everyone, 4).tolist() == [1, 3, 2, 4]
+        assert largest_gradients(gradients, everyone, 0).tolist() == []
+        assert len(largest_gradients(gradients, everyone, 100)) == 6
 
-    def test_only_the_eligible_and_pulled(self):
-        stress = np.array([0.0, 9.0, np.nan, 2.0])
-        assert choose_strained(stress, np.array([True, False, True, True]), 4).tolist() == [3]
+    def test_only_the_eligible_with_gradients(self):
+        gradients = np.array([0.0, 9.0, np.nan, 2.0])
+        assert largest_gradients(gradients, np.array([True, False, True, True]), 4).tolist() == [3]
 
 
 def test_pruned_rows_are_no_gaussians(device):

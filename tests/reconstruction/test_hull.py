@@ -1,4 +1,4 @@
-"""The visual hull: silhouettes' distances, balls between two bounds, bad masks, crops, refusals, threads, a capture."""
+"""The visual hull: distances to silhouettes, balls between two bounds, empty masks, crops, refusals, a capture."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def distances(alpha, device, limit=40.0):
 
 
 class TestSilhouettes:
-    @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 90.0, 200.0])
+    @pytest.mark.parametrize("angle", [0.0, 20.0, 200.0])
     def test_straight_edge(self, device, angle):
         size, s = 33, 8
         x = (np.arange(size * s) + 0.5) / s - 16.3
@@ -50,7 +50,7 @@ class TestSilhouettes:
         np.testing.assert_allclose(found, [[-4.0 / 3.0, -1.0 / 3.0, 2.0 / 3.0, 5.0 / 3.0]], rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize(("value", "sign"), [(0.0, -1.0), (1.0, 1.0)])
-    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (300, 1), (20, 70)])
+    @pytest.mark.parametrize("shape", [(1, 1), (20, 70)])
     def test_no_edge(self, device, shape, value, sign):
         np.testing.assert_array_equal(distances(np.full(shape, value, np.float32), device, 30.0), sign * 30.0)
 
@@ -71,7 +71,7 @@ class TestSilhouettes:
 
 
 def widest(views, unit):
-    """How far a hull may reach along unit vectors, of a ball of radius 1.
+    """Reach of a hull along unit vectors, of a ball of radius 1, at most.
 
     A view's cone touches the ball on the circle of directions at acos(R / D) from the camera's. Along a direction at
     the angle e from the nearest of those the tangent plane there is met at 1 / cos(e).
@@ -86,7 +86,7 @@ def widest(views, unit):
 
 
 def slack(hull, views):
-    """How far masks and voxels may move the surface [m]: the edge's error at the ball, and a part of a voxel.
+    """Distance by which masks and voxels may move the surface [m]: the edge's error at the ball, and a part of a voxel.
 
     Interpolated between points at a pixel's distance, where the distances' own error is largest (1.41 to 1), a crossing
     moves by 0.09 voxel.
@@ -96,7 +96,7 @@ def slack(hull, views):
 
 
 class TestBall:
-    @pytest.mark.parametrize("count", [4, 6, 12, 24])
+    @pytest.mark.parametrize("count", [4, 24])
     def test_lies_between_the_ball_and_its_tangent_planes(self, device, count):
         views = ball_views(count)
         hull = visual_hull(views, resolution=48, quorum=count, device=device)
@@ -107,8 +107,6 @@ class TestBall:
         assert (radii <= RADIUS * reach + slack(hull, views) * reach).all()
         assert hull.mesh.is_watertight
         assert hull.mesh.volume > 0.0
-        assert hull.used == tuple(view.name for view in views)
-        assert hull.ignored == ()
 
     def test_converges_to_the_ball(self, device):
         volume = 4.0 / 3.0 * np.pi * RADIUS**3
@@ -149,15 +147,6 @@ class TestBall:
         np.testing.assert_allclose(focus, center, rtol=0, atol=0.5 * 2.0 / cameras[0].focal_x)
         assert abs(reach - 2.0) < 0.05
 
-    def test_threads_make_no_difference(self, monkeypatch):
-        meshes = []
-        for threads in ("1", "2", "5"):
-            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            meshes.append(visual_hull(ball_views(7), resolution=40, device="cpu").mesh)
-        for mesh in meshes[1:]:
-            np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
-            np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
-
 
 def with_alpha(view, alpha):
     return CapturedView(name=view.name, camera=view.camera, color=np.zeros_like(view.color), alpha=alpha)
@@ -169,19 +158,7 @@ class TestMasks:
         kept = visual_hull(views[2:], resolution=32, device=device)
         black = with_alpha(views[0], np.zeros_like(views[0].alpha))
         hull = visual_hull([black, replace(views[1], alpha=None), *views[2:]], resolution=32, device=device)
-        assert hull.ignored == ("view_0", "view_1")
         np.testing.assert_array_equal(hull.mesh.vertices, kept.mesh.vertices)
-
-    def test_a_wrong_one_is_outvoted(self, device):
-        views = ball_views(12)
-        half = views[3].alpha.copy()
-        half[:, :32] = 0.0
-        broken = [*views[:3], with_alpha(views[3], half), *views[4:]]
-        exact = visual_hull(broken, resolution=32, device=device)
-        assert exact.mesh.volume < 0.7 * 4.0 / 3.0 * np.pi * RADIUS**3  # one view's word is enough to take half away
-        hull = visual_hull(broken, resolution=32, tolerance=1, device=device)
-        radii = np.linalg.norm(hull.mesh.vertices, axis=1)
-        assert radii.min() >= RADIUS - 0.5 * hull.voxel - slack(hull, views)
 
     def test_what_a_view_crops_is_left_to_others(self, device):
         views = ball_views(16)
@@ -190,12 +167,6 @@ class TestMasks:
         radii = np.linalg.norm(hull.mesh.vertices, axis=1)
         assert radii.min() >= RADIUS - 0.5 * hull.voxel - slack(hull, views)
         assert hull.mesh.volume < 1.3 * 4.0 / 3.0 * np.pi * RADIUS**3
-
-    def test_a_box_cuts_and_closes(self, device):
-        views = ball_views(12)
-        hull = visual_hull(views, resolution=32, box=[[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]], device=device)
-        assert hull.mesh.is_watertight
-        assert -1e-6 <= hull.mesh.bounds[0, 2] <= hull.voxel
 
 
 class TestRefusals:
@@ -219,10 +190,9 @@ class TestRefusals:
             visual_hull(views, device="cpu")
 
     def test_options(self):
-        views = ball_views(3)
-        for options in ({"resolution": 8}, {"tolerance": 4}, {"tolerance": -1}, {"box": [[0, 0, 0], [1, 0, 1]]}):
+        for options in ({"resolution": 8}, {"quorum": 1}):
             with pytest.raises(InvalidOptionError):
-                visual_hull(views, device="cpu", **options)
+                visual_hull(ball_views(3), device="cpu", **options)
 
 
 def test_walker_contains_the_truth(data_dir, device):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beam_warp.reconstruction.image_motion import motion_in_pixels
+from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.world.camera import Camera
 
 FRONT = Camera(

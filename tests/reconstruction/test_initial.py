@@ -18,18 +18,18 @@ from beam_warp.reconstruction.initial import (
     DISC_THICKNESS,
     DISC_WIDTH,
     HEXAGONAL,
-    SH_CONSTANT,
     even_surface_points,
     initial_gaussians,
 )
 from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.gaussians import WORLD_AXES
+from beam_warp.world.harmonics import SH_C0
 
 RADIUS = 0.5
 
 
 def colors_of(cloud):
-    return 0.5 + SH_CONSTANT * cloud.radiance[:, 0]
+    return 0.5 + SH_C0 * cloud.radiance[:, 0]
 
 
 class TestEvenPoints:

@@ -3,10 +3,12 @@
 import gc
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 import weakref
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +20,11 @@ from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
-from beam_warp.reconstruction.job import (
-    ID_BITS,
-    Part,
-    ReconstructOptions,
-    plan_segments,
-    reconstruct,
-    reconstruct_part,
-    stored_cloud,
-)
+from beam_warp.reconstruction import job as job_module
+from beam_warp.reconstruction.frames import store as frame_store
+from beam_warp.reconstruction.frames.plan import plan_segments
+from beam_warp.reconstruction.frames.store import ID_BITS, stored_cloud
+from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare, reconstruct, reconstruct_part
 
 FRAMES = (0, 1, 2, 3)
 PAIRS = ReconstructOptions(segment_length=2)
@@ -40,6 +38,21 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def capture(folder):
     return Capture.read(folder)
+
+
+@pytest.fixture(scope="module")
+def followed(folder, tmp_path_factory):
+    """All frames in one segment: steps, folder, result, and what was said of the progress."""
+    steps, out, said = FakeSteps(), tmp_path_factory.mktemp("runs") / "followed", []
+    found = reconstruct(Capture.read(folder), out, steps, progress=lambda *step: said.append(step))
+    return steps, out, found, said
+
+
+@pytest.fixture(scope="module")
+def paired(folder, tmp_path_factory):
+    """Two segments of two frames: steps, folder, result."""
+    steps, out = FakeSteps(), tmp_path_factory.mktemp("runs") / "paired"
+    return steps, out, reconstruct(Capture.read(folder), out, steps, PAIRS)
 
 
 def results(out):
@@ -61,9 +74,8 @@ class TestSegments:
         assert plan_segments((3, 4, 6, 9, 10), 2) == ((3, 4), (6, 9), (10,))
         assert plan_segments((3, 4, 6), 3) == plan_segments((3, 4, 6), 0) == ((3, 4, 6),)
 
-    def test_one_segment_keeps_identities(self, capture, tmp_path):
-        steps = FakeSteps()
-        found = reconstruct(capture, tmp_path / "out", steps)
+    def test_one_segment_keeps_identities(self, followed):
+        steps, _, found, _ = followed
         assert steps.calls == ["begin", "advance", "advance", "advance"]
         assert found.sequence.topology == "constant"
         assert found.sequence.frames_per_second == 12.0
@@ -73,9 +85,8 @@ class TestSegments:
         assert moved == sorted(moved)
         assert moved[1] > 0.0
 
-    def test_segments_share_no_identity(self, capture, tmp_path):
-        steps = FakeSteps()
-        found = reconstruct(capture, tmp_path / "out", steps, PAIRS)
+    def test_segments_share_no_identity(self, paired):
+        steps, _, found = paired
         assert steps.calls == ["begin", "advance", "begin", "advance"]
         assert found.sequence.topology == "perFrame"
         assert found.report["segments"] == [0, 2]
@@ -103,7 +114,11 @@ class TestSegments:
         assert any("frame 2: lost (too bright), fitted anew" in step[3] for step in said if len(step) > 3)
 
     def test_frames_of_a_range_keep_their_numbers(self, capture, tmp_path):
+        """The asset states them, and how its Gaussians were drawn."""
+        stated = {"raster_antialiased": "true", "raster_low_pass": "0.3", "capture_frames": "1 3"}
         found = reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(frames=(1, 3)))
+        assert found.sequence.metadata.items() >= stated.items()
+        assert read(found.asset).metadata.items() >= stated.items()
         assert sorted(path.name for path in (tmp_path / "out" / "frames").glob("*.h5")) == [
             "frame_000001.h5",
             "frame_000003.h5",
@@ -112,9 +127,8 @@ class TestSegments:
 
 
 class TestOutputs:
-    def test_all_is_written_and_valid(self, capture, tmp_path):
-        out = tmp_path / "out"
-        found = reconstruct(capture, out, FakeSteps(), PAIRS)
+    def test_all_is_written_and_valid(self, paired):
+        _, out, found = paired
         assert validate(found.asset).is_valid
         back = read(found.asset)
         assert len(back) == 4
@@ -130,30 +144,22 @@ class TestOutputs:
             assert read_image(out / "previews" / f"frame_{frame:06d}.png").width > 300
         assert not [path for path in out.rglob("*") if path.name.startswith(".")]
 
-    def test_how_it_was_drawn_and_which_frames_it_shows_are_stated(self, capture, tmp_path):
-        stated = {"raster_antialiased": "true", "raster_low_pass": "0.3", "capture_frames": "1 3"}
-        found = reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(frames=(1, 3)))
-        assert found.sequence.metadata.items() >= stated.items()
-        assert read(found.asset).metadata.items() >= stated.items()
-
-    def test_drift_is_said(self, tmp_path):
-        capture = Capture.read(write_capture(tmp_path / "capture", range(4)))
-        warnings = reconstruct(capture, tmp_path / "out", FakeSteps()).report["warnings"]
+    def test_drift_is_said(self, followed):
+        warnings = followed[2].report["warnings"]
         assert next(text for text in warnings if "dB" in text).startswith("frame 3 is 3.6 dB below its key frame")
 
-    def test_progress_ends_full(self, capture, tmp_path):
-        said = []
-        reconstruct(capture, tmp_path / "out", FakeSteps(), progress=lambda *step: said.append(step))
+    def test_progress_ends_full(self, followed):
+        said = followed[3]
         assert [step[1:3] for step in said if step[0] == "frames"] == [(done, 4) for done in range(5)]
         assert ("fit", 1, 1, "frame 0, 30.00 dB, 60 Gaussians") in said
         assert ("track", 1, 1, "frame 1, 29.00 dB") in said
 
-    def test_what_the_track_shares_with_the_cloud_is_stored_once(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "out", FakeSteps(), PAIRS)
-        first, third = (set(read_frame(tmp_path / "out" / "frames" / f"frame_{n:06d}.h5")) for n in (0, 2))
+    def test_what_the_track_shares_with_the_cloud_is_stored_once(self, paired):
+        frames = paired[1] / "frames"
+        first, third = (set(read_frame(frames / f"frame_{n:06d}.h5")) for n in (0, 2))
         assert {name for name in first if name.startswith("track_")} == {"track_velocity", "track_age"}
         assert third - first == {"track_ids"}  # local in the track, unique in the cloud
-        cloud = stored_cloud(tmp_path / "out" / "frames" / "frame_000002.h5")
+        cloud = stored_cloud(frames / "frame_000002.h5")
         assert cloud.ids.min() == 2 << ID_BITS
 
 
@@ -182,50 +188,56 @@ class Stop(BaseException):
     """A kill."""
 
 
-def killed_at(monkeypatch, event, *, after):
-    """Make the event-th write of a run raise, before or after it is done; return how many there were."""
-    import beam_warp.reconstruction.job as module
-
+def killed_at(monkeypatch, event):
+    """Make the event-th write of a run raise before it is done; return the writes that there were."""
     seen = []
 
     def watched(function):
         def write(*arguments, **options):
             seen.append(function)
-            if len(seen) == event and not after:
-                raise Stop
-            result = function(*arguments, **options)
             if len(seen) == event:
                 raise Stop
-            return result
+            return function(*arguments, **options)
 
         return write
 
-    for name in ("write_frame", "write_png", "write_json", "write_report"):
-        monkeypatch.setattr(module, name, watched(getattr(module, name)))
+    writes = {frame_store: ("write_frame", "write_png", "write_json"), job_module: ("write_report",)}
+    for module, names in writes.items():
+        for name in names:
+            monkeypatch.setattr(module, name, watched(getattr(module, name)))
     return seen
 
 
+def leave_half_written(out):
+    """Leave what a kill within a frame's and within the asset's writer leaves."""
+    (out / "frames" / ".frame_000001.h5.1.tmp").write_bytes(b"half")
+    (out / ".gaussians.abc").mkdir()
+    (out / ".gaussians.abc" / "half.usdc").write_bytes(b"half")
+
+
 class TestResuming:
-    @pytest.mark.parametrize("after", [False, True])
-    def test_a_kill_at_any_write_changes_no_byte(self, capture, tmp_path, monkeypatch, after):
+    def test_a_kill_at_any_write_changes_no_byte(self, capture, tmp_path, monkeypatch):
+        """Killed before each write, which is the state after the write before it; the last leaves a whole run."""
         options = ReconstructOptions(segment_length=2, frames=(0, 1, 2))
         with monkeypatch.context() as patch:
-            writes = killed_at(patch, 0, after=after)
+            writes = killed_at(patch, 0)
             reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         whole = results(tmp_path / "whole")
         assert len(writes) == 3 * 3 + 1  # Gaussians, preview and note of each frame, and the report
-        for event in range(1, len(writes) + 1):
+        for event in range(1, len(writes) + 2):
             out = tmp_path / f"killed_{event}"
             with monkeypatch.context() as patch:
-                killed_at(patch, event, after=after)
-                with pytest.raises(Stop):
+                killed_at(patch, event)
+                with pytest.raises(Stop) if event <= len(writes) else nullcontext():
                     reconstruct(capture, out, FakeSteps(), options)
+            leave_half_written(out)
             steps = FakeSteps()
             found = reconstruct(capture, out, steps, options)
             assert len(steps.calls) == 3 - found.report["resumed_frames"]
-            assert found.report["resumed_frames"] == min((event + (1 if after else 0) + 1) // 3, 3)
+            assert found.report["resumed_frames"] == min((event + 1) // 3, 3)
             assert not differing(whole, results(out))
 
+    @pytest.mark.slow
     def test_sigkill(self, folder, capture, tmp_path):
         """A process killed while it works, with a frame half written."""
         script = (
@@ -259,49 +271,46 @@ class TestResuming:
         reconstruct(capture, tmp_path / "whole", FakeSteps())
         assert not differing(results(tmp_path / "whole"), results(tmp_path / "out"))
 
-    def test_parts_and_a_final_call_are_the_whole(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "whole", FakeSteps(), PAIRS)
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(2, 2), PAIRS) == (2, 3)
+    def test_parts_and_a_final_call_are_the_whole(self, paired, capture, tmp_path):
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(2, 2), PAIRS) == (2, 3)
         assert not (tmp_path / "out" / "gaussians.usda").exists()
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2), PAIRS) == (0, 1)
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2), PAIRS) == (0, 1)
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps, PAIRS)
         assert steps.calls == []
-        assert not differing(results(tmp_path / "whole"), results(tmp_path / "out"))
+        assert not differing(results(paired[1]), results(tmp_path / "out"))
 
     def test_more_parts_than_segments(self, capture, tmp_path):
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(3, 3), PAIRS) == ()
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(3, 3), PAIRS) == ()
 
-    def test_a_damaged_frame_is_made_again(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "out", FakeSteps())
-        whole = results(tmp_path / "out")
+    def test_a_damaged_frame_is_made_again(self, followed, capture, tmp_path):
+        shutil.copytree(followed[1], tmp_path / "out")
         path = tmp_path / "out" / "frames" / "frame_000001.h5"
         path.write_bytes(path.read_bytes()[:400])
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps)
         assert steps.calls == ["advance"]
-        assert not differing(whole, results(tmp_path / "out"))
+        assert not differing(results(followed[1]), results(tmp_path / "out"))
 
-    def test_a_missing_preview_is_drawn_again(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "out", FakeSteps())
-        whole = results(tmp_path / "out")
+    def test_a_missing_preview_is_drawn_again(self, followed, capture, tmp_path):
+        shutil.copytree(followed[1], tmp_path / "out")
         (tmp_path / "out" / "previews" / "frame_000002.png").unlink()
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps)
         assert steps.calls == []
-        assert not differing(whole, results(tmp_path / "out"))
+        assert not differing(results(followed[1]), results(tmp_path / "out"))
 
 
 class TestStaleness:
     """Nothing that was made from something else is taken, and nothing is made twice from the same."""
 
-    def test_other_options_start_over(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "out", FakeSteps())
+    def test_other_options_start_over(self, followed, capture, tmp_path):
+        shutil.copytree(followed[1], tmp_path / "out")
         assert reconstruct(capture, tmp_path / "out", FakeSteps(seed=1)).report["resumed_frames"] == 0
         assert reconstruct(capture, tmp_path / "out", FakeSteps(count=50), PAIRS).report["resumed_frames"] == 0
 
-    def test_other_segments_keep_what_they_may(self, capture, tmp_path):
-        reconstruct(capture, tmp_path / "out", FakeSteps())
+    def test_other_segments_keep_what_they_may(self, followed, capture, tmp_path):
+        shutil.copytree(followed[1], tmp_path / "out")
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps, PAIRS)
         assert steps.calls == ["begin", "advance"]  # 0 and 1 are as they were; 2 is a key frame now, and 3 follows it
@@ -322,18 +331,18 @@ class TestStaleness:
         assert not differing(results(tmp_path / "fresh"), results(tmp_path / "out"))
         assert found.report["resumed_frames"] == 2
 
-    def test_a_camera_that_changes(self, tmp_path):
+    def test_a_camera_that_changes(self, followed, tmp_path):
         folder = write_capture(tmp_path / "capture", FRAMES)
-        reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps())
+        shutil.copytree(followed[1], tmp_path / "out")
         content = json.loads((folder / "transforms.json").read_text())
         content["fl_x"] = 24.5
         (folder / "transforms.json").write_text(json.dumps(content))
         assert reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps()).report["resumed_frames"] == 0
 
-    def test_a_moved_capture_is_the_same(self, tmp_path):
-        first, second = (write_capture(tmp_path / name, FRAMES) for name in ("first", "second"))
-        reconstruct(Capture.read(first), tmp_path / "out", FakeSteps())
-        assert reconstruct(Capture.read(second), tmp_path / "out", FakeSteps()).report["resumed_frames"] == 4
+    def test_a_moved_capture_is_the_same(self, followed, tmp_path):
+        shutil.copytree(followed[1], tmp_path / "out")
+        moved = Capture.read(write_capture(tmp_path / "moved", FRAMES))
+        assert reconstruct(moved, tmp_path / "out", FakeSteps()).report["resumed_frames"] == 4
 
     def test_settled_images_are_read_once_for_their_digest(self, tmp_path, monkeypatch):
         folder = write_capture(tmp_path / "capture", (0, 1))
@@ -380,9 +389,9 @@ class TestMistakes:
 
     def test_parts(self, capture, tmp_path):
         with pytest.raises(InvalidOptionError, match="part must be I/N"):
-            Part(0, 2)
+            SegmentShare(0, 2)
         with pytest.raises(InvalidOptionError, match="segment_length must be at least 1 to work in parts"):
-            reconstruct_part(capture, tmp_path / "out", FakeSteps(), Part(1, 2))
+            reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2))
 
     def test_a_folder_that_cannot_be_made(self, capture, tmp_path):
         with pytest.raises(OutputError, match="out must be a folder that can be made"):

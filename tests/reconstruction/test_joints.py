@@ -1,4 +1,4 @@
-"""Joints on the host: which Gaussians they are, how they hang together, how edges stretch, where they go next."""
+"""Joints on the host: which Gaussians they are, how they hang together, which ones are torn."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joint_selection import select_joints
-from beam_warp.reconstruction.joints import JointGraph, stretch
+from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
+from beam_warp.reconstruction.joints.selection import select_joints
 
 EPSILON = 2.0**-24
 """Largest relative rounding of a float32."""
@@ -59,7 +59,7 @@ class TestSelection:
         assert (rows < 10_000).all()
 
     def test_second_object(self, rng):
-        """What is apart, but a surface itself, is not isolated."""
+        """A surface apart from the others is not isolated."""
         ball = 0.1 * sphere(rng, 200) + np.array([3.0, 0, 0])
         rows = select_joints(np.concatenate([sphere(rng, 10_000), ball]), 1000)
         assert 1 <= (rows >= 10_000).sum() <= 50
@@ -174,38 +174,30 @@ class TestGraph:
             JointGraph.build(np.eye(3), 65)
 
 
-class TestStretch:
+class TestTorn:
     def test_closed_form(self):
+        """A line of joints 1 apart, its middle edge stretched to more and to less than twice as long."""
         joints = np.arange(4.0)[:, None] * [1.0, 0, 0]
-        now = np.array([0.0, 1.0, 3.5, 4.5])[:, None] * [1.0, 0, 0]
-        found = stretch(JointGraph.build(joints, 1), joints, now)
-        # each joint's nearest: 0-1, 1-0, 2-1 (stretched to 2.5) or 2-3, 3-2; ties are the tree's
-        assert found.smallest == 1.0
-        assert found.median == 1.0
         graph = JointGraph.build(joints, 2)
-        found = stretch(graph, joints, now)
-        assert found.largest == pytest.approx(2.5, rel=1e-5)
-        assert found.torn == 0.5  # joints 1 and 2, from either side
+        for length, torn in ((2.5, 0.5), (1.9, 0.0), (0.4, 0.5)):
+            now = np.array([0.0, 1.0, 1.0 + length, 2.0 + length])[:, None] * [1.0, 0, 0]
+            assert torn_fraction(graph, joints, now) == torn  # joints 1 and 2, from either side
 
     def test_rigid_motion(self, rng):
         joints = rng.uniform(size=(50, 3))
         now = Rotation.from_rotvec([1.0, 2.0, -0.5]).apply(joints) + 3.0
-        found = stretch(JointGraph.build(joints), joints, now)
-        assert np.abs(found.ratios - 1.0).max() <= 1e-12
-        assert found.torn == 0.0
+        assert torn_fraction(JointGraph.build(joints), joints, now) == 0.0
 
     def test_edges_that_are_not_there(self):
         joints, facing = two_sheets(2, 0.1)
-        graph = JointGraph.build(joints, normals=facing)
         now = joints + np.array([0, 0, 5.0]) * (np.arange(8) >= 4)[:, None]
-        found = stretch(graph, joints, now)
-        assert (found.ratios == 1.0).all()
-        assert stretch(JointGraph.build(joints), joints, now).torn == 1.0
+        assert torn_fraction(JointGraph.build(joints, normals=facing), joints, now) == 0.0
+        assert torn_fraction(JointGraph.build(joints), joints, now) == 1.0
 
     def test_one_joint(self):
-        assert stretch(JointGraph.build(np.zeros((1, 3))), np.zeros((1, 3)), np.ones((1, 3))).largest == 1.0
+        assert torn_fraction(JointGraph.build(np.zeros((1, 3))), np.zeros((1, 3)), np.ones((1, 3))) == 0.0
 
     def test_refusals(self):
         graph = JointGraph.build(np.eye(3))
         with pytest.raises(InvalidArrayError, match=r"positions must have shape \(3, 3\), got \(2, 3\)"):
-            stretch(graph, np.eye(3), np.eye(3)[:2])
+            torn_fraction(graph, np.eye(3), np.eye(3)[:2])

@@ -10,8 +10,9 @@ from reference.skinning import product
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.reconstruction.joints import JointGraph
-from beam_warp.reconstruction.motion_losses import RigidityLoss, TemporalLoss
+from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.rigidity import RigidityLoss
+from beam_warp.reconstruction.temporal import TemporalLoss
 
 EPSILON = 2.0**-24
 """Largest relative rounding of a float32."""
@@ -116,7 +117,7 @@ class TestRigidity:
         expected = 0.3 * twin.rigidity(graph.neighbors, graph.weights, graph.spacing, *poses)
         assert found == pytest.approx(expected, rel=200.0 * EPSILON)
 
-    @pytest.mark.parametrize(("count", "neighbor_count"), [(2, 8), (5, 8), (40, 3), (60, 8)])
+    @pytest.mark.parametrize(("count", "neighbor_count"), [(2, 8), (40, 3)])
     @pytest.mark.parametrize(("angle", "shift"), [(0.5, 0.1), (1e-3, 1e-3)])
     def test_gradients(self, device, rng, count, neighbor_count, angle, shift):
         """Also between two frames, where the motion is a thousandth of the edges."""
@@ -192,23 +193,23 @@ class TestTemporal:
     def test_closed_form(self, device):
         values, reference = (wp.full(4, x, dtype=float, device=device) for x in (0.75, 0.5))
         gradient = wp.zeros(4, dtype=float, device=device)
-        loss = TemporalLoss(4, device=device)(values, reference, weight=2.0, unit=0.5, gradient=gradient)
+        loss = TemporalLoss((4, 1), device=device)(values, reference, weight=2.0, unit=0.5, gradient=gradient)
         assert value(loss) == 0.5
         assert (gradient.numpy() == 2.0 * 2.0 * 0.25 / 0.25 / 4.0).all()
 
     @pytest.mark.parametrize(("kind", "width"), [(float, None), (float, 5), (wp.vec3, 3), (wp.quat, 4), (wp.vec4, 4)])
-    @pytest.mark.parametrize("count", [1, 1023, 1025])
+    @pytest.mark.parametrize("count", [1, 1025])
     def test_twin(self, device, rng, kind, width, count):
         shape = (count,) if width is None else (count, width)
         now, before = (single(rng.standard_normal(shape)) for _ in range(2))
         arrays = [wp.array(a.astype(np.float32), dtype=kind, device=device) for a in (now, before, 0.0 * now)]
-        loss = TemporalLoss(shape, device=device)(*arrays[:2], weight=0.3, unit=0.1, gradient=arrays[2])
+        loss = TemporalLoss((count, width or 1), device=device)(*arrays[:2], weight=0.3, unit=0.1, gradient=arrays[2])
         assert value(loss) == pytest.approx(0.3 * twin.temporal(now, before, 0.1), rel=8.0 * EPSILON)
         expected = 2.0 * 0.3 * (now - before) / 0.1**2 / now.size
         assert relative_error(arrays[2].numpy(), expected) <= 8.0 * EPSILON
 
     def test_some_columns(self, device, rng):
-        """As spherical harmonics beyond degree 0 are some columns of all."""
+        """Spherical harmonics beyond degree 0 are some columns of all."""
         rows = wp.array(rng.standard_normal((7, 6)).astype(np.float32), dtype=float, device=device)
         reference = wp.zeros((7, 4), dtype=float, device=device)
         gradient = wp.zeros((7, 6), dtype=float, device=device)
@@ -225,7 +226,5 @@ class TestTemporal:
             loss(rows.numpy(), rows)
         with pytest.raises(InvalidOptionError, match="unit must be a number in"):
             loss(rows, rows, unit=0.0)
-        with pytest.raises(InvalidOptionError, match=r"shape must be \(N,\) or \(N, K\), got \(4, 3, 3\)"):
-            TemporalLoss((4, 3, 3), device="cpu")
         with pytest.raises(InvalidOptionError, match=r"shape\[1\] must be an integer in"):
             TemporalLoss((4, 0), device="cpu")

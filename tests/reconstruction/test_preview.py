@@ -37,7 +37,7 @@ def ball():
 
 
 def photograph(ball, where, *, factor=1.0, alpha=True):
-    """What the ball looks like, times a factor."""
+    """Return a photograph of the ball, its colours times a factor."""
     buffer = rasterize(ball, where, channels=("radiance",), device="cpu")
     color = buffer.channels["radiance"] * buffer.alpha[..., None] * np.float32(factor)
     covered = np.clip(buffer.alpha, 0.0, 1.0)

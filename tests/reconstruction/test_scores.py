@@ -7,12 +7,12 @@ from skimage.metrics import structural_similarity
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
+from beam_warp.image.metrics import block_means
 from beam_warp.raster.gbuffer import GBuffer, rasterize
-from beam_warp.reconstruction.scores import block_means, read_truth_mesh, score_frame, seen_radiance, truth_frames
+from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-
-SH_BASIS_0 = 0.28209479177387814
+from beam_warp.world.harmonics import SH_C0
 
 DISCS = 20_000
 
@@ -32,7 +32,7 @@ def discs(tiny_capture):
         orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
         scales=np.tile([spacing, spacing, 0.05 * spacing], (DISCS, 1)),
         opacities=np.full(DISCS, 0.99),
-        radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
+        radiance=((color - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
     )
 
@@ -114,7 +114,7 @@ class TestViews:
         }  # fmt: skip
 
     def test_a_pixel_is_the_mean_of_its_samples(self, tiny_capture, discs, device):
-        """In linear light, before it is encoded; what geometry says is measured as without samples."""
+        """The mean is taken in linear light, before it is encoded; geometry is measured as without samples."""
         records = tiny_capture.select(split="test", frames=[0])
         once, fine = (score_frame(discs, records, samples=samples, device=device).as_dict() for samples in (1, 3))
         buffer = rasterize(discs, records[0].camera.supersampled(3), channels=("radiance",), device=device)

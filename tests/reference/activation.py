@@ -1,4 +1,4 @@
-"""What is drawn of what an optimiser moves, in float64 and as the papers write it; arrays may be complex."""
+"""Scales and opacities that are drawn, in float64 and as the papers write them; arrays may be complex."""
 
 import numpy as np
 

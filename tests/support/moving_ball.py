@@ -7,10 +7,9 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
 
 RADIUS = 0.5
-
-SH_BASIS_0 = 0.28209479177387814
 
 SAMPLES = 4
 """Side of the square of rays of a pixel."""
@@ -72,7 +71,7 @@ def ball_cloud(count=300, *, radius=RADIUS, painted=True):
         orientations=turns / np.linalg.norm(turns, axis=1, keepdims=True),
         scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
         opacities=np.full(count, 0.8),
-        radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
+        radiance=((color - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
         ids=np.arange(count),
     )

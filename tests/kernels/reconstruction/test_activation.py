@@ -92,7 +92,7 @@ class TestClosedForms:
         assert own == pytest.approx(1.0, rel=16 * EPSILON)  # ds/dlog s = s: the same axis on the way back
 
 
-@pytest.mark.parametrize("count", [1, 255, 1025])
+@pytest.mark.parametrize("count", [1, 1025])
 class TestTwin:
     def test_forward(self, device, rng, count):
         log_scales, logits, filters = random_shapes(rng, count)

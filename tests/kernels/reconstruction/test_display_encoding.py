@@ -26,7 +26,7 @@ def upload(array, device):
 
 
 def strided(array, device, columns=7):
-    """The same image as some channels of wider rows, as a rasteriser has it."""
+    """Upload an image as some channels of wider rows, as a rasteriser has it."""
     wide = np.full((*array.shape[:2], columns), np.nan, np.float32)
     wide[..., 2 : 2 + array.shape[2]] = array
     return upload(wide, device)[:, :, 2 : 2 + array.shape[2]]
@@ -50,14 +50,11 @@ def slopes(values):
     return np.where(values > KNEE, 1.055 / 2.4 * np.maximum(values, KNEE) ** (1.0 / 2.4 - 1.0), 12.92)
 
 
-@pytest.mark.parametrize(("linear", "display"), [(0.0, 0.0), (0.001, 0.01292), (1.0, 1.0), (0.5, 0.735356983052)])
+@pytest.mark.parametrize(
+    ("linear", "display"), [(0.0, 0.0), (0.001, 0.01292), (1.0, 1.0), (0.5, 0.735356983052), (4.0, 1.824796295276)]
+)
 def test_values_of_the_curve(device, linear, display):
     assert encoded(np.full((1, 1, 1), linear), 1, device)[0, 0, 0] == pytest.approx(display, rel=ROUNDINGS * EPSILON)
-
-
-def test_above_one_the_curve_goes_on(device):
-    found = encoded(np.full((1, 1, 1), 4.0), 1, device)[0, 0, 0]
-    assert found == pytest.approx(1.055 * 4.0 ** (1 / 2.4) - 0.055, rel=ROUNDINGS * EPSILON)
 
 
 def test_the_knee_is_no_step(device):
@@ -69,8 +66,8 @@ def test_the_knee_is_no_step(device):
 
 
 @pytest.mark.parametrize("bring", [upload, strided])
-@pytest.mark.parametrize("factor", [1, 2, 4])
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 3), (33, 35)])
+@pytest.mark.parametrize("factor", [1, 4])
+@pytest.mark.parametrize("size", [(1, 9), (33, 35)])
 class TestImages:
     def test_encoding_is_of_the_mean(self, device, rng, size, factor, bring):
         """A pixel half black, half white is encoded 0.5, not the mean of encoded 0 and 1."""
@@ -106,7 +103,7 @@ class TestImages:
 
 
 def test_gradients_are_central_differences(device, rng):
-    """Of the float64 curve, whose step at the knee no difference reaches: means stay 1e-3 of it away."""
+    """Differences of the float64 curve do not reach its step at the knee: means stay 1e-3 of it away."""
     samples = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (6, 8, 3))).astype(np.float32)
     values = means(samples, 2)
     samples[0::2, 0::2][np.abs(values / KNEE - 1.0) < 0.1] += 1e-3

@@ -1,4 +1,4 @@
-"""Which joints hang together, and which joints a point is near: nearest neighbours with weights, on the host.
+"""The graph of joints, and the joints near a point: nearest neighbours with weights, on the host.
 
 Lengths are measured in joint spacings, the median distance from a joint to the nearest one that it goes with, never in
 metres: a subject of 2 m and one of 2 mm get the same graph.
@@ -21,11 +21,11 @@ REACH = 1.5
 joint then has about a quarter of the weight of the nearest."""
 
 SMALLEST_COSINE = -0.2
-"""Of two normals, for what they belong to to count as one surface: up to 101 degrees, so that a right angle, such as
-the edge of a box, still does where normals are 10 degrees off."""
+"""Least cosine between the normals of two joints of one surface: up to 101 degrees, so that the faces at a right angle,
+such as the edge of a box, still count as one where normals are 10 degrees off."""
 
 CANDIDATES = 3
-"""Neighbours looked at for one that is kept, where normals may rule some out: of two sheets in contact half are."""
+"""Neighbours looked at for each one that is kept, where normals may rule some out: of two sheets in contact, half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,12 @@ class JointGraph:
         """Connect every joint to its nearest ones, with weights exp(-d^2 / l^2), l = 1.5 spacings, that add up to 1.
 
         Args:
-            joint_positions: ``(M, 3)``.
+            joint_positions: The joints, ``(M, 3)``.
             neighbor_count: Edges that leave a joint, k; M - 1 if there are fewer joints.
             normals: Which way the surface faces at each joint, outward, ``(M, 3)`` of any length; 0 where unknown.
                 Joints that face apart are then not connected: an arm on a hip is near it in space, far along the
                 surface, and must come off. They are, nearest ones, where no joint near faces otherwise.
-            smallest_cosine: Of the normals of two joints that do not face apart.
+            smallest_cosine: Least cosine between the normals of two joints that do not face apart.
 
         Raises:
             InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
@@ -84,27 +84,10 @@ class JointGraph:
         return cls(ends, weights, edges, starts, spacing)
 
 
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """How much longer edges are than at rest.
+def torn_fraction(graph: JointGraph, rest_positions: ArrayLike, positions: ArrayLike) -> float:
+    """Return the fraction of joints with an edge more than twice as long as at rest, or less than half.
 
-    Attributes:
-        ratios: Length over length at rest, ``(M, k)`` float64; 1 for edges that are not there.
-        smallest: The smallest of them.
-        median: Their median, of edges that are there.
-        largest: The largest of them.
-        torn: Fraction of the joints with an edge that is more than twice as long as at rest, or less than half.
-    """
-
-    ratios: NDArray[np.float64]
-    smallest: float
-    median: float
-    largest: float
-    torn: float
-
-
-def stretch(graph: JointGraph, rest_positions: ArrayLike, positions: ArrayLike) -> Stretch:
-    """Compare lengths of edges: skin stretches a little; where tracking is lost or the topology changes, a lot.
+    Skin stretches a little; where tracking is lost or the topology changes, edges stretch a lot.
 
     Args:
         graph: Of the joints.
@@ -124,11 +107,8 @@ def stretch(graph: JointGraph, rest_positions: ArrayLike, positions: ArrayLike) 
     old, new = (np.linalg.norm(x[graph.neighbors] - x[:, None], axis=-1) for x in (before, after))
     # Joints that coincide at rest must not divide by 0; a millionth of the spacing is nothing beside any edge.
     floor = 1e-6 * graph.spacing
-    there = graph.weights > 0.0
-    ratios = np.where(there, (new + floor) / (old + floor), 1.0)
-    found = ratios[there] if there.any() else np.ones(1)
-    torn = ((ratios > 2.0) | (ratios < 0.5)).any(axis=1)
-    return Stretch(ratios, float(found.min()), float(np.median(found)), float(found.max()), float(torn.mean()))
+    ratios = np.where(graph.weights > 0.0, (new + floor) / (old + floor), 1.0)
+    return float(((ratios > 2.0) | (ratios < 0.5)).any(axis=1).mean())
 
 
 def joint_spacing(
@@ -219,7 +199,7 @@ def _spacing(squared: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Facing:
-    """Which way points and joints face, of unit length or 0, and how far apart those may that go together."""
+    """Directions that points and joints face, of unit length or 0, and the least cosine of those that go together."""
 
     points: NDArray[np.float64]
     joints: NDArray[np.float64]
@@ -235,7 +215,7 @@ class _Facing:
 def _facing(
     points: NDArray[np.float64] | None, joints: NDArray[np.float64] | None, smallest_cosine: float
 ) -> _Facing | None:
-    """Return which way both face, or None if either is not told."""
+    """Return the directions of both, or None if either is not known."""
     cosine = require_number("smallest_cosine", smallest_cosine, -1.0, 1.0)
     return None if points is None or joints is None else _Facing(points, joints, cosine)
 

@@ -1,4 +1,4 @@
-"""How skin Gaussians follow joints: what they are anchored to, the warp by the joints' poses, and its gradients."""
+"""Skinning: anchors of Gaussians to joints, the warp by the joints' poses, and its gradients."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from beam_warp.kernels.reconstruction.skinning import (
     launch_warp_skin,
     launch_write_messages,
 )
-from beam_warp.reconstruction.joints import (
+from beam_warp.reconstruction.joints.graph import (
     REACH,
     SMALLEST_COSINE,
     group_by,
@@ -35,16 +35,17 @@ from beam_warp.reconstruction.joints import (
 )
 
 BLENDS = ("linear", "dual")
-"""How the motions of several joints become one: as matrices' effect on points, or as dual quaternions."""
+"""Ways to blend the motions of several joints: of the points that they move, or of dual quaternions."""
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Which joints carry each skin.
+    """The joints that carry each skin Gaussian, and their weights.
 
     Attributes:
-        joints: Nearest first, ``(N, k)`` int32.
-        weights: Not negative, the first the largest of its row, each row adds up to 1, ``(N, k)`` float32.
+        joints: Numbers of the joints, nearest first, ``(N, k)`` int32.
+        weights: Weights of the joints, ``(N, k)`` float32: not negative, the first the largest of its row; each row
+            adds up to 1.
     """
 
     joints: NDArray[np.int32]
@@ -66,13 +67,13 @@ class Anchors:
         A skin that is far from every joint (several l) follows the nearest.
 
         Args:
-            positions: Of the skins at rest, ``(N, 3)``.
-            joint_positions: At rest, ``(M, 3)``.
+            positions: Positions of the skins at rest, ``(N, 3)``.
+            joint_positions: Positions of the joints at rest, ``(M, 3)``.
             neighbor_count: Joints for a skin, k; M if there are fewer.
             normals: Which way the surface faces at each skin, outward, ``(N, 3)`` of any length; 0 where unknown.
             joint_normals: The same of the joints, ``(M, 3)``. With both, joints that face apart from a skin do not
                 carry it, unless all near ones do; see `JointGraph.build`.
-            smallest_cosine: Of the normals of a skin and a joint that do not face apart.
+            smallest_cosine: Least cosine between the normals of a skin and a joint that do not face apart.
 
         Raises:
             InvalidArrayError: An array has another shape, is not finite, or most joints coincide.
@@ -105,7 +106,7 @@ class Skin:
         rest_orientations: ``(N,)`` quat; likewise. Their lengths are kept.
         joint_rest_positions: ``(M,)`` vec3; likewise.
         blend: ``"linear"`` or ``"dual"``.
-        device: Where they are.
+        device: Warp device that holds them.
 
     Source: Jiang et al. 2024, DualGS (anchors, linear blend); Kavan et al. 2008, "Geometric Skinning with Approximate
     Dual Quaternion Blending"; `docs/tracking.md` lists what differs.
@@ -126,7 +127,7 @@ class Skin:
         Args:
             rest_positions: ``(N, 3)``.
             rest_orientations: Quaternions xyzw, ``(N, 4)``.
-            anchors: Of the N skins to the M joints.
+            anchors: Anchors of the N skins to the M joints.
             joint_rest_positions: ``(M, 3)``.
             blend: ``"linear"`` or ``"dual"``.
             device: Warp device; the first GPU without, or the CPU where there is none.

@@ -1,4 +1,4 @@
-"""Which Gaussians become joints: some that cover the surface evenly."""
+"""Selection of the Gaussians that become joints: some that cover the surface evenly."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from beam_warp.checks import require_array, require_count, require_finite, requi
 from beam_warp.errors import InvalidArrayError
 
 OVERSAMPLING = 5
-"""Candidates for a joint, at least: with 5 the farthest of them is near where the farthest point of all would be."""
+"""Least number of candidates for a joint: with 5, the farthest of them is near the farthest point of all."""
 
 NEIGHBORS = 8
-"""Gaussians that must be near one for it to be of a surface."""
+"""Neighbours that a Gaussian of a surface must have."""
 
 FAINTEST = 0.1
 """Opacity below which a Gaussian is no joint, as DualGS prunes them (Jiang et al. 2024, released code)."""

@@ -1,4 +1,4 @@
-"""How far a subject moves from one frame to the next, as its cameras see it."""
+"""Motion of a subject from one frame to the next, in pixels of its cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def motion_in_pixels(
     Args:
         before: Points [m], ``(N, 3)``.
         after: The same points [m], ``(N, 3)``.
-        cameras: That look at them; points beside the image count too, points behind the camera do not.
+        cameras: Cameras that look at the points; points beside the image count too, points behind the camera do not.
     """
     farthest = np.zeros(len(before))
     for camera in cameras:

@@ -1,0 +1,1 @@
+"""The steps of a reconstruction job: plan the frames, read their images, model them, store them, report."""
