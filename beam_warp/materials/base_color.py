@@ -64,6 +64,14 @@ class BaseColor:
     observability: NDArray[np.uint8]
     clipped_part: float
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return base colour, its standard error and observability by the names that a cloud has for them."""
+        return {
+            "base_color": self.base_color,
+            "base_color_error": self.standard_error,
+            "observability": self.observability,
+        }
+
 
 def solve_base_color(
     cloud: GaussianCloud, evidence: ColorEvidence, mean_irradiance: float, *, dispersion: float = 1.0

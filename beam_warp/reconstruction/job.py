@@ -37,6 +37,7 @@ from beam_warp.capture.inspect import SPLIT, require_reconstructable
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device
+from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.files import write_png
@@ -371,7 +372,7 @@ class _Job:
         self._seconds: dict[int, float] = {}
         self._base = json.dumps(
             {
-                "version": __version__,
+                "code": code_digest(),
                 "device": "cuda" if self._device.is_cuda else "cpu",
                 "options": steps.options(),
             },
