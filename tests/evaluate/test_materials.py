@@ -14,7 +14,7 @@ from support.figure_asset import OPENNESS, changed, figure_asset
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
-from beam_warp.evaluate.materials import score_materials, stated_raster
+from beam_warp.evaluate.materials import score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.relighters import DeferredRelighter, RelitImage
 from beam_warp.image.files import read_image
@@ -305,15 +305,6 @@ class TestWhatIsThere:
         assert all(image.shape == truth.shape and image.shape[2] == 3 for image, truth in seen)
         # Scaled colours differ by rounding: 1e-6 of colour, at most 12.92 times as much when encoded.
         assert all(score.perceptual["flip"] < 2e-5 for score in found.mean_channels().values())
-
-
-def test_the_filter_that_an_asset_states():
-    assert stated_raster({}) == RasterOptions()
-    stated = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
-    assert stated_raster(stated) == RasterOptions(antialiased=True, low_pass=0.1)
-    for wrong in ({"raster_antialiased": "maybe"}, {"raster_low_pass": "soft"}, {"raster_low_pass": "-1"}):
-        with pytest.raises(InvalidOptionError):
-            stated_raster(wrong)
 
 
 def test_a_capture_without_relit_images_is_scored_all_the_same(asset, mirror):
