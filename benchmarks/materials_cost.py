@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
-from materials_contenders import OURS, Decomposed, Method, Stages, Subject, SubjectFrame, by_images, direct
+from materials_contenders import OURS, Decomposed, Method, Subject, SubjectFrame, by_images, direct
 from materials_truth import SHARP, Row
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.demo.capture import dome_cameras
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.light.prepared import MaterialLight
 from beam_warp.materials.images import crop_to_subject
 from beam_warp.raster.gbuffer import upload_gaussians
@@ -133,7 +134,7 @@ def measure_cost(
 
 def cut_first(subject: Subject) -> Decomposed:
     """Cut views to the subject, then decompose by the direct path."""
-    stages = Stages(subject.device)
+    stages = StageTimer(subject.device)
     with stages("cut views"):
         frames = [replace(frame, views=[crop_to_subject(view) for view in frame.views]) for frame in subject.frames]
     found = direct(replace(subject, frames=frames), OURS.but(joint=False))

@@ -38,7 +38,7 @@ class StageTimer:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-class FrameLog:
+class JobLog:
     """Progress and seconds of a job that works frame by frame.
 
     Attributes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from beam_warp.capture.findings import Finding
 from beam_warp.digests import array_digest
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import kept_frame
 from beam_warp.light.prepared import MaterialLight
@@ -51,7 +51,7 @@ class CaptureLight:
 
 
 def capture_light(
-    environment: EnvironmentMap, source: Source, options: RunOptions, described: str, folder: Path, log: FrameLog
+    environment: EnvironmentMap, source: Source, options: RunOptions, described: str, folder: Path, log: JobLog
 ) -> CaptureLight:
     """Prepare an environment and find its exposure.
 
@@ -80,7 +80,7 @@ def capture_light(
     return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops)
 
 
-def _exposure_stops(frame: SeenFrame, light: MaterialLight, options: RunOptions, log: FrameLog) -> float:
+def _exposure_stops(frame: SeenFrame, light: MaterialLight, options: RunOptions, log: JobLog) -> float:
     """Return the stops by which the light explains a frame best."""
     scene, points = frame.scene, frame.points
     # Highlights cannot be told from the light before its exposure is known.
@@ -93,7 +93,7 @@ def _exposure_stops(frame: SeenFrame, light: MaterialLight, options: RunOptions,
 
 
 def light_findings(
-    frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str, log: FrameLog
+    frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str, log: JobLog
 ) -> list[dict[str, Any]]:
     """Look at the light and the images of a frame before anything is measured.
 

@@ -12,9 +12,7 @@ open surface on average, nor where a pixel is not covered by the subject wholly,
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -36,15 +34,15 @@ from beam_warp.checks import (
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixels, launch_write_bake_targets
 from beam_warp.light.sampled import SampledEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
+from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
-    DIFFUSE_WEIGHTS,
     FEWEST_LIGHT_SAMPLES,
     SURFACE_DEPTHS,
-    DiffuseWeight,
     SurfaceDepth,
     ViewSurfaces,
     surface_occlusion,
@@ -95,7 +93,7 @@ class ImagePathOptions:
         steps: Steps of ``"adam"``.
         ridge: See `beam_warp.materials.bake.BakeOptions`.
         temporal: Pull of the base colour towards the previous frame's, in pixels.
-        diffuse_weight: See `beam_warp.materials.residues.DIFFUSE_WEIGHTS`.
+        diffuse_weight: See `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
         surface_depth: See `beam_warp.materials.residues.SURFACE_DEPTHS`.
         seed: Same seed, same device, same bits.
 
@@ -122,7 +120,7 @@ class ImagePathOptions:
         require_count("light_samples", self.light_samples, FEWEST_LIGHT_SAMPLES, 1 << 20)
         require_number("offset", self.offset)
         require_choice("denoiser", self.denoiser, DENOISERS)
-        require_choice("diffuse_weight", self.diffuse_weight, DIFFUSE_WEIGHTS)
+        require_choice("diffuse_weight", self.diffuse_weight, tuple(DIFFUSE_WEIGHTS))
         require_choice("surface_depth", self.surface_depth, SURFACE_DEPTHS)
         self.baking(temporal=self.temporal)
 
@@ -220,7 +218,7 @@ def decompose_by_images(
         require_finite("previous", before)
     require_count("frame", frame, 0, 2**32 - 1)
 
-    stages = _Stages(scene.device)
+    stages = StageTimer(scene.device)
     with stages("upload"):
         gaussians = upload_gaussians(cloud, scene.device, values=rough[:, None])
     drawn_as = raster_options or RasterOptions()
@@ -263,21 +261,6 @@ _DENOISER_NOTES = {
 }
 
 
-class _Stages:
-    """Seconds by stage; waits for the device, so that work is charged to the stage that asked for it."""
-
-    def __init__(self, device: Any) -> None:
-        self.seconds: dict[str, float] = {}
-        self._device = device
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        wp.synchronize_device(self._device)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
 def crop_to_subject(view: CapturedView) -> CapturedView:
     """Return the part of a view that shows the subject, with a margin; all of it where coverage is not known.
 
@@ -310,7 +293,7 @@ def _measure_view(
     raster_options: RasterOptions,
     number: int,
     denoiser: Denoiser,
-    stages: _Stages,
+    stages: StageTimer,
 ) -> _MeasuredView:
     """Find base colour and ambient occlusion of a view's pixels, to be baked."""
     device = scene.device
@@ -370,7 +353,7 @@ def _bake(
     options: ImagePathOptions,
     raster_options: RasterOptions,
     previous: NDArray[np.float32] | None,
-    stages: _Stages,
+    stages: StageTimer,
     device: Any,
 ) -> tuple[BakedValues, NDArray[np.bool_]]:
     """Bake the images, and fill what no view sees from its neighbours."""

@@ -25,7 +25,7 @@ from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
-from beam_warp.jobs.progress import FrameLog, Progress, no_progress
+from beam_warp.jobs.progress import JobLog, Progress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
 from beam_warp.materials.archive import FrameArchive
@@ -107,7 +107,7 @@ def run(
             "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
         )
     folder, digests = make_folders(out, "frames", "digests")
-    log = FrameLog(progress, len(sequence), device)
+    log = JobLog(progress, len(sequence), device)
     persistent = chosen.persistent or sequence.topology == "constant"
 
     source = Source(sequence, images, chosen.materials, digests=digests, device=str(device), log=log)

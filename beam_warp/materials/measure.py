@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.digests import array_digest
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.light.prepared import MaterialLight
 from beam_warp.materials.archive import FrameArchive, MeasuredFrame
 from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
@@ -40,7 +40,7 @@ class FrameMeasurement:
         options: MaterialOptions | ImagePathOptions,
         persistent: bool,
         key: str,
-        log: FrameLog,
+        log: JobLog,
     ) -> None:
         """Take what frames are measured with.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.digests import array_digest
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.jobs.store import kept_frame
 from beam_warp.light.prepared import MaterialLight
 from beam_warp.materials.options import ESTIMATE, RunOptions
@@ -38,7 +38,7 @@ class RoughnessFinder:
         persistent: bool,
         key: str,
         folder: Path,
-        log: FrameLog,
+        log: JobLog,
     ) -> None:
         """Take what roughness is estimated from.
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.base_color import fill_from_neighbors
 from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.direct import MaterialOptions
@@ -37,7 +37,7 @@ class SeenFrame:
         options: MaterialOptions,
         *,
         device: str,
-        log: FrameLog,
+        log: JobLog,
     ) -> None:
         """Take a frame; nothing is worked out yet.
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.archive import FrameArchive, MeasuredFrame
 from beam_warp.materials.base_color import BaseColor, solve_base_color
 from beam_warp.materials.changes import ChangeTest, with_changes
@@ -42,7 +42,7 @@ class SolvedFrames:
 class FrameSolver:
     """Solves base colour and stores it; memory does not grow with the number of frames."""
 
-    def __init__(self, archive: FrameArchive, key: str, mean_irradiance: float, log: FrameLog) -> None:
+    def __init__(self, archive: FrameArchive, key: str, mean_irradiance: float, log: JobLog) -> None:
         """Take what solving needs.
 
         Args:

@@ -8,7 +8,7 @@ from beam_warp.capture.digests import CaptureDigests
 from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.jobs.progress import FrameLog
+from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.seen import SeenFrame
@@ -33,7 +33,7 @@ class Source:
         *,
         digests: Path,
         device: str,
-        log: FrameLog,
+        log: JobLog,
     ) -> None:
         """Read the first frame.
 

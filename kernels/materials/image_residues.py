@@ -30,6 +30,7 @@ from beam_warp.kernels.light.environment_sampling import (
 )
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.kernels.materials.pixel_surfaces import PixelSurfaces
+from beam_warp.kernels.materials.residues import FRESNEL_HV
 from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace.visibility import Rays
 
@@ -37,9 +38,6 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(3.14159265358979323846)
 RESIDUE_STREAM = wp.constant(wp.uint32(0x52455349))
-
-FRESNEL_HV = wp.constant(0)
-ALBEDO_SCALING = wp.constant(1)
 
 
 @wp.struct

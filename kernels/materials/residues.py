@@ -61,7 +61,7 @@ class LightRays:
 
 
 @wp.struct
-class PointLight:
+class GatheredLight:
     """Light at each point, by row."""
 
     unshadowed: wp.array[wp.vec3]  # irradiance over pi with nothing in the way
@@ -128,7 +128,7 @@ def brightness(color: wp.vec3) -> float:
 
 
 @wp.kernel
-def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int, out_light: PointLight):
+def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int, out_light: GatheredLight):
     """Arriving light: E_unshadowed * sum V f / sum f, or the mean of V f; its noise; what a turn of the normal does.
 
     Where no ray found light, half of the unshadowed light is stated, give or take all of it.
@@ -174,7 +174,7 @@ def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int
 
 
 @wp.struct
-class Surface:
+class ShadedPoints:
     """What is known of the points that shade, by row."""
 
     normals: wp.array[wp.vec3]
@@ -224,9 +224,9 @@ def view_residues_kernel(
     first: int,
     batch: RayBatch,
     rays: LightRays,
-    light: PointLight,
+    light: GatheredLight,
     lobes: EnvironmentLight,
-    surface: Surface,
+    surface: ShadedPoints,
     diffuse_weight: int,
     out_views: Observations,
 ):
@@ -267,7 +267,7 @@ def facing_weight(cosine: float) -> float:
 
 @wp.kernel
 def fit_color_kernel(
-    first: int, views: Observations, light: PointLight, surface: Surface, rounds: int, out_fit: ColorFit
+    first: int, views: Observations, light: GatheredLight, surface: ShadedPoints, rounds: int, out_fit: ColorFit
 ):
     """Least-squares sums over views, outliers counted little in every round but the first (Cauchy's weights)."""
     row = first + wp.tid()

@@ -20,9 +20,9 @@ from beam_warp.kernels.light.brdf import (
 )
 from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
 from beam_warp.kernels.materials.residues import (
+    GatheredLight,
     LightRays,
     Observations,
-    PointLight,
     brightness,
     facing_weight,
 )
@@ -60,7 +60,7 @@ def lobe_shares_kernel(
     first: int,
     batch: RayBatch,
     rays: LightRays,
-    light: PointLight,
+    light: GatheredLight,
     normals: wp.array[wp.vec3],
     views: Observations,
     out_shares: wp.array2d[wp.vec4],
@@ -127,7 +127,7 @@ def view_weight(sample: wp.vec4, cosine: float) -> float:
 def profile_kernel(
     first: int,
     batch: RayBatch,
-    light: PointLight,
+    light: GatheredLight,
     lobes: EnvironmentLight,
     normals: wp.array[wp.vec3],
     views: Observations,

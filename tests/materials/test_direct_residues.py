@@ -11,10 +11,10 @@ from beam_warp.kernels.materials.residues import (
     ALBEDO_SCALING,
     FRESNEL_HV,
     ColorFit,
+    GatheredLight,
     LightRays,
     Observations,
-    PointLight,
-    Surface,
+    ShadedPoints,
     launch_fit_color,
     launch_gather_light,
     launch_trace_bounce,
@@ -84,13 +84,13 @@ class Points:
         self.rays.weights = to_device(weights[self.rows].reshape(-1, 3), wp.vec3, device)
         self.rays.visibility = to_device(visibility[self.rows].reshape(-1), float, device)
         self.rays.paired = int(paired)
-        self.light = PointLight()
+        self.light = GatheredLight()
         for name in ("unshadowed", "arriving", "bounce"):
             setattr(self.light, name, wp.zeros(count, dtype=wp.vec3, device=device))
         for name in ("noise", "tilt"):
             setattr(self.light, name, wp.zeros(count, dtype=float, device=device))
         self.light.bounce.assign(np.full((count, 3), bounce, np.float32))
-        self.surface = Surface()
+        self.surface = ShadedPoints()
         self.surface.normals = to_device(normals, wp.vec3, device)
         self.surface.roughness = to_device(np.full(count, roughness), float, device)
 
@@ -374,7 +374,7 @@ def scene_of_views(rng, count, views):
 
 
 def fitted(colors, weight, toward, share, specular, normals, arriving, device, *, robust=False, bounce=0.0):
-    found, light, surface, fit = Observations(), PointLight(), Surface(), ColorFit()
+    found, light, surface, fit = Observations(), GatheredLight(), ShadedPoints(), ColorFit()
     found.colors = wp.array(
         np.concatenate([colors, weight[..., None]], -1).astype(np.float32), dtype=wp.vec4, device=device
     )
