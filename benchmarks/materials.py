@@ -1,4 +1,4 @@
-"""How good decomposed materials are, what each idea brings, and what it costs at the paper's scale.
+"""Quality of decomposed materials, the gain of each idea, and the cost at the paper's scale.
 
     python benchmarks/materials.py [--device cuda:0] [--data DIR] [--out results.json] [--parts PART ...] [--quick]
 

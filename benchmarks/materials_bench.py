@@ -1,4 +1,4 @@
-"""What the parts of the materials benchmark share: how much is measured, on which captures and lights."""
+"""Captures, lights and effort of the materials benchmark, which all its parts share."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LIGHTS = ("studio", "sunrise", "apartment", "night", "workshop")
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """Effort of the benchmark.
 
     Attributes:
         perfect_gaussians: On the true surface.
@@ -99,7 +99,7 @@ QUICK = Effort(
 
 @dataclass(frozen=True)
 class Bench:
-    """What parts share.
+    """Inputs that all parts share.
 
     Attributes:
         captures: With truth, by name.

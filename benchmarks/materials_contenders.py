@@ -43,7 +43,7 @@ class SubjectFrame:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is decomposed.
+    """Gaussians and captured views that are decomposed.
 
     Attributes:
         name: In tables.
@@ -77,7 +77,7 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class Decomposed:
-    """What came out: the first frame's materials, seconds by stage for all frames used, how many these are, notes."""
+    """The first frame's materials, seconds by stage for all frames used, how many these are, notes."""
 
     materials: Materials
     seconds: dict[str, float]
@@ -94,7 +94,7 @@ class Unavailable(Exception):
 
 @dataclass(frozen=True)
 class Choices:
-    """How the direct path is run.
+    """Choices of the direct path.
 
     Attributes:
         materials: Rays and fit.

@@ -1,4 +1,4 @@
-"""What decomposing costs at the paper's scale: a figure of many Gaussians in a dome of many large images, one frame.
+"""Cost of decomposing at the paper's scale: a figure of many Gaussians in a dome of many large images, one frame.
 
 Images are drawn by the rasteriser once, before the clock starts, and lie in memory decoded, as the package takes them.
 """
@@ -35,7 +35,7 @@ TARGETS = {"direct": 2.0, "image path": 20.0, "peak_bytes": 16 * 2**30}
 
 @dataclass(frozen=True)
 class Scale:
-    """How large.
+    """Size of the problem.
 
     Attributes:
         gaussians: Of the figure.

@@ -125,7 +125,7 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, na
 
 @dataclass(frozen=True)
 class PerfectRow:
-    """How materials on the true surface are measured: at its points or those that views show, and so on."""
+    """Way to measure materials on the true surface: at its points or at those that views show, and so on."""
 
     exact: bool = True
     roughness: str = "true"
@@ -136,7 +136,7 @@ class PerfectRow:
 
     @property
     def name(self) -> str:
-        """In tables."""
+        """Name in tables."""
         words = [f"{'true' if self.exact else 'seen'} points", f"roughness {self.roughness}", f"{self.rays} rays"]
         words.append("with the bounce" if self.bounce else "direct only")
         if self.offset != "auto":

@@ -60,7 +60,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was found, and where it was written.
+    """Scores of an asset and their report.
 
     Attributes:
         scores: The scores.

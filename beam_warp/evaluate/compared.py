@@ -1,4 +1,4 @@
-"""What is compared: the frames of an asset, the views of a capture whose truth is known, and its lights."""
+"""Both sides of an evaluation: the frames of an asset, the views of a capture whose truth is known, and its lights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How good the materials of an asset are, against the exact channels of a capture: every view, and over time.
+"""Evaluation of an asset's materials against the exact channels of a capture: every view, and over time.
 
 read      `beam_warp.evaluate.compared`     frames, records with truth, lights
 draw      `beam_warp.evaluate.views`        channels and relit images of every view, and their scores
@@ -36,7 +36,7 @@ with a walking person of 320 x 320 pixels: .98 as it should be, .86 when 2 cm as
 off, .45 turned by a quarter, .03 lying."""
 
 GOOD_OVERLAP = 0.8
-"""Below this overlap something is said."""
+"""Coverage in common below which a note says so."""
 
 Observer = Callable[[ScoredView], None]
 

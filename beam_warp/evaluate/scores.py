@@ -104,7 +104,7 @@ class MaterialViewScores:
 
 @dataclass(frozen=True)
 class MaterialScores:
-    """How good an asset is.
+    """Scores of an asset against a capture with truth.
 
     Attributes:
         views: One by one, in the order of frames.

@@ -21,7 +21,7 @@ EVIDENCE = "evidence_"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredFrame:
-    """What was measured of one frame.
+    """Measurements of one frame.
 
     Attributes:
         number: Number of the frame in the sequence.

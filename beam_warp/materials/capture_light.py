@@ -50,7 +50,7 @@ class CaptureLight:
     stops: float
 
 
-def capture_light(
+def prepare_light(
     environment: EnvironmentMap, source: Source, options: RunOptions, described: str, folder: Path, log: JobLog
 ) -> CaptureLight:
     """Prepare an environment and find its exposure.

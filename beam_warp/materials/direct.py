@@ -1,6 +1,6 @@
-"""What the light of a capture says of each Gaussian in one frame: how open it is, and evidence on its base colour.
+"""Direct path: ambient occlusion of each Gaussian in one frame, and evidence on its base colour.
 
-The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
+Rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
 What views show comes from their images (`beam_warp.materials.evidence`), or, of Gaussians without images, from their
 own captured radiance around the normal.
 """
@@ -53,10 +53,10 @@ BOUNCE_PART = 4
 
 VIEW_COUNT = 8
 SMALLEST_VIEW_COSINE = 0.2
-"""Where there are no images: views below this n.v count for nothing, there the normal and the lobe's edge dominate."""
+"""Least n.v of a view, where there are no images: below, the normal and the lobe's edge dominate."""
 
 BURIED_VISIBILITY = 0.02
-"""Below this visibility no view shows the Gaussian: its captured colour was never constrained."""
+"""Visibility below which no view shows the Gaussian: its captured colour was never constrained."""
 
 SATURATION = 0.995
 """Captured display colour above which the sensor's or the training's ceiling may have cut it."""
@@ -71,7 +71,7 @@ paper's 1 - F, with Schlick's F)."""
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """How materials are measured.
+    """Options of the direct path.
 
     Attributes:
         sample_count: Rays per Gaussian and frame for visibility, and as many for light; a power of two is best.
@@ -109,7 +109,7 @@ class MaterialOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColorEvidence:
-    """What frames say about base colour; evidence on the same Gaussians adds up.
+    """Evidence of frames on base colour; evidence on the same Gaussians adds up.
 
     Attributes:
         numerator: Sum of w L_D (L_o - L_S), ``(N, 3)``.

@@ -1,11 +1,11 @@
-"""From captured views and known light to base colour and ambient occlusion by way of images: the paper's path.
+"""Image path, the paper's: base colour and ambient occlusion of every pixel of the views, baked into the Gaussians.
 
 Per view, the pixels' surface points are lifted by a fixed distance, ambient occlusion and both residues are estimated
 by independent rays and denoised, and what was captured is solved for the base colour, pixel by pixel. Then both are
 baked into the Gaussians, geometry held fixed (BEAM §3.2). `beam_warp.materials.direct` is the direct path, which needs
 no images of materials; this one is what it is compared with.
 
-What the paper leaves open is decided so: densities of rays as in `beam_warp.materials.residues`; the base colour is
+The paper leaves the following open. Here, densities of rays as in `beam_warp.materials.residues`; the base colour is
 max(L_o - L_S, 0) / L_D, cut to [0, 1], and does not count where L_D is below `UNLIT_PART` of the light that falls on an
 open surface on average, nor where a pixel is not covered by the subject wholly, as drawn and as captured.
 """
@@ -81,7 +81,7 @@ FILL_NEIGHBORS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePathOptions:
-    """How the image path measures; defaults are the paper's, but for the solver.
+    """Options of the image path; defaults are the paper's, but for the solver.
 
     Attributes:
         occlusion_samples: Rays a pixel for ambient occlusion.
@@ -138,7 +138,7 @@ class ImagePathOptions:
 
 @dataclass(frozen=True, eq=False)
 class ImageMaterials:
-    """What the image path finds.
+    """Materials that the image path finds.
 
     Attributes:
         base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
@@ -278,7 +278,7 @@ def crop_to_subject(view: CapturedView) -> CapturedView:
 
 
 class _MeasuredView(NamedTuple):
-    """What one view says, and how many of its pixels show a surface."""
+    """Bake target of one view, and how many of its pixels show a surface."""
 
     target: BakeTarget
     surface_count: int

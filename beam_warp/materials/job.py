@@ -30,7 +30,7 @@ from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
 from beam_warp.materials.archive import FrameArchive
 from beam_warp.materials.capture_images import CaptureImages
-from beam_warp.materials.capture_light import capture_light, light_findings
+from beam_warp.materials.capture_light import light_findings, prepare_light
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.materials.measure import FrameMeasurement
 from beam_warp.materials.options import OverviewOptions, RunOptions
@@ -47,7 +47,7 @@ ASSET_NAME = "asset.usda"
 
 @dataclass(frozen=True)
 class RunResult:
-    """Where the results are, and what was done.
+    """Files and records that a run leaves.
 
     Attributes:
         asset: Root layer of the asset.
@@ -112,7 +112,7 @@ def run(
 
     source = Source(sequence, images, chosen.materials, digests=digests, device=str(device), log=log)
     described = _described(chosen, images, is_cuda=device.is_cuda)
-    light = capture_light(environment, source, chosen, described, folder, log)
+    light = prepare_light(environment, source, chosen, described, folder, log)
     key = array_digest(light.environment.radiance, text=described)
     first_key = source.key(key, source.first)
     findings = light_findings(source.first, light.environment, folder / "findings.json", first_key, log)

@@ -1,4 +1,4 @@
-"""What light does at the surface points that a camera's pixels show: how open they are, and what they would send back.
+"""Ambient occlusion and reflected light of the surface points that a camera's pixels show.
 
 The paper's Gaussian sampler (BEAM §3.2, Eqs. 3 to 7), for one view at a time, on the pixels that show a surface and no
 others. The paper states sample counts, not densities. Here occlusion rays are drawn by the cosine; light rays by
@@ -44,7 +44,7 @@ from beam_warp.world.camera import Camera
 SurfaceDepth = Literal["median", "mean"]
 
 SURFACE_DEPTHS = ("median", "mean")
-"""Where on a pixel's ray the surface is: at the median depth, which jumps at silhouettes, or at the mean, which lies
+"""Depths at which a pixel's ray may meet the surface: the median, which jumps at silhouettes, or the mean, which lies
 between front and back there."""
 
 LEAST_ALPHA = 0.5

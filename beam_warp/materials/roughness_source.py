@@ -1,4 +1,4 @@
-"""Where roughness comes from: a constant, or a texture on a mesh whose nearest valid texel each Gaussian takes."""
+"""Stated roughness: a constant, or a texture on a mesh whose nearest valid texel each Gaussian takes."""
 
 from __future__ import annotations
 

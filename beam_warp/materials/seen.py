@@ -1,4 +1,4 @@
-"""Second step of the main job: what the views of a frame show of its Gaussians, and where their light is gathered."""
+"""Second step of the main job: evidence of a frame's views on its Gaussians, and points where light is gathered."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class SeenFrame:
 
     @cached_property
     def views(self) -> ViewEvidence | None:
-        """What the capture's images show; None without a capture."""
+        """Evidence of the capture's images on the Gaussians; None without a capture."""
         if self.capture is None:
             return None
         images = self.images()
@@ -91,7 +91,7 @@ class SeenFrame:
 
     @cached_property
     def points(self) -> SurfacePoints:
-        """Where light is gathered: where views show the surface, or the Gaussians' own centres."""
+        """Points where light is gathered: where views show the surface, or the Gaussians' own centres."""
         views, offset = self.views, self._options.offset
         if views is None:
             return SurfacePoints.at_centers(self.cloud, self.scene, self.surface, offset)

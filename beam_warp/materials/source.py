@@ -17,7 +17,7 @@ from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
 
 
 class Source:
-    """What a job was given, read one frame at a time.
+    """Input of a job, read one frame at a time.
 
     Attributes:
         sequence: The sequence as it was given.

@@ -42,7 +42,7 @@ RESIDUE_STREAM = wp.constant(wp.uint32(0x52455349))
 
 @wp.struct
 class ResidueSamples:
-    """How the samples of a point are shared among densities: the first ones, the next ones, the rest."""
+    """Samples of a point, shared among densities: the first ones, the next ones, the rest."""
 
     set: SampleSet
     environment_count: int
@@ -51,8 +51,8 @@ class ResidueSamples:
 
 @wp.struct
 class Residues:
-    """By row: the radiance of a white diffuser, that of the specular lobe, and the standard errors of their means over
-    the channels."""
+    """Radiance of a white diffuser and of the specular lobe by row, with the standard errors of their means over the
+    channels."""
 
     diffuse: wp.array[wp.vec3]
     specular: wp.array[wp.vec3]

@@ -1,4 +1,4 @@
-"""How well every one of a few roughnesses explains what views show of points whose light is known.
+"""Misfit of candidate roughnesses to the views of points whose light is known.
 
 The rays that gathered a point's light also say which share of each view's specular lobe is open, as in
 `beam_warp.kernels.materials.residues`. That share changes slowly with roughness and costs a loop over the rays, so it
@@ -31,10 +31,10 @@ from beam_warp.kernels.trace.surface_rays import RayBatch
 wp.set_module_options({"enable_backward": False})
 
 SHARE_ROUGHNESS = wp.constant(wp.vec4(0.15, 0.35, 0.6, 1.0))
-"""Where the open share of the lobe is summed over rays."""
+"""Perceptual roughnesses at which the open share of the lobe is summed over rays."""
 
 ROUNDS = wp.constant(3)
-"""Of reweighting: by then the weights have settled."""
+"""Rounds of reweighting: by then the weights have settled."""
 
 SPREAD_PART = wp.constant(0.06)
 """Residual at which a view counts half, as a part of what a white surface would show with nothing in the way.
@@ -111,7 +111,7 @@ def share_at(shares: wp.vec4, roughness: float) -> float:
 
 @wp.struct
 class ProfileFit:
-    """How well candidates explain the views of a part, by row; rows of other points are left as they are."""
+    """Misfit of candidates to the views of a part, by row; rows of other points are left as they are."""
 
     misfit: wp.array3d[float]  # (PARTS, row, candidate): sum over views of w log(1 + e^2 / s^2) at the best base color
     views: wp.array[float]  # sum of w over all views: how many views that see a whole pixel

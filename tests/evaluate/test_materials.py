@@ -121,7 +121,7 @@ class TestAgainstItself:
             assert found_here.solid_psnr == pytest.approx(20.0, abs=0.01)  # alpha above .999: 0.009 dB
 
     def test_turned_normals_are_turned_by_as_much(self, asset, mirror, device):
-        """By 10 degrees about z: as much as that where a normal is level, not at all where it points up."""
+        """A turn by 10 degrees about z is seen whole where a normal is level, not at all where it points up."""
         angle = np.radians(10.0)
         turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
         turned = changed(asset, lambda _, cloud: cloud.with_arrays(normals=cloud.normals @ turn.T))
@@ -184,7 +184,7 @@ class TestAgainstTruth:
             assert scores[name].solid_psnr == pytest.approx(solid, abs=1e-6), name
 
     def test_the_shared_tool_agrees(self, evaluated, relit_capture, data_dir):
-        """It is independent of this package: PSNR to its last digit, SSIM, scale and normals to theirs."""
+        """The shared tool, independent of this package, agrees: PSNR to its last digit, the others to theirs."""
         tool = data_dir.parent / "tools" / "score_capture.py"
         if not tool.is_file():
             pytest.skip(f"the shared scoring tool {tool} is absent")
@@ -248,7 +248,7 @@ class TestRefusals:
 
 class TestWhatIsThere:
     def test_frames_that_the_asset_lacks_are_said(self, asset, mirror):
-        """Its second frame alone, stated as such, scores as it does among both."""
+        """The second frame alone, stated as such, scores as it does among both."""
         second = GaussianSequence.from_clouds([asset[1]], metadata={"capture_frames": "1"})
         found = score(second, mirror, "cpu")
         assert [view.frame for view in found.views] == [1, 1]
@@ -269,7 +269,7 @@ class TestWhatIsThere:
         }  # fmt: skip
 
     def test_relighters_are_told_how_to_draw(self, asset, mirror):
-        """As the asset states, with the samples asked for, a frame's cameras at a time, under each light."""
+        """Relighters draw as the asset states, with the samples asked for, for all cameras of a frame, under each light."""
         told = []
 
         def relighter(cloud, environment, cameras, *, raster, samples, device):

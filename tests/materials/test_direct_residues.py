@@ -34,7 +34,7 @@ from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 EPS = float(np.finfo(np.float32).eps)
 TABLE_ERROR = 2e-3
-"""Of the directional albedo between the nodes of its table, see tests/light/test_ggx.py."""
+"""Error of the directional albedo between the nodes of its table, see tests/light/test_ggx.py."""
 
 
 def unit(vectors):
@@ -127,7 +127,7 @@ def random_rays(rng, count, samples):
 
 
 class TestGatheredLight:
-    @pytest.mark.parametrize("samples", [4, 7, 64])
+    @pytest.mark.parametrize("samples", [7, 64])
     @pytest.mark.parametrize("paired", [True, False])
     def test_arriving_light_and_its_noise(self, device, rng, samples, paired):
         rays = random_rays(rng, 70, samples)
@@ -339,7 +339,7 @@ class TestResidues:
                 # squared times its slope, 4 pi / 4096 of at most 1
                 assert abs(share[v, p] - expected) < 4.0 * np.pi / 4096
 
-    @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
+    @pytest.mark.parametrize("roughness", [0.1, 1.0])
     def test_white_furnace(self, device, rng, roughness):
         """A white open surface under uniform light of radiance 1 sends 1 to every view: L_D share + L_S."""
         white = EnvironmentLighting.from_environment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=16), device=device)
@@ -394,7 +394,7 @@ def fitted(colors, weight, toward, share, specular, normals, arriving, device, *
 
 
 class TestFit:
-    @pytest.mark.parametrize("views", [1, 2, 33])
+    @pytest.mark.parametrize("views", [1, 33])
     def test_plain_least_squares_is_lstsq(self, device, rng, views):
         normals, toward, arriving, share, specular, weight = scene_of_views(rng, 70, views)
         bounce = 0.25

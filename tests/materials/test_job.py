@@ -344,7 +344,7 @@ class TestWithACapture:
         assert not (tmp_path / "out" / "asset.usda").exists()
 
     def test_the_image_path_follows_its_first_frame(self, discs, studio, tiny_capture, tmp_path):
-        """Its colours are drawn towards those of the frame before: when that changes, it is done again."""
+        """Colours are drawn towards those of the frame before: when that frame changes, the next is done again."""
         options = replace(FAST, images=ImagePathOptions(occlusion_samples=4, light_samples=4))
         self.run(discs, studio, tmp_path / "out", tiny_capture, options)
         again = self.run(discs, studio, tmp_path / "out", tiny_capture, options)

@@ -31,7 +31,7 @@ from beam_warp.materials.roughness import (
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 NOISE = 0.01
-"""Of every view's colour, as a part of what a white surface shows: a good photograph of a well known surface."""
+"""Noise of every view's colour, as a part of what a white surface shows: a good photograph of a well known surface."""
 
 SKY = SmoothSky(
     (0.25, 0.3, 0.4),
