@@ -1,4 +1,4 @@
-"""Digests of plain records and of the content of files.
+"""Digests of plain records, of arrays, of the content of files, and of this package's code.
 
 A file is read again only when its size, times or inode are others than when it was last read. One that changed less
 than `RACE_SECONDS` before it was read could change once more without showing, and is never remembered.
@@ -7,7 +7,9 @@ than `RACE_SECONDS` before it was read could change once more without showing, a
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
+import importlib.util
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +22,56 @@ from beam_warp.errors import MissingFileError
 
 RACE_SECONDS = 2.0
 """Coarsest time step of usual file systems (FAT)."""
+
+
+SOURCE_SUFFIXES = (".py", ".usda")
+"""Files of the package that a result can depend on: code, and the schema."""
+
+MAPPED_PACKAGES = ("kernels", "schema", "converters")
+"""Packages that lie beside ``beam_warp`` in a checkout, and inside it in a wheel."""
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return the digest of the code that makes results, 32 hexadecimal digits.
+
+    Files are hashed as text, comments and docstrings included: telling them apart would mean to parse the whole
+    package, which costs a second. So an edited comment makes jobs start over, and no changed algorithm goes unnoticed.
+    """
+    folders = {"": _folder_of("beam_warp")}
+    folders |= {name: _folder_of(f"beam_warp.{name}") for name in MAPPED_PACKAGES}
+    return source_digest(folders)
+
+
+def source_digest(folders: Mapping[str, Path]) -> str:
+    """Return the digest of the source files of folders, the same wherever the folders lie.
+
+    Line ends do not count: checkouts on Windows have others.
+
+    Args:
+        folders: Folder by the place of its files in the package, ``""`` for the package itself. A file that two
+            folders hold at the same place counts once.
+    """
+    files: dict[str, Path] = {}
+    for place, folder in folders.items():
+        for path in folder.rglob("*"):
+            name = (Path(place) / path.relative_to(folder)).as_posix()
+            if path.suffix in SOURCE_SUFFIXES:
+                files[name] = path
+    digest = hashlib.blake2b(digest_size=16)
+    for name, path in sorted(files.items()):
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        digest.update(f"{name} {len(content)}:".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _folder_of(package: str) -> Path:
+    """Return the folder of an installed package, without importing it."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None
+    assert spec.submodule_search_locations is not None
+    return Path(spec.submodule_search_locations[0])
 
 
 def fields_of(record: Any) -> list[tuple[str, Any]]:
@@ -61,9 +113,9 @@ def content_digest(path: Path, known: Mapping[str, list[Any]]) -> tuple[tuple[in
     return (stamp if settled else None), digest
 
 
-def array_digest(*arrays: NDArray[Any]) -> str:
-    """Return the digest of arrays: their types, shapes and bits."""
-    digest = hashlib.blake2b(digest_size=16)
+def array_digest(*arrays: NDArray[Any], text: str = "") -> str:
+    """Return the digest of arrays, their types, shapes and bits, and of a text before them."""
+    digest = hashlib.blake2b(text.encode(), digest_size=16)
     for array in arrays:
         digest.update(f"{array.dtype.str} {array.shape} ".encode())
         digest.update(np.ascontiguousarray(array).data if array.size else b"")

@@ -1,4 +1,4 @@
-"""How good decomposed materials are, what each idea brings, and what it costs at the paper's scale.
+"""Quality of decomposed materials, the gain of each idea, and the cost at the paper's scale.
 
     python benchmarks/materials.py [--device cuda:0] [--data DIR] [--out results.json] [--parts PART ...] [--quick]
 
@@ -18,46 +18,32 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
+from materials_bench import FULL, TARGETS, Bench, quick_bench, read_lights
 from materials_contenders import AblationRow, Subject, SubjectFrame, Unavailable, ablation_rows, seen_normals
 from materials_cost import PAPER, Scale, measure_cost
-from materials_truth import (
-    SHARP,
-    Materials,
-    PerfectFrame,
-    Row,
-    TruthViews,
-    light_errors,
-    light_reference,
-    row_of,
-)
+from materials_perfect import measure_perfect
+from materials_truth import Row, TruthViews, row_of
 from reconstruction_contenders import follow, ours
 from timing import commit, machine
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.relighters import RELIGHTERS
 from beam_warp.jobs.report import versions
-from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.world.axes import change_axes
-from beam_warp.world.environment import EnvironmentMap
 
 PUBLISHED = {
     "BEAM, its own synthetic humans": {
@@ -67,282 +53,6 @@ PUBLISHED = {
     }
 }
 """PSNR [dB] and SSIM that the paper states; other data."""
-
-TARGETS = {
-    "perfect": {
-        "ambient_occlusion_psnr": 40.0,
-        "irradiance_relative_rmse": 0.035,
-        "base_color_psnr_with_bounce": 35.0,
-        "base_color_psnr_direct_only": [31.0, 33.0],
-    },
-    "reconstructed": {
-        "ambient_occlusion": [30.0, 0.95],
-        "base_color": [26.0, 0.93],
-        "scale": [0.97, 1.03],
-        "relit": [30.0, 0.94],
-    },
-}
-
-LIGHTS = ("studio", "sunrise", "apartment", "night", "workshop")
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much is measured.
-
-    Attributes:
-        perfect_gaussians: On the true surface.
-        light_points: Points at which light is compared.
-        light_rays: Rays that are judged.
-        reference_rays: Rays that they are compared with.
-        perfect_rays: Rays a Gaussian of the perfect geometry's materials.
-        perfect_samples: Side of the square of samples of its drawn pixels.
-        samples: The same of reconstructions.
-        frames: Most frames of an ablation.
-        high: Rays a pixel of the image path where there are many.
-        adam_steps: Of the image path's other solver.
-        scale: Of the cost.
-        fitting: Changes of the reconstruction's defaults.
-    """
-
-    perfect_gaussians: int = 140_000
-    light_points: int = 4096
-    light_rays: int = 64
-    reference_rays: int = 16_384
-    perfect_rays: tuple[int, ...] = (64, 256)
-    perfect_samples: int = 4
-    samples: int = 2
-    frames: int = 6
-    high: int = 512
-    adam_steps: int = 5000
-    scale: Scale = field(default_factory=Scale)
-    fitting: Any = None
-
-
-FULL = Effort()
-
-QUICK = Effort(
-    perfect_gaussians=1500,
-    light_points=32,
-    light_rays=16,
-    reference_rays=256,
-    perfect_rays=(8,),
-    perfect_samples=2,
-    samples=1,
-    frames=2,
-    high=16,
-    adam_steps=8,
-    scale=Scale(
-        gaussians=400,
-        views=3,
-        size=(48, 32),
-        repeats=1,
-        counts=(200, 400),
-        view_counts=(1, 2),
-        ray_counts=(8, 16),
-        series_views=2,
-    ),
-    fitting={"color_iterations": 30, "normal_iterations": 30},
-)
-
-
-@dataclass(frozen=True)
-class Bench:
-    """What parts share.
-
-    Attributes:
-        captures: With truth, by name.
-        lights: Environments by name.
-        assets: Reconstructions by the name of their capture; what is missing is made.
-        gaussians: Of those that are made.
-        effort: How much is measured.
-        device: Where.
-        pictures: Folder of pictures; None for none.
-        say: Hears what is being done.
-    """
-
-    captures: Mapping[str, Capture]
-    lights: Mapping[str, EnvironmentMap]
-    assets: Mapping[str, Path]
-    gaussians: int
-    effort: Effort
-    device: Any
-    pictures: Path | None
-    say: Callable[[str], None]
-
-    def light_of(self, capture: Capture) -> PreparedEnvironment:
-        """Return the light of a capture, prepared."""
-        assert capture.environment_path is not None
-        return PreparedEnvironment(EnvironmentMap.read(capture.environment_path), self.device)
-
-    def picture(self, truth: TruthViews, cloud: Any, found: Materials | None, *words: str) -> str | None:
-        """Write a row's picture; returns its file's name."""
-        if self.pictures is None:
-            return None
-        self.pictures.mkdir(parents=True, exist_ok=True)
-        name = re.sub(r"[^a-z0-9]+", "_", " ".join(words).lower()).strip("_") + ".png"
-        truth.picture(cloud, found, self.pictures / name)
-        return name
-
-
-def measure_perfect(bench: Bench) -> Iterator[Row]:
-    """Yield what is known so far of materials on the true surface."""
-    result: Row = {"targets": TARGETS["perfect"], "captures": {}}
-    for name, capture in bench.captures.items():
-        frame = truth_frames(capture)[0]
-        started = time.perf_counter()
-        perfect = PerfectFrame.of(capture, frame, bench.effort.perfect_gaussians, bench.device)
-        bench.say(
-            f"{name}: {len(perfect.cloud):,} Gaussians on the true surface, {time.perf_counter() - started:.1f} s"
-        )
-        row: Row = {"gaussians": len(perfect.cloud), "seen": float(perfect.evidence.seen.mean()), "rows": []}
-        result["captures"][name] = row
-        row["irradiance"] = perfect_light(bench, perfect)
-        yield result
-        truth = TruthViews(capture, frame, SHARP, bench.effort.perfect_samples, str(bench.device))
-        row["truth_picture"] = bench.picture(truth, perfect.cloud, None, "perfect", name, "truth")
-        for entry in perfect_materials(bench, perfect, truth, name):
-            row["rows"].append(entry)
-            bench.say(f"{name}, {entry['name']}: {row_of(entry)}")
-            yield result
-        row["reached"] = perfect_reached(row)
-        yield result
-
-
-def perfect_light(bench: Bench, perfect: PerfectFrame) -> Row:
-    """Return errors of irradiance on every light: the default, and what each of its three ideas brings."""
-    effort = bench.effort
-    points = perfect.points()
-    seen = np.flatnonzero(points.seen)
-    rows = np.random.default_rng(0).permutation(seen)[: effort.light_points]
-    found: Row = {}
-    for name, environment in bench.lights.items():
-        light = PreparedEnvironment(environment, bench.device)
-        reference = light_reference(perfect.scene, points, rows, light, effort.reference_rays)
-        mean = float(environment.radiance.mean())
-        found[name] = {
-            "points": len(rows),
-            "rays": effort.light_rays,
-            "reference_rays": effort.reference_rays,
-            "peak_over_mean": float(environment.radiance.max()) / max(mean, 1e-12),
-            "ways": {
-                label: light_errors(perfect.scene, reference, light, sample_count=effort.light_rays, **how)
-                for label, how in (
-                    ("product, ratio, Owen", {}),
-                    ("product, Owen", {"ratio": False}),
-                    ("product, ratio, iid", {"sampler": "iid"}),
-                    ("mis, ratio, Owen", {"density": "mis"}),
-                    ("cosine, ratio, Owen", {"density": "cosine"}),
-                    ("cosine, iid", {"density": "cosine", "ratio": False, "sampler": "iid"}),
-                )
-            },
-        }
-        default = found[name]["ways"]["product, ratio, Owen"]
-        bench.say(
-            f"light {name}: {default['relative_rmse']:.4f} at each point, {default['rmse_over_mean']:.4f} of the mean"
-        )
-    return found
-
-
-def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, name: str) -> Iterator[Row]:
-    """Yield scores with and without the bounce, at the true points and at those that views show."""
-    light = bench.light_of(perfect.capture)
-    rough = {"0.5": np.full(len(perfect.cloud), 0.5, np.float32), "true": perfect.true_roughness(bench.device)}
-    spread = perfect.images_spread_back()
-    for row in perfect_rows(bench.effort.perfect_rays):
-        points = perfect.points(row.offset, exact=row.exact)
-        started = time.perf_counter()
-        measured = measure_materials(
-            perfect.cloud,
-            perfect.scene,
-            points,
-            rough[row.roughness],
-            light,
-            options=MaterialOptions(bounce=row.bounce, sample_count=row.rays),
-            views=perfect.evidence if row.observed == "difference" else spread,
-        )
-        solved = solve_base_color(
-            perfect.cloud.with_arrays(normal_confidence=points.confidence), measured.evidence, light.mean_irradiance
-        )
-        seconds = time.perf_counter() - started
-        openness, _ = fill_from_neighbors(
-            perfect.cloud.positions,
-            measured.ambient_occlusion[:, None],
-            measured.ambient_occlusion_error[:, None],
-            ~points.seen,
-        )
-        found = Materials(solved.base_color, openness[:, 0].astype(np.float32), rough[row.roughness])
-        yield {
-            "name": row.name,
-            "points": "true" if row.exact else "seen",
-            **{key: value for key, value in vars(row).items() if key != "exact"},
-            "seconds": seconds,
-            **truth.score(perfect.cloud, found),
-            "picture": bench.picture(truth, perfect.cloud, found, "perfect", name, row.name),
-        }
-
-
-@dataclass(frozen=True)
-class PerfectRow:
-    """How materials on the true surface are measured: at its points or those that views show, and so on."""
-
-    exact: bool = True
-    roughness: str = "true"
-    rays: int = 64
-    bounce: bool = True
-    offset: Any = "auto"
-    observed: str = "difference"
-
-    @property
-    def name(self) -> str:
-        """In tables."""
-        words = [f"{'true' if self.exact else 'seen'} points", f"roughness {self.roughness}", f"{self.rays} rays"]
-        words.append("with the bounce" if self.bounce else "direct only")
-        if self.offset != "auto":
-            words.append(f"offset {1000.0 * self.offset:g} mm")
-        if self.observed != "difference":
-            words.append("images spread back")
-        return ", ".join(words)
-
-
-def perfect_rows(rays: Sequence[int]) -> list[PerfectRow]:
-    """Return what is measured on the true surface: the default with and without the bounce first."""
-    default = PerfectRow(rays=rays[0])
-    return [
-        *(replace(row, bounce=bounce) for row in (default, replace(default, exact=False)) for bounce in (True, False)),
-        replace(default, roughness="0.5"),
-        replace(default, observed="images"),
-        *(replace(default, offset=offset) for offset in (0.001, 0.002, 0.02)),
-        *(replace(default, rays=count) for count in rays[1:]),
-    ]
-
-
-def perfect_reached(row: Row) -> Row:
-    """Return which targets are met: with the truth's coverage, since silhouettes are the Gaussians'."""
-
-    def first(bounce: bool) -> Row:
-        return next(r for r in row["rows"] if r["bounce"] is bounce and r["points"] == "true")
-
-    wanted = TARGETS["perfect"]
-    direct_only = first(False)["base_color"]["true_coverage_psnr"]
-    low, high = wanted["base_color_psnr_direct_only"]
-    # Phrased so that NaN fails.
-    return {
-        "ambient_occlusion": bool(
-            first(True)["ambient_occlusion"]["true_coverage_psnr"] >= wanted["ambient_occlusion_psnr"]
-        ),
-        **{
-            f"irradiance, {measure}": {
-                name: bool(light["ways"]["product, ratio, Owen"][measure] <= wanted["irradiance_relative_rmse"])
-                for name, light in row["irradiance"].items()
-            }
-            for measure in ("relative_rmse", "rmse_over_mean")
-        },
-        "base_color_with_bounce": bool(
-            first(True)["base_color"]["true_coverage_psnr"] >= wanted["base_color_psnr_with_bounce"]
-        ),
-        "direct_only_lands_where_expected": bool(low <= direct_only <= high),
-    }
 
 
 def measure_ablation(bench: Bench) -> Iterator[Row]:
@@ -392,7 +102,7 @@ def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthV
     scores = truth.score(cloud, done.materials)
     if row.group == "ladder":
         found = done.materials if done.materials.normals is not None else replace(done.materials, normals=normals)
-        scores["relit"] = {name: truth.score_relit(cloud, found, make) for name, make in RELIGHTERS.items()}
+        scores["relit"] = {name: truth.score_relit(cloud, found, make()) for name, make in RELIGHTERS.items()}
     return {
         "seconds": sum(done.seconds.values()),
         "seconds_per_frame": sum(done.seconds.values()) / done.frames,
@@ -532,26 +242,6 @@ def _table(rows: Sequence[Row], *, true_coverage: bool = False) -> list[str]:
         cells.append(f"{row['peak_device_bytes'] / 2**30:.2f}" if "peak_device_bytes" in row else "")
         lines.append("| " + " | ".join(cells) + " |")
     return lines
-
-
-def read_lights(data: Path) -> dict[str, EnvironmentMap]:
-    """Return the HDRIs of the data folder."""
-    return {name: EnvironmentMap.read(data / "hdri" / f"{name}.hdr") for name in LIGHTS}
-
-
-def quick_bench(folder: Path, device: Any, say: Callable[[str], None]) -> Bench:
-    """Return a bench that runs in no time, on the demo's capture and its own light."""
-    capture = write_demo_capture(
-        folder / "demo", camera_count=6, test_camera_count=1, size=64, samples=4, frame_count=2, device=str(device)
-    )
-    return bench_of_capture(capture, device, say)
-
-
-def bench_of_capture(capture: Capture, device: Any, say: Callable[[str], None]) -> Bench:
-    """Return a quick bench of one capture."""
-    assert capture.environment_path is not None
-    lights = {"its own": EnvironmentMap.read(capture.environment_path)}
-    return Bench({"demo": capture}, lights, {}, 600, QUICK, device, None, say)
 
 
 def main() -> int:

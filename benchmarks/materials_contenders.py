@@ -7,18 +7,16 @@ says so in its row.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-import warp as wp
 from materials_truth import Materials
 from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
@@ -45,7 +43,7 @@ class SubjectFrame:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is decomposed.
+    """Gaussians and captured views that are decomposed.
 
     Attributes:
         name: In tables.
@@ -79,7 +77,7 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class Decomposed:
-    """What came out: the first frame's materials, seconds by stage for all frames used, how many these are, notes."""
+    """The first frame's materials, seconds by stage for all frames used, how many these are, notes."""
 
     materials: Materials
     seconds: dict[str, float]
@@ -96,7 +94,7 @@ class Unavailable(Exception):
 
 @dataclass(frozen=True)
 class Choices:
-    """How the direct path is run.
+    """Choices of the direct path.
 
     Attributes:
         materials: Rays and fit.
@@ -129,24 +127,9 @@ DIRECT_AS_PAPER = Choices(
 """The paper's choices as far as the direct path has them; 64 rays in every row, so that only the idea changes."""
 
 
-class Stages:
-    """Seconds by stage; waits for the device, so that work is charged to the stage that asked for it."""
-
-    def __init__(self, device: Any) -> None:
-        self.seconds: dict[str, float] = {}
-        self._device = device
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        wp.synchronize_device(self._device)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
 def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
     """Decompose by the direct path."""
-    stages, device = Stages(subject.device), str(subject.device)
+    stages, device = StageTimer(subject.device), str(subject.device)
     frames = subject.frames if choices.joint else subject.frames[:1]
     if choices.joint and len(frames) < 2:
         raise Unavailable("a joint fit needs two frames of the same Gaussians")
@@ -212,7 +195,7 @@ def seen_normals(subject: Subject) -> NDArray[np.float32]:
 def by_images(subject: Subject, **options: Any) -> Decomposed:
     """Decompose by the image path; without options, the paper's preset."""
     frame = subject.frames[0]
-    stages = Stages(subject.device)
+    stages = StageTimer(subject.device)
     with stages("upload and build"):
         scene = Scene.from_gaussians(frame.cloud, str(subject.device))
     found = decompose_by_images(

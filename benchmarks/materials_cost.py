@@ -1,4 +1,4 @@
-"""What decomposing costs at the paper's scale: a figure of many Gaussians in a dome of many large images, one frame.
+"""Cost of decomposing at the paper's scale: a figure of many Gaussians in a dome of many large images, one frame.
 
 Images are drawn by the rasteriser once, before the clock starts, and lie in memory decoded, as the package takes them.
 """
@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
-from materials_contenders import OURS, Decomposed, Method, Stages, Subject, SubjectFrame, by_images, direct
+from materials_contenders import OURS, Decomposed, Method, Subject, SubjectFrame, by_images, direct
 from materials_truth import SHARP, Row
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.demo.capture import dome_cameras
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.images import crop_to_subject
+from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
 from beam_warp.trace.denoise import chosen_denoiser
@@ -34,7 +35,7 @@ TARGETS = {"direct": 2.0, "image path": 20.0, "peak_bytes": 16 * 2**30}
 
 @dataclass(frozen=True)
 class Scale:
-    """How large.
+    """Size of the problem.
 
     Attributes:
         gaussians: Of the figure.
@@ -133,7 +134,7 @@ def measure_cost(
 
 def cut_first(subject: Subject) -> Decomposed:
     """Cut views to the subject, then decompose by the direct path."""
-    stages = Stages(subject.device)
+    stages = StageTimer(subject.device)
     with stages("cut views"):
         frames = [replace(frame, views=[crop_to_subject(view) for view in frame.views]) for frame in subject.frames]
     found = direct(replace(subject, frames=frames), OURS.but(joint=False))

@@ -1,4 +1,4 @@
-"""What the materials benchmark compares with: exact channels of test views, light by many rays, true geometry."""
+"""Truth of the materials benchmark: exact channels of test views, light by many rays, true geometry."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from beam_warp.world.shot import Shot
 Row = dict[str, Any]
 
 SHARP = RasterOptions(antialiased=True, low_pass=0.1)
-"""How Gaussians on the true surface are drawn: truth is filtered by a box, which samples of a pixel do."""
+"""Drawing of Gaussians on the true surface: truth is filtered by a box, which samples of a pixel do."""
 
 REFERENCE_SEED = 1 << 31
 """References draw other samples than what is measured, whose seeds count up from 0."""
@@ -50,7 +50,7 @@ REFERENCE_SEED = 1 << 31
 
 @dataclass(frozen=True, eq=False)
 class Materials:
-    """What is scored: base colour ``(N, 3)`` and ambient occlusion ``(N,)``; roughness and normals to relight with."""
+    """Scored base colour ``(N, 3)`` and ambient occlusion ``(N,)``; roughness and normals to relight with."""
 
     base_color: NDArray[np.float32]
     ambient_occlusion: NDArray[np.float32]

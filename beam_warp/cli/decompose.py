@@ -152,9 +152,9 @@ def run_options(
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
     from beam_warp.materials.direct import MaterialOptions
-    from beam_warp.materials.frame import RoughnessTexture
     from beam_warp.materials.images import ImagePathOptions
     from beam_warp.materials.job import RunOptions
+    from beam_warp.materials.roughness_source import RoughnessTexture
 
     stated = measuring.roughness
     if isinstance(stated, Path) != (measuring.roughness_mesh is not None):

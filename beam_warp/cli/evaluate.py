@@ -16,7 +16,7 @@ from beam_warp.cli.console import print_json, progress
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.asset import Evaluation
-    from beam_warp.evaluate.materials import ImageScore, MaterialScores
+    from beam_warp.evaluate.scores import ImageScore, MaterialScores
     from beam_warp.evaluate.steadiness import Deviation
     from beam_warp.raster.records import RasterOptions
     from beam_warp.world.gaussians import GaussianSequence
@@ -113,9 +113,9 @@ def _raster(args: Evaluate, sequence: GaussianSequence) -> RasterOptions:
     """Return how splats are drawn: as the asset states, unless it is overruled."""
     from dataclasses import replace
 
-    from beam_warp.evaluate.materials import stated_raster
+    from beam_warp.raster.records import RasterOptions
 
-    options = stated_raster(sequence.metadata)
+    options = RasterOptions.from_metadata(sequence.metadata)
     if args.low_pass is not None:
         options = replace(options, low_pass=require_number("low-pass", args.low_pass, 1e-6, 1e6))
     return replace(options, antialiased=True) if args.antialiased else options

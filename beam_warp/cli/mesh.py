@@ -15,11 +15,11 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from beam_warp import converters
-from beam_warp._version import __version__
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
+from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.image.files import write_png
 from beam_warp.world.axes import change_axes
@@ -223,7 +223,7 @@ def _key(args: Mesh, options: RasterOptions, cloud: GaussianCloud, cameras: Sequ
     """Return what a frame's files are made of, as a digest."""
     digest = hashlib.sha256()
     asked = (args.format, args.voxel, args.depth, args.color, args.confirmations, options, canonical)
-    digest.update(repr((__version__, asked)).encode())
+    digest.update(repr((code_digest(), asked)).encode())
     for name, array in cloud.arrays().items():
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -13,15 +13,17 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from beam_warp._version import __version__
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, require_free, write_demo_capture
 from beam_warp.demo.truth import Truth, display_color, relit_views, score_views
 from beam_warp.device.arrays import resolve_device
+from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.jobs.progress import Progress
 from beam_warp.jobs.report import write_json
-from beam_warp.materials.job import ESTIMATE, OverviewOptions, Progress, RunOptions, RunResult, run
+from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult, run
+from beam_warp.materials.options import ESTIMATE
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
 from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
@@ -230,7 +232,7 @@ class _Laps:
 def _demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
     """Write the capture, or read one that was written with the same options."""
     asked = {
-        "version": __version__,
+        "code": code_digest(),
         "device": "cuda" if resolve_device(device).is_cuda else "cpu",
         "frame_count": options.frame_count,
         "camera_count": options.camera_count,

@@ -19,8 +19,9 @@ from beam_warp.demo.lights import demo_environments
 from beam_warp.demo.truth import Truth, comparison, relit_views, score_views
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb
 from beam_warp.image.files import write_exr, write_png
+from beam_warp.jobs.progress import Progress, no_progress
 from beam_warp.jobs.report import write_report
-from beam_warp.materials.job import OverviewOptions, Progress, RunOptions, RunResult, no_progress, run
+from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult, run
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,13 @@ from beam_warp.capture.matching import match_frames, scored_frames
 from beam_warp.checks import require_choice
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.drawn import SAMPLES
-from beam_warp.evaluate.materials import MaterialScores, ScoredView, score_materials
+from beam_warp.evaluate.materials import score_materials
 from beam_warp.evaluate.relighters import RELIGHTERS
+from beam_warp.evaluate.scores import MaterialScores
 from beam_warp.evaluate.sheet import evaluation_sheet
+from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.files import write_exr, write_png
+from beam_warp.jobs.progress import Progress, no_progress
 from beam_warp.jobs.report import device_facts, versions, write_json
 from beam_warp.jobs.store import make_folders
 from beam_warp.raster.records import RasterOptions
@@ -26,13 +29,10 @@ from beam_warp.world.gaussians import GaussianSequence
 REPORT_NAME = "evaluation.json"
 SHEET_NAME = "evaluation.png"
 
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What an evaluation is asked for.
+    """Options of `evaluate_asset`.
 
     Attributes:
         frames: The capture's number of every frame of the asset; None takes what the asset states, else 0, 1, 2, ….
@@ -60,7 +60,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was found, and where it was written.
+    """Scores of an asset and their report.
 
     Attributes:
         scores: The scores.
@@ -78,7 +78,7 @@ def evaluate_asset(
     *,
     out: Path | None = None,
     renders: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Evaluation:
     """Score an asset; write a report and a picture, and the images that were scored, as far as they are asked for.
 

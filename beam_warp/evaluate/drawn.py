@@ -1,4 +1,4 @@
-"""What a camera sees of a relightable cloud, a pixel being the mean of several samples: what is scored."""
+"""Material channels of a relightable cloud as a camera sees them, a pixel being the mean of several samples."""
 
 from __future__ import annotations
 

@@ -8,16 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.evaluate.materials import ImageScore, ScoredView, true_channel
+from beam_warp.evaluate.scores import ImageScore
+from beam_warp.evaluate.views import ScoredView, true_channel
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.metrics import bounding_box
 from beam_warp.image.panels import BACKGROUND, Panel, lay_out
 
 AMPLIFICATION = 4
-"""By how much differences are brightened: a quarter of the display's range comes to white."""
+"""Factor by which differences are brightened: a quarter of the display's range becomes white."""
 
 MARGIN = 4
-"""Around the subject [pixel of the view]."""
+"""Width of the margin around the subject [pixel of the view]."""
 
 ROWS = (300, 600)
 """Panels of fewer rows are enlarged, those of more reduced, by a whole factor."""
@@ -63,7 +64,7 @@ def evaluation_sheet(views: Sequence[ScoredView]) -> NDArray[np.uint8]:
 
 
 def _channels(view: ScoredView) -> Iterator[_Compared]:
-    """Give every channel that was scored."""
+    """Yield every channel that was scored."""
     drawn, truth, scores = view.drawn, view.truth, view.scores
     truth_alpha = truth.channels["A"]
     if drawn.radiance is not None:
@@ -95,7 +96,7 @@ def _channels(view: ScoredView) -> Iterator[_Compared]:
 def _triple(
     title: str, channel: _Compared, truth_alpha: NDArray[np.floating[Any]]
 ) -> Iterator[tuple[str, NDArray[np.uint8], int]]:
-    """Give truth, ours and what differs: a caption, pixels, and the shade around them."""
+    """Yield truth, ours and their difference: a caption, pixels, and the shade around them."""
     score = channel.score
     yield title, _over_background(channel.truth, truth_alpha), SHADE
     ours = _over_background(channel.ours, channel.our_alpha)
@@ -105,7 +106,7 @@ def _triple(
 
 
 def _over_background(over_black: NDArray[np.floating[Any]], alpha: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Put display colours that lie over black over the background of pictures."""
+    """Composite display colours, which lie over black, over the background of pictures."""
     return np.rint(255.0 * np.clip(over_black + BACKGROUND * (1.0 - alpha[..., None]), 0.0, 1.0)).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""How steady base colour is over time: per Gaussian, and at points that are fixed on the true surface."""
+"""Steadiness of base colour over time: per Gaussian, and at points that are fixed on the true surface."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Deviation:
 
 @dataclass(frozen=True)
 class SurfaceScores:
-    """What becomes of the base colour of points that are fixed on the true surface, as test cameras see them.
+    """Steadiness of the base colour of points that are fixed on the true surface, as test cameras see them.
 
     Attributes:
         ours: Over all frames whose true surface is known.
@@ -80,7 +80,7 @@ class SurfaceScores:
 
 @dataclass(frozen=True)
 class TemporalScores:
-    """How steady base colour is.
+    """Steadiness of base colour over time.
 
     Attributes:
         gaussians: Of Gaussians that persist, all frames of the asset.

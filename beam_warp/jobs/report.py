@@ -1,4 +1,4 @@
-"""What a run says about itself: counts over frames, versions, warnings, and the file they are written to."""
+"""Report of a job: the code, versions and device that made its result, and the JSON file that they are written to."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ import numpy as np
 import warp as wp
 
 from beam_warp._version import __version__
+from beam_warp.digests import code_digest
 from beam_warp.errors import OutputError
 from beam_warp.kernels.common.launching import thread_count
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
+    """Return the versions that a result depends on; ``code`` is the digest of this package's source."""
     return {
         "beam-warp": __version__,
+        "code": code_digest(),
         "warp": wp.__version__,
         "numpy": np.__version__,
         "usd-core": version("usd-core"),
@@ -30,7 +32,7 @@ def versions() -> dict[str, str]:
 
 
 def device_facts(device: Any) -> dict[str, Any]:
-    """Return what a Warp device is, JSON-able."""
+    """Return the name and kind of a Warp device, and the threads of a CPU, JSON-able."""
     return {
         "name": device.name,
         "kind": "cuda" if device.is_cuda else "cpu",

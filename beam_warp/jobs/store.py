@@ -1,14 +1,14 @@
-"""The intermediate store: one HDF5 file per frame, written whole or not at all.
+"""Store of finished frames: one HDF5 file a frame, written whole or not at all, from which a stopped job continues.
 
-Workers never share a file, and a killed one costs a frame. A file carries the key of what it was computed from; a
-reader asks for that key, so stale files are never taken for fresh ones.
+Workers never share a file, and a killed one costs a frame. A file carries the key of what it was computed from. A
+reader compares that key, so a stale file is never taken for a fresh one.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ KEY = "beam_key"
 
 
 def make_folders(out: Path, *names: str) -> list[Path]:
-    """Make a folder for results and the named ones in it, as far as they are not there.
+    """Make a folder for results and the named folders in it; those that exist stay as they are.
 
     Raises:
         OutputError: One of them cannot be made, or ``out`` has no parent.
@@ -77,3 +77,14 @@ def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, ND
     with h5py.File(path, "r") as file:
         wanted = tuple(file) if names is None else names
         return {name: np.asarray(file[name]) for name in wanted}
+
+
+def kept_frame(path: Path, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return the arrays stored under a key; where there are none, make and store them first.
+
+    Raises:
+        OutputError: The file cannot be written; nothing is left behind.
+    """
+    if frame_key(path) != key:
+        write_frame(path, key, make())
+    return read_frame(path)

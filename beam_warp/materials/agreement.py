@@ -1,6 +1,6 @@
-"""Whether a sequence, a capture and a light go together, before materials are measured from them.
+"""Checks that a sequence, a capture and a light go together, before materials are measured from them.
 
-What cannot work is refused with an error; what will give worse materials than it could is a finding.
+A combination that cannot work is refused with an error; one that gives worse materials than it could is a finding.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CLEARLY_MORE = 0.1
 """Overlap that other axes or units must gain to be proposed."""
 
 UNITS = {"centimetres": 0.01, "millimetres": 0.001, "hundreds of metres": 100.0}
-"""What a sequence may have been written in instead of metres, and how many metres that is."""
+"""Units that a sequence may have been written in by mistake, in metres."""
 
 CUT_PART = 0.01
 """Part of the subject's pixels at the ceiling from which on a view is reported: highlights alone are less."""
@@ -61,12 +61,12 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class SilhouetteMatch:
-    """How far what a sequence covers in views is what their masks show.
+    """Agreement of the coverage that a sequence has in views with their masks.
 
     Attributes:
         overlap: Intersection over union, median over the views that know their coverage; NaN if none does.
-        view_count: How many those are, of the views compared.
-        finding: What is wrong, if anything.
+        view_count: Compared views that know their coverage.
+        finding: A mismatch, or None.
     """
 
     overlap: float
@@ -262,7 +262,7 @@ def _way_out(
     device: str | None,
     overlap: float,
 ) -> str:
-    """Say how the sequence would match, if other axes or units make it."""
+    """Return a remedy: the axes or units in which the sequence would match, if any do."""
     few, small = _coarse(cloud), _small(views, SEARCH_VIEWS, SEARCH_SIDE)
 
     def turned(shape: GaussianCloud, code: str) -> GaussianCloud:

@@ -1,6 +1,6 @@
-"""From images to Gaussians: the values whose drawing comes nearest to given images, geometry held fixed, within bounds.
+"""Baking of images into Gaussians: the bounded values whose drawing comes nearest to given images, geometry held fixed.
 
-What a pixel shows of values x is linear in them, W x with the blending weights W, so that baking is the bounded linear
+A pixel's value is linear in the Gaussians' values x, W x with the blending weights W. So baking is the bounded linear
 least-squares problem
 
     min over x in [low, high]  sum over pixels of m_p |(W x)_p - t_p|^2 + ridge |x - prior|^2
@@ -50,7 +50,7 @@ Solver = Literal["cg", "adam"]
 SOLVERS = ("cg", "adam")
 
 MOST_COLUMNS = CHANNEL_COUNTS[-1]
-"""Of one problem: what the rasteriser composites in one pass."""
+"""Most columns of one problem: those that the rasteriser composites in one pass."""
 
 GROUP_SPLATS = 2**22
 """Most splats, Gaussians times views, drawn at a time unless one view has more."""
@@ -60,12 +60,12 @@ GROUP_PIXELS = 2**23
 
 
 LEAST_EVIDENCE = 1e-6
-"""Pixels below which a mean of what a Gaussian is seen in is one of rounding."""
+"""Pixels below which the mean of the targets that a Gaussian is seen in is rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
 class BakeTarget:
-    """What one view should show.
+    """Values that one view should show, and their weights.
 
     Attributes:
         camera: The view.
@@ -81,7 +81,7 @@ class BakeTarget:
 
 @dataclass(frozen=True, kw_only=True)
 class BakeOptions:
-    """How baking is done.
+    """Options of baking.
 
     Attributes:
         solver: ``"cg"`` or ``"adam"``.
@@ -125,7 +125,7 @@ class BakeOptions:
 
 @dataclass(frozen=True, eq=False)
 class BakedValues:
-    """What came of baking.
+    """Result of baking.
 
     Attributes:
         values: ``(N, K)`` float32 in the bounds.

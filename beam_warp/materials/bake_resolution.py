@@ -1,6 +1,6 @@
-"""How fine images must be to be baked: pixels much finer than the Gaussians say nothing more, and cost.
+"""Resolution of images for baking: pixels much finer than the Gaussians cost time and tell nothing more.
 
-So images are reduced by a whole factor to where a pixel is half as wide as the splats' deviation, if they are finer
+Images are reduced by a whole factor to where a pixel is half as wide as the splats' deviation, if they are finer
 than that: memory and time of baking fall by the factor's square. Rays, denoising and the solve for the base colour stay
 at the images' own resolution; their noise averages out over a reduced pixel as it does over a splat.
 """
@@ -34,7 +34,7 @@ SMALL_SPLATS = 25.0
 """Percentile of the deviations that counts."""
 
 MEASURED_SPLATS = 4096
-"""Splats of which it is taken at least: one in so many that this is left."""
+"""Least number of splats that the percentile is taken of; larger clouds are thinned evenly."""
 
 
 def reduction_factor(cloud: GaussianCloud, cameras: Sequence[Camera], *, near: float) -> int:

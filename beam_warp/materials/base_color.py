@@ -1,4 +1,4 @@
-"""From evidence to base colour: solve the least-squares problem, say how sure it is, flag and fill what it leaves out.
+"""Base colour from evidence: the least-squares solution, its standard error, flags and values of what is not measured.
 
 Nothing is divided by a small number: what was hardly lit or never seen is flagged and filled from neighbours.
 """
@@ -45,7 +45,7 @@ UNKNOWN = (0.5, 12.0**-0.5)
 """Base colour of which nothing is known, and its standard error: any in [0, 1] is as likely."""
 
 MISSING = Observability.UNLIT | Observability.UNSEEN
-"""What base colour cannot be measured of."""
+"""Flags of Gaussians whose base colour cannot be measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,14 @@ class BaseColor:
     standard_error: NDArray[np.float32]
     observability: NDArray[np.uint8]
     clipped_part: float
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return base colour, its standard error and observability by the names that a cloud has for them."""
+        return {
+            "base_color": self.base_color,
+            "base_color_error": self.standard_error,
+            "observability": self.observability,
+        }
 
 
 def solve_base_color(

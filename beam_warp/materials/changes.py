@@ -1,4 +1,4 @@
-"""Whether base colour changes over time: one colour for all frames unless the data says otherwise.
+"""Test whether base colour changes over time: one colour for all frames unless the data says otherwise.
 
 Frame f of a Gaussian has the colour rho_f with the standard error s_f. If it is the same in every frame,
 Q = sum over f of (rho_f - mean)^2 / s_f^2 follows a chi-squared distribution of one degree less than frames. Errors of
@@ -34,7 +34,7 @@ and the middle does not show it. It holds as long as fewer than a tenth of the G
 
 @dataclass(frozen=True, eq=False)
 class ColorChange:
-    """Which Gaussians change colour, and what their frames are drawn towards.
+    """Gaussians that change colour, and the mean that their frames are drawn towards.
 
     Attributes:
         changing: ``(N,)`` bool.

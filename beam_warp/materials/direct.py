@@ -1,6 +1,6 @@
-"""What the light of a capture says of each Gaussian in one frame: how open it is, and evidence on its base colour.
+"""Direct path: ambient occlusion of each Gaussian in one frame, and evidence on its base colour.
 
-The direct path: rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
+Rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
 What views show comes from their images (`beam_warp.materials.evidence`), or, of Gaussians without images, from their
 own captured radiance around the normal.
 """
@@ -24,10 +24,10 @@ from beam_warp.kernels.materials.residues import (
     ALBEDO_SCALING,
     FRESNEL_HV,
     ColorFit,
+    GatheredLight,
     LightRays,
     Observations,
-    PointLight,
-    Surface,
+    ShadedPoints,
     launch_fit_color,
     launch_gather_light,
     launch_sample_radiance,
@@ -53,10 +53,10 @@ BOUNCE_PART = 4
 
 VIEW_COUNT = 8
 SMALLEST_VIEW_COSINE = 0.2
-"""Where there are no images: views below this n.v count for nothing, there the normal and the lobe's edge dominate."""
+"""Least n.v of a view, where there are no images: below, the normal and the lobe's edge dominate."""
 
 BURIED_VISIBILITY = 0.02
-"""Below this visibility no view shows the Gaussian: its captured colour was never constrained."""
+"""Visibility below which no view shows the Gaussian: its captured colour was never constrained."""
 
 SATURATION = 0.995
 """Captured display colour above which the sensor's or the training's ceiling may have cut it."""
@@ -64,18 +64,20 @@ SATURATION = 0.995
 DiffuseWeight = Literal["albedo_scaling", "fresnel_hv"]
 
 DIFFUSE_WEIGHTS: dict[str, int] = {"albedo_scaling": int(ALBEDO_SCALING), "fresnel_hv": int(FRESNEL_HV)}
+"""Ways to weigh the light that is left for diffusion, and the kernels' numbers for them: ``"albedo_scaling"``, what the
+specular lobe as a whole does not reflect, which conserves energy; ``"fresnel_hv"``, 1 - F(h.v) for every ray (the
+paper's 1 - F, with Schlick's F)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """How materials are measured.
+    """Options of the direct path.
 
     Attributes:
         sample_count: Rays per Gaussian and frame for visibility, and as many for light; a power of two is best.
         offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.trace.rays`.
         bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
-        diffuse_weight: What the specular lobe leaves for diffusion: ``"albedo_scaling"`` 1 - E_s(n.v), which keeps
-            energy, or ``"fresnel_hv"`` 1 - F(h.v), the paper's.
+        diffuse_weight: What the specular lobe leaves for diffusion, one of `DIFFUSE_WEIGHTS`.
         sampler: Sample sets; see `beam_warp.irradiance`.
         density: What light rays are drawn by; see there.
         ratio: Whether rays only say which share of the unshadowed light arrives; see there.
@@ -107,7 +109,7 @@ class MaterialOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColorEvidence:
-    """What frames say about base colour; evidence on the same Gaussians adds up.
+    """Evidence of frames on base colour; evidence on the same Gaussians adds up.
 
     Attributes:
         numerator: Sum of w L_D (L_o - L_S), ``(N, 3)``.
@@ -189,8 +191,8 @@ class LitPoints:
         rows: Which Gaussians they are, ``(M,)``.
     """
 
-    light: PointLight
-    surface: Surface
+    light: GatheredLight
+    surface: ShadedPoints
     views: Observations
     rows: NDArray[np.int64]
 
@@ -359,12 +361,12 @@ def make_points(
     """
     device = light.device
     at = upload(np.asarray(rows, np.int32), int, device)
-    surface = Surface()
+    surface = ShadedPoints()
     surface.normals = points.normals[at].contiguous()
     surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
     views.specular = wp.zeros(views.directions.shape, dtype=wp.vec3, device=device)
     views.diffuse_share = wp.zeros(views.directions.shape, dtype=float, device=device)
-    arriving = _empty(PointLight, len(rows), device)
+    arriving = _empty(GatheredLight, len(rows), device)
     launch_sum_unshadowed(light.moments, surface.normals, arriving.unshadowed, device)
     return LitPoints(arriving, surface, views, np.asarray(rows, np.int64))
 

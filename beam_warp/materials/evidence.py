@@ -1,4 +1,4 @@
-"""What views show of every Gaussian: the surface it belongs to, and its colour towards each camera.
+"""Evidence of views on every Gaussian: the surface that it belongs to, and its colour towards each camera.
 
 The rasteriser's blending weights say which pixels a Gaussian is part of, and how much. Spread back by them, the points
 that pixels see give each Gaussian its place on the surface as it is *seen*, which its own centre is not (a third of
@@ -40,7 +40,7 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
 SURFACE_CHANNELS = 8
-"""Of a pixel's channels, those that are added up over views."""
+"""Number of a pixel's channels that are added up over views."""
 
 LEAST_WEIGHT = 0.5
 """Pixels that all views together must show of a Gaussian, by its blending weights, for it to be seen."""
@@ -65,12 +65,12 @@ MARGIN = 4
 """Pixels around the subject that stay: the pixel filter widens splats."""
 
 HEADROOM = 0.995
-"""Of what a display-referred image can hold: from there on a pixel counts as cut."""
+"""Part of an image's largest value from which on a pixel counts as cut."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """What views show of every Gaussian; arrays are on the device.
+    """Place, normal and colours of every Gaussian as views show them; arrays are on the device.
 
     Attributes:
         positions: The point of the surface that it belongs to [m], ``(N,)`` vec3; its own centre where it is not seen.

@@ -1,4 +1,4 @@
-"""Under which exposure of a light is display-referred captured colour physically possible."""
+"""Exposure of a light under which display-referred captured colour is physically possible."""
 
 from __future__ import annotations
 

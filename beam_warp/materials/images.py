@@ -1,20 +1,18 @@
-"""From captured views and known light to base colour and ambient occlusion by way of images: the paper's path.
+"""Image path, the paper's: base colour and ambient occlusion of every pixel of the views, baked into the Gaussians.
 
 Per view, the pixels' surface points are lifted by a fixed distance, ambient occlusion and both residues are estimated
 by independent rays and denoised, and what was captured is solved for the base colour, pixel by pixel. Then both are
 baked into the Gaussians, geometry held fixed (BEAM §3.2). `beam_warp.materials.direct` is the direct path, which needs
 no images of materials; this one is what it is compared with.
 
-What the paper leaves open is decided so: densities of rays as in `beam_warp.materials.residues`; the base colour is
+The paper leaves the following open. Here, densities of rays as in `beam_warp.materials.residues`; the base colour is
 max(L_o - L_S, 0) / L_D, cut to [0, 1], and does not count where L_D is below `UNLIT_PART` of the light that falls on an
 open surface on average, nor where a pixel is not covered by the subject wholly, as drawn and as captured.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -36,15 +34,15 @@ from beam_warp.checks import (
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixels, launch_write_bake_targets
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
+from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
-    DIFFUSE_WEIGHTS,
     FEWEST_LIGHT_SAMPLES,
     SURFACE_DEPTHS,
-    DiffuseWeight,
     SurfaceDepth,
     ViewSurfaces,
     surface_occlusion,
@@ -83,7 +81,7 @@ FILL_NEIGHBORS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePathOptions:
-    """How the image path measures; defaults are the paper's, but for the solver.
+    """Options of the image path; defaults are the paper's, but for the solver.
 
     Attributes:
         occlusion_samples: Rays a pixel for ambient occlusion.
@@ -95,7 +93,7 @@ class ImagePathOptions:
         steps: Steps of ``"adam"``.
         ridge: See `beam_warp.materials.bake.BakeOptions`.
         temporal: Pull of the base colour towards the previous frame's, in pixels.
-        diffuse_weight: See `beam_warp.materials.residues.DIFFUSE_WEIGHTS`.
+        diffuse_weight: See `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
         surface_depth: See `beam_warp.materials.residues.SURFACE_DEPTHS`.
         seed: Same seed, same device, same bits.
 
@@ -122,7 +120,7 @@ class ImagePathOptions:
         require_count("light_samples", self.light_samples, FEWEST_LIGHT_SAMPLES, 1 << 20)
         require_number("offset", self.offset)
         require_choice("denoiser", self.denoiser, DENOISERS)
-        require_choice("diffuse_weight", self.diffuse_weight, DIFFUSE_WEIGHTS)
+        require_choice("diffuse_weight", self.diffuse_weight, tuple(DIFFUSE_WEIGHTS))
         require_choice("surface_depth", self.surface_depth, SURFACE_DEPTHS)
         self.baking(temporal=self.temporal)
 
@@ -140,7 +138,7 @@ class ImagePathOptions:
 
 @dataclass(frozen=True, eq=False)
 class ImageMaterials:
-    """What the image path finds.
+    """Materials that the image path finds.
 
     Attributes:
         base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
@@ -220,7 +218,7 @@ def decompose_by_images(
         require_finite("previous", before)
     require_count("frame", frame, 0, 2**32 - 1)
 
-    stages = _Stages(scene.device)
+    stages = StageTimer(scene.device)
     with stages("upload"):
         gaussians = upload_gaussians(cloud, scene.device, values=rough[:, None])
     drawn_as = raster_options or RasterOptions()
@@ -263,21 +261,6 @@ _DENOISER_NOTES = {
 }
 
 
-class _Stages:
-    """Seconds by stage; waits for the device, so that work is charged to the stage that asked for it."""
-
-    def __init__(self, device: Any) -> None:
-        self.seconds: dict[str, float] = {}
-        self._device = device
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        wp.synchronize_device(self._device)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
 def crop_to_subject(view: CapturedView) -> CapturedView:
     """Return the part of a view that shows the subject, with a margin; all of it where coverage is not known.
 
@@ -295,7 +278,7 @@ def crop_to_subject(view: CapturedView) -> CapturedView:
 
 
 class _MeasuredView(NamedTuple):
-    """What one view says, and how many of its pixels show a surface."""
+    """Bake target of one view, and how many of its pixels show a surface."""
 
     target: BakeTarget
     surface_count: int
@@ -310,7 +293,7 @@ def _measure_view(
     raster_options: RasterOptions,
     number: int,
     denoiser: Denoiser,
-    stages: _Stages,
+    stages: StageTimer,
 ) -> _MeasuredView:
     """Find base colour and ambient occlusion of a view's pixels, to be baked."""
     device = scene.device
@@ -370,7 +353,7 @@ def _bake(
     options: ImagePathOptions,
     raster_options: RasterOptions,
     previous: NDArray[np.float32] | None,
-    stages: _Stages,
+    stages: StageTimer,
     device: Any,
 ) -> tuple[BakedValues, NDArray[np.bool_]]:
     """Bake the images, and fill what no view sees from its neighbours."""

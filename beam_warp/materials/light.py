@@ -1,9 +1,9 @@
-"""Whether a stated environment fits what was captured under it: its turn, its handedness, its scale, its range.
+"""Check that a stated environment fits its capture: its turn, its handedness, its scale, its range.
 
-Two things tell, and neither knows the base colours. Divided by the right light, shading is gone from what was seen and
-the base colours that are left spread least over the surface. And what changes of a point's colour from view to view is
-gloss: whatever the base colour, it must follow the light that the views see mirrored. Both are linear in the light, so
-that all turns of an environment cost two matrix products.
+Two criteria need no base colours. Observed colours divided by the shading of the right light are base colours, which
+spread less over the surface than under any other light. Changes of a point's colour from view to view are gloss:
+whatever the base colour, they must follow the light that the views see mirrored. Both are linear in the light, so that
+all turns of an environment cost two matrix products.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ UNREMOVED = 1.1
 
 WELL_LIT = 0.5
 BRIGHT, BRIGHTEST = 0.75, 0.95
-"""Of Gaussians that get this part of the mean irradiance, quantiles of the largest channel of base colour."""
+"""Part of the mean irradiance from which on a Gaussian counts as well lit; quantiles of the largest channel of base
+colour over those Gaussians."""
 
 TOO_BRIGHT = 1.1
 TOO_DARK = 0.05
@@ -102,7 +103,7 @@ files are linear and 0.03 in sRGB."""
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LightEvidence:
-    """What some points show of the light; cells are those of a lat-long grid, row-major.
+    """Evidence of some points on the light; cells are those of a lat-long grid, row-major.
 
     Attributes:
         normals: Unit, ``(M, 3)``.
@@ -121,7 +122,7 @@ class LightEvidence:
 
 @dataclass(frozen=True, kw_only=True)
 class LightCheck:
-    """How well an environment fits a capture.
+    """Fit of an environment to a capture.
 
     Attributes:
         best_rotation_degrees: Turn by which it fits best, as `EnvironmentMap.rotated` takes it, in (-180, 180]; of
@@ -272,7 +273,7 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
 
 
 def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
-    """Tell a display-referred picture that was given as light: cut at white, or from 8 bits whatever its scale.
+    """Detect a display-referred picture that was given as light: cut at white, or from 8 bits whatever its scale.
 
     Uniform maps and those of a few colours are taken for what they are.
     """
@@ -395,7 +396,7 @@ def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]
 
 
 def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
-    """Put what is wrong into words; of a light that does not fit at all neither turn nor exposure mean anything."""
+    """Return findings about a light; if it does not fit at all, neither its turn nor its exposure mean anything."""
     put_in = check.spread_best > UNREMOVED * check.spread_undivided
     if (has_gloss and check.gloss_best < LEAST_GLOSS) or put_in:
         return [
@@ -438,7 +439,7 @@ def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
 
 
 def _unjudged(count: int, finding: Finding) -> LightCheck:
-    """Say why nothing can be said."""
+    """Return a check that judges nothing, with the finding that says why."""
     return LightCheck(
         best_rotation_degrees=0.0,
         is_mirrored=False,

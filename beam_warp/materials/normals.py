@@ -1,4 +1,4 @@
-"""Which way the surface faces at every Gaussian, and how sure that is."""
+"""Surface normals at every Gaussian, with their confidence, and the points where its light is gathered."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FLAT_RATIO = 0.35
 """A Gaussian whose smallest scale is below this part of its middle one has an orientation of its own."""
 
 LIFT_IN_REACHES = 4.0
-"""How far rays from points that views show are lifted, in root mean square reaches of the Gaussians above them.
+"""Lift of rays from points that views show, in root mean square reaches of the Gaussians above them.
 
 On reconstructions of two captures 3 to 5 give ambient occlusion within 0.2 dB of each other but for one: 3 loses 0.8 dB
 on one of them to self-shadowing (docs/materials.md)."""
@@ -57,7 +57,7 @@ class SurfaceNormals:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Where the light of each Gaussian is gathered; arrays of Warp are on the scene's device.
+    """Points where the light of each Gaussian is gathered; arrays of Warp are on the scene's device.
 
     Attributes:
         positions: Points on the surface [m], ``(N,)`` vec3.

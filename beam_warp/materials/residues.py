@@ -1,4 +1,4 @@
-"""What light does at the surface points that a camera's pixels show: how open they are, and what they would send back.
+"""Ambient occlusion and reflected light of the surface points that a camera's pixels show.
 
 The paper's Gaussian sampler (BEAM §3.2, Eqs. 3 to 7), for one view at a time, on the pixels that show a surface and no
 others. The paper states sample counts, not densities. Here occlusion rays are drawn by the cosine; light rays by
@@ -16,8 +16,6 @@ import warp as wp
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import upload
 from beam_warp.kernels.materials.image_residues import (
-    ALBEDO_SCALING,
-    FRESNEL_HV,
     Residues,
     ResidueSamples,
     launch_draw_residue_rays,
@@ -32,6 +30,7 @@ from beam_warp.kernels.materials.pixel_surfaces import (
 )
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -42,16 +41,10 @@ from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT, trace_rays
 from beam_warp.world.camera import Camera
 
-DiffuseWeight = Literal["fresnel_hv", "albedo_scaling"]
-
-DIFFUSE_WEIGHTS = ("fresnel_hv", "albedo_scaling")
-"""What of the light is left for diffusion: ``"fresnel_hv"``, 1 - F(h.v) for every ray (the paper's 1 - F, with
-Schlick's F); ``"albedo_scaling"``, what the specular lobe as a whole does not reflect, which conserves energy."""
-
 SurfaceDepth = Literal["median", "mean"]
 
 SURFACE_DEPTHS = ("median", "mean")
-"""Where on a pixel's ray the surface is: at the median depth, which jumps at silhouettes, or at the mean, which lies
+"""Depths at which a pixel's ray may meet the surface: the median, which jumps at silhouettes, or the mean, which lies
 between front and back there."""
 
 LEAST_ALPHA = 0.5
@@ -182,7 +175,7 @@ def surface_residues(
         light: The environment, prepared on the same device.
         sample_count: Rays a pixel, at least `FEWEST_LIGHT_SAMPLES`.
         offset: Lift of ray origins along the normal [m].
-        diffuse_weight: w_d, one of `DIFFUSE_WEIGHTS`.
+        diffuse_weight: w_d, one of `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
         seed: Same seed, same device, same bits.
         frame: As for `surface_occlusion`.
 
@@ -195,7 +188,7 @@ def surface_residues(
 
     Source: BEAM Eqs. 5 and 6; balance heuristic, Veach 1997; visible normals, Heitz 2018.
     """
-    require_choice("diffuse_weight", diffuse_weight, DIFFUSE_WEIGHTS)
+    require_choice("diffuse_weight", diffuse_weight, tuple(DIFFUSE_WEIGHTS))
     require_count("sample_count", sample_count, FEWEST_LIGHT_SAMPLES, 1 << 20)
     require_number("offset", offset)
     require_count("seed", seed, 0, 2**32 - 1)
@@ -206,7 +199,6 @@ def surface_residues(
     samples.environment_count = sample_count // 2
     samples.cosine_count = sample_count // 4
     table = upload(specular_albedo_table(), wp.vec2, device)
-    weighting = (FRESNEL_HV, ALBEDO_SCALING)[DIFFUSE_WEIGHTS.index(diffuse_weight)]
     residues = Residues()
     residues.diffuse, residues.specular = (wp.empty(len(surfaces), dtype=wp.vec3, device=device) for _ in range(2))
     residues.diffuse_error, residues.specular_error = (
@@ -219,5 +211,6 @@ def surface_residues(
         launch_draw_residue_rays(samples, light.distribution, batch, rows, (seed, frame), rays, weights, device)
         visibility = wp.empty(len(rays.origins), dtype=float, device=device)
         trace_rays(scene, EXACT, rays, visibility)
+        weighting = DIFFUSE_WEIGHTS[diffuse_weight]
         launch_reduce_residues(batch, rows, rays.directions, weights, visibility, table, weighting, residues, device)
     return residues

@@ -64,7 +64,7 @@ PRECISIONS = np.geomspace(1e-3, 10.0, 25)
 """T that are tried. The largest takes residuals of 0.013 of a white surface for chance: no captured light is better."""
 
 STEPS = np.array((0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3))
-"""By how much a place may differ from its surroundings (standard deviation), as tried."""
+"""Differences of a place from its surroundings (standard deviations) that are tried."""
 
 SPREADS = np.geomspace(0.05, 0.4, 13)
 """Spreads of the prior that are tried: no subject is of one roughness to better than the split sum knows it."""
@@ -79,10 +79,10 @@ LEAST_AGREEMENT = 2.0
 """Natural logarithm of the odds by which halves must agree rather than not, for any claim: e^2 is 7 to 1."""
 
 INFORMED_PART = 0.9
-"""Of the prior's spread; a Gaussian whose distribution is wider is told by the prior."""
+"""Part of the prior's spread; a Gaussian whose distribution is wider is told by the prior."""
 
 MODEL_ERROR = 0.04
-"""What the split sum makes of roughness: against the full integral over the lobe, under a sky of five soft lights and
+"""Error of roughness by the split sum: against the full integral over the lobe, under a sky of five soft lights and
 without noise, 0.2, 0.3, ... 0.8 come back 0.02 to 0.06 off, 0.035 in root mean square."""
 
 TINY = 1e-300
@@ -90,7 +90,7 @@ TINY = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class RoughnessProfile:
-    """How badly candidates explain the views of Gaussians; profiles of several frames of them add up.
+    """Misfit of candidates to the views of Gaussians; profiles of several frames of the same Gaussians add up.
 
     Attributes:
         misfit: For all views, the even and the odd ones, and each of `CANDIDATES`: the sum over views of
@@ -128,7 +128,7 @@ class RoughnessProfile:
 
 @dataclass(frozen=True)
 class RoughnessPrior:
-    """What is held of roughness before a place is looked at: normal, cut to the range of `CANDIDATES`.
+    """Prior distribution of roughness: normal, cut to the range of `CANDIDATES`.
 
     Attributes:
         mean: Mean, perceptual.
@@ -287,7 +287,7 @@ def solve_roughness(
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What misfits are worth: exp(-precision misfit), and the logarithm of the odds that halves of the views agree."""
+    """Weight of misfits, exp(-precision misfit), and the logarithm of the odds that halves of the views agree."""
 
     precision: float
     agreement: float
@@ -298,7 +298,7 @@ class _Evidence:
 
 
 def _told_by(prior: RoughnessPrior, count: int, frames: int) -> RoughnessEstimate:
-    """Return what is held of Gaussians that no view shows."""
+    """Return the prior as the estimate of Gaussians that no view shows."""
     mean, spread = _moments(_log_prior(prior))
     nothing = _Evidence(0.0, 0.0).record()
     return RoughnessEstimate(

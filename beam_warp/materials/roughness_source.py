@@ -1,7 +1,8 @@
-"""Where roughness comes from: a constant, or a texture on a mesh whose nearest valid texel each Gaussian takes."""
+"""Stated roughness: a constant, or a texture on a mesh whose nearest valid texel each Gaussian takes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,27 @@ MAX_TEXELS = 1 << 26
 """Largest texture, in texels, that is projected: 8192 x 8192."""
 
 
-def constant_roughness(cloud: GaussianCloud, value: float) -> NDArray[np.float32]:
-    """Return one perceptual roughness in [0, 1] for every Gaussian, ``(N,)`` float32."""
-    return np.full(len(cloud), require_number("roughness", value, 0.0, 1.0), np.float32)
+@dataclass(frozen=True)
+class RoughnessTexture:
+    """A roughness texture and the mesh whose texture coordinates it follows, in the axes and units of the input."""
+
+    texture: Path
+    mesh: Path
+
+
+def stated_roughness(cloud: GaussianCloud, source: float | RoughnessTexture) -> NDArray[np.float32]:
+    """Return the perceptual roughness that a constant or a texture states for every Gaussian, ``(N,)`` float32.
+
+    Args:
+        cloud: Gaussians, in the axes and units of a texture's mesh.
+        source: A constant in [0, 1], or a texture.
+
+    Raises:
+        BeamError: As `textured_roughness`, or the constant is out of range.
+    """
+    if isinstance(source, RoughnessTexture):
+        return textured_roughness(cloud, source.texture, source.mesh)
+    return np.full(len(cloud), require_number("roughness", source, 0.0, 1.0), np.float32)
 
 
 def texel_positions(mesh: trimesh.Trimesh, height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from beam_warp.materials.archive import MeasuredFrame
 from beam_warp.materials.changes import ColorChange
 from beam_warp.world.gaussians import GaussianCloud, Observability
 
@@ -19,7 +19,7 @@ UNCERTAIN_WARNING = 0.5
 
 
 def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
-    """Return what a user should know about a tally's `Tally.summary`."""
+    """Return what a user should know about a tally's `MaterialTally.summary`."""
     warnings = []
     if statistics["clipped_part"] > CLIPPED_WARNING:
         warnings.append(
@@ -36,7 +36,7 @@ def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
     return warnings
 
 
-class Tally:
+class MaterialTally:
     """Counts over frames, so that a report needs no frame twice."""
 
     def __init__(self) -> None:
@@ -46,8 +46,8 @@ class Tally:
         self._changes: dict[str, float] = {}
         self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
-    def add(self, cloud: GaussianCloud, stored: Mapping[str, NDArray[Any]], clipped_part: float = 0.0) -> None:
-        """Count one frame: its relightable cloud, ``from_shape`` and ``report`` of the store, and what was cut at 1."""
+    def add(self, frame: MeasuredFrame, cloud: GaussianCloud, clipped_part: float = 0.0) -> None:
+        """Count one frame: its measurements, its relightable cloud, and the part of the opacity that was cut at 1."""
         count = len(cloud)
         assert cloud.observability is not None
         assert cloud.ambient_occlusion is not None
@@ -59,13 +59,13 @@ class Tally:
         self._rows += count
         for name, value in (
             ("clipped", clipped_part * count),
-            ("from_shape", stored["from_shape"].sum()),
+            ("from_shape", frame.from_shape.sum()),
             ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
             ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
             ("error", error),
             ("measured", measured.sum()),
-            ("dropped", stored["report"][1]),
-            ("raised", stored["report"][2]),
+            ("dropped", frame.report[1]),
+            ("raised", frame.report[2]),
         ):
             self._sums[name] = self._sums.get(name, 0.0) + float(value)
         for flag in Observability:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp._version import __version__
+from beam_warp.digests import code_digest
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
@@ -110,7 +110,7 @@ class RenderJob:
     def __init__(self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: Report) -> None:
         """Take what is rendered, by whom, how it is shown, and who wants to know."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
-        self._digests = ShotDigests(__version__, renderer.decisive, writer.options)
+        self._digests = ShotDigests(code_digest(), renderer.decisive, writer.options)
 
     def render_stills(self, images: Sequence[tuple[Frame, Path]]) -> Tally:
         """Render single images, writing over what is there; frames in the order of time are read once.

@@ -14,9 +14,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp._version import __version__
 from beam_warp.converters.staging import staged_outputs
 from beam_warp.device.arrays import upload
+from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.trace.surface_rays import launch_local_surface
 from beam_warp.light.prepared import PreparedEnvironment
@@ -185,7 +185,7 @@ def _fingerprint(cloud: GaussianCloud, environment: EnvironmentMap, plan: Tracin
         digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     digest.update(environment.radiance.tobytes())
     chosen = (plan.offsets, plan.reference_rays, plan.points, plan.seed)
-    digest.update(repr((chosen, scene.device.name, scene.device.is_cuda, __version__)).encode())
+    digest.update(repr((chosen, scene.device.name, scene.device.is_cuda, code_digest())).encode())
     return digest.hexdigest()
 
 

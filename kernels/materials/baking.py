@@ -1,4 +1,4 @@
-"""What baking adds around the rasteriser: residuals of pixels, pulls towards other values, sums over views."""
+"""Kernels of baking beside the rasteriser: residuals of pixels, pulls towards other values, sums over views."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def weigh_residuals_kernel(
     weights: wp.array2d[float],
     out_pixels: wp.array2d[float],
 ):
-    """What is masked away may hold anything; columns beyond those of the weights count nothing."""
+    """Masked targets may hold any value; columns beyond those of the weights count nothing."""
     item = first + wp.tid()
     row = item / drawn.shape[1]
     c = item % drawn.shape[1]
@@ -84,7 +84,7 @@ def launch_weigh_pixels(drawn: Any, weights: Any, out_pixels: Any, device: Any) 
 
 
 def launch_weigh_residuals(drawn: Any, targets: Any, weights: Any, out_pixels: Any, device: Any) -> None:
-    """Multiply what images lack of their targets by weights."""
+    """Multiply the differences of images and their targets by weights."""
     launch(weigh_residuals_kernel, drawn.size, inputs=[drawn, targets, weights], outputs=[out_pixels], device=device)
 
 

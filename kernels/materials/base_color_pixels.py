@@ -1,4 +1,4 @@
-"""Base colour of pixels from their captured radiance and both residues, and what of it baking may rely on."""
+"""Base colour of pixels from their captured radiance and both residues, and which pixels baking may rely on."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ShownPixels:
-    """What the pixels of one view show, flat."""
+    """Drawn and captured values of the pixels of one view, flat."""
 
     alpha: wp.array[float]  # coverage as drawn
     surface: wp.array[float]  # 1 where residues were measured, else 0
@@ -24,7 +24,7 @@ class ShownPixels:
 
 @wp.struct
 class PixelGuards:
-    """Below what a pixel says nothing."""
+    """Values below which a pixel does not count."""
 
     least_alpha: float  # coverage, drawn and captured
     least_diffuse: float  # light of a white diffuser

@@ -46,7 +46,7 @@ class Problem:
 
 @wp.struct
 class ColumnState:
-    """What each column is at, ``(K,)`` each."""
+    """State of the solution of each column, ``(K,)`` each."""
 
     mode: wp.array[int]
     step: wp.array[float]
@@ -68,7 +68,7 @@ def free_gradient(problem: Problem, x: float, g: float) -> float:
 
 @wp.func
 def bound_gradient(problem: Problem, x: float, g: float) -> float:
-    """Of a variable at its bound, if descent leads into the box."""
+    """Gradient of a variable at its bound if descent leads into the box, else 0."""
     value = float(0.0)
     if x <= problem.low:
         value = wp.min(g, 0.0)
@@ -79,7 +79,7 @@ def bound_gradient(problem: Problem, x: float, g: float) -> float:
 
 @wp.func
 def room(problem: Problem, x: float, d: float) -> float:
-    """How far x can go along -d within the box, in units of d."""
+    """Largest step along -d that keeps x within the box, in units of d."""
     reach = float(wp.inf)
     if d > 0.0:
         reach = (x - problem.low) / d
@@ -218,7 +218,7 @@ def write_direction_kernel(first: int, problem: Problem, state: ColumnState):
 
 
 class SolveSums:
-    """Where the lanes' sums are kept."""
+    """Buffers of the lanes' sums."""
 
     def __init__(self, columns: int, device: Any) -> None:
         self.direction = wp.empty((LANES, columns), dtype=wp.vec2d, device=device)

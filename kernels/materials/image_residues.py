@@ -30,6 +30,7 @@ from beam_warp.kernels.light.environment_sampling import (
 )
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.kernels.materials.pixel_surfaces import PixelSurfaces
+from beam_warp.kernels.materials.residues import FRESNEL_HV
 from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace.visibility import Rays
 
@@ -38,13 +39,10 @@ wp.set_module_options({"enable_backward": False})
 PI = wp.constant(3.14159265358979323846)
 RESIDUE_STREAM = wp.constant(wp.uint32(0x52455349))
 
-FRESNEL_HV = wp.constant(0)
-ALBEDO_SCALING = wp.constant(1)
-
 
 @wp.struct
 class ResidueSamples:
-    """How the samples of a point are shared among densities: the first ones, the next ones, the rest."""
+    """Samples of a point, shared among densities: the first ones, the next ones, the rest."""
 
     set: SampleSet
     environment_count: int
@@ -53,8 +51,8 @@ class ResidueSamples:
 
 @wp.struct
 class Residues:
-    """By row: the radiance of a white diffuser, that of the specular lobe, and the standard errors of their means over
-    the channels."""
+    """Radiance of a white diffuser and of the specular lobe by row, with the standard errors of their means over the
+    channels."""
 
     diffuse: wp.array[wp.vec3]
     specular: wp.array[wp.vec3]

@@ -1,4 +1,4 @@
-"""What the neighbours of each Gaussian say about the surface: its thinnest direction, and the normal they agree on."""
+"""Surface around each Gaussian from its neighbours: their thinnest direction, and the normal that they agree on."""
 
 import warp as wp
 

@@ -29,7 +29,7 @@ class PixelSurfaces:
 
 @wp.struct
 class SurfaceImages:
-    """What a view shows of a surface, pixel by pixel."""
+    """Images of the surface that a view shows."""
 
     alpha: wp.array[float]
     depth: wp.array[float]  # along the optical axis

@@ -1,4 +1,4 @@
-"""What pixels should show, in blocks: means by weight and sums of the weights."""
+"""Reduction of bake targets to blocks of pixels: means by weight, and sums of the weights."""
 
 from typing import Any
 

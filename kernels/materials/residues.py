@@ -1,4 +1,4 @@
-"""What of a Gaussian's captured colour the light explains: diffuse and specular residues of every view, and their fit.
+"""Diffuse and specular residues of every view of a Gaussian under the traced light, and the fit of base colour to them.
 
 Rays are traced once per Gaussian; every view's residues (BEAM Eqs. 4 and 5) come from the same rays, because visibility
 does not depend on the view. Light without anything in the way is known in closed form (irradiance) or blurred
@@ -40,7 +40,7 @@ FACING = wp.constant(0.5)
 """n.v from which on views count, and from which on they count fully: before, the shading normal decides."""
 
 ROUNDS = wp.constant(3)
-"""Of reweighting: by then the weights have settled."""
+"""Rounds of reweighting: by then the weights have settled."""
 
 RELATIVE_SPREAD = wp.constant(0.1)
 LEAST_SPREAD = wp.constant(0.01)
@@ -61,7 +61,7 @@ class LightRays:
 
 
 @wp.struct
-class PointLight:
+class GatheredLight:
     """Light at each point, by row."""
 
     unshadowed: wp.array[wp.vec3]  # irradiance over pi with nothing in the way
@@ -73,7 +73,7 @@ class PointLight:
 
 @wp.struct
 class Observations:
-    """What views show of points, and what light explains of it: row v of each array is view v."""
+    """Colours of points towards views, and their residues under the light: row v of each array is view v."""
 
     colors: wp.array2d[wp.vec4]  # radiance, and its weight, 0 where the view does not see the point
     directions: wp.array2d[wp.vec3]  # unit, towards the viewer
@@ -128,7 +128,7 @@ def brightness(color: wp.vec3) -> float:
 
 
 @wp.kernel
-def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int, out_light: PointLight):
+def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int, out_light: GatheredLight):
     """Arriving light: E_unshadowed * sum V f / sum f, or the mean of V f; its noise; what a turn of the normal does.
 
     Where no ray found light, half of the unshadowed light is stated, give or take all of it.
@@ -174,8 +174,8 @@ def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int
 
 
 @wp.struct
-class Surface:
-    """What is known of the points that shade, by row."""
+class ShadedPoints:
+    """Normals and roughness of the points that are shaded, by row."""
 
     normals: wp.array[wp.vec3]
     roughness: wp.array[float]
@@ -224,9 +224,9 @@ def view_residues_kernel(
     first: int,
     batch: RayBatch,
     rays: LightRays,
-    light: PointLight,
+    light: GatheredLight,
     lobes: EnvironmentLight,
-    surface: Surface,
+    surface: ShadedPoints,
     diffuse_weight: int,
     out_views: Observations,
 ):
@@ -267,7 +267,7 @@ def facing_weight(cosine: float) -> float:
 
 @wp.kernel
 def fit_color_kernel(
-    first: int, views: Observations, light: PointLight, surface: Surface, rounds: int, out_fit: ColorFit
+    first: int, views: Observations, light: GatheredLight, surface: ShadedPoints, rounds: int, out_fit: ColorFit
 ):
     """Least-squares sums over views, outliers counted little in every round but the first (Cauchy's weights)."""
     row = first + wp.tid()

@@ -1,4 +1,4 @@
-"""How well every one of a few roughnesses explains what views show of points whose light is known.
+"""Misfit of candidate roughnesses to the views of points whose light is known.
 
 The rays that gathered a point's light also say which share of each view's specular lobe is open, as in
 `beam_warp.kernels.materials.residues`. That share changes slowly with roughness and costs a loop over the rays, so it
@@ -20,9 +20,9 @@ from beam_warp.kernels.light.brdf import (
 )
 from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
 from beam_warp.kernels.materials.residues import (
+    GatheredLight,
     LightRays,
     Observations,
-    PointLight,
     brightness,
     facing_weight,
 )
@@ -31,10 +31,10 @@ from beam_warp.kernels.trace.surface_rays import RayBatch
 wp.set_module_options({"enable_backward": False})
 
 SHARE_ROUGHNESS = wp.constant(wp.vec4(0.15, 0.35, 0.6, 1.0))
-"""Where the open share of the lobe is summed over rays."""
+"""Perceptual roughnesses at which the open share of the lobe is summed over rays."""
 
 ROUNDS = wp.constant(3)
-"""Of reweighting: by then the weights have settled."""
+"""Rounds of reweighting: by then the weights have settled."""
 
 SPREAD_PART = wp.constant(0.06)
 """Residual at which a view counts half, as a part of what a white surface would show with nothing in the way.
@@ -60,7 +60,7 @@ def lobe_shares_kernel(
     first: int,
     batch: RayBatch,
     rays: LightRays,
-    light: PointLight,
+    light: GatheredLight,
     normals: wp.array[wp.vec3],
     views: Observations,
     out_shares: wp.array2d[wp.vec4],
@@ -111,7 +111,7 @@ def share_at(shares: wp.vec4, roughness: float) -> float:
 
 @wp.struct
 class ProfileFit:
-    """How well candidates explain the views of a part, by row; rows of other points are left as they are."""
+    """Misfit of candidates to the views of a part, by row; rows of other points are left as they are."""
 
     misfit: wp.array3d[float]  # (PARTS, row, candidate): sum over views of w log(1 + e^2 / s^2) at the best base color
     views: wp.array[float]  # sum of w over all views: how many views that see a whole pixel
@@ -127,7 +127,7 @@ def view_weight(sample: wp.vec4, cosine: float) -> float:
 def profile_kernel(
     first: int,
     batch: RayBatch,
-    light: PointLight,
+    light: GatheredLight,
     lobes: EnvironmentLight,
     normals: wp.array[wp.vec3],
     views: Observations,

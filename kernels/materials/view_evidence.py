@@ -1,4 +1,4 @@
-"""What the pixels of views say of the Gaussians that they show: where the surface is, which way it faces, its colour.
+"""Evidence that the pixels of views give on the Gaussians that they show: place, normal and colour of the surface.
 
 Pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an origin, 3-5
 normal, 6 weight of both; 7 weight of saturated pixels; 8-10 captured colour less the rendered one, 11 its weight.
@@ -23,7 +23,7 @@ LEAST_COVERAGE = wp.constant(0.99)
 
 @wp.struct
 class SurfacePixels:
-    """What a rasteriser drew, one view after the other: of each pixel the radiance and the normal, and how deep."""
+    """Radiance, normal, coverage and depth of the pixels that a rasteriser drew, one view after the other."""
 
     colors: wp.array2d[float]  # radiance in columns 0-2, normals in 3-5, sums weighted by visibility
     alpha: wp.array[float]
@@ -33,7 +33,7 @@ class SurfacePixels:
 
 @wp.struct
 class CapturedPixels:
-    """What one camera saw; arrays of length 0 where it has no image, or no coverage."""
+    """Image of one camera; arrays have length 0 where it has no image, or no coverage."""
 
     color: wp.array[wp.vec3]  # scene-linear, premultiplied
     coverage: wp.array[float]

@@ -8,6 +8,7 @@ import materials as benchmark
 import numpy as np
 import pytest
 from device_memory import peak_memory
+from materials_bench import QUICK, bench_of_capture
 from materials_contenders import DIRECT_AS_PAPER, OURS, Subject, SubjectFrame, Unavailable, ablation_rows, direct
 from materials_cost import Scale, drawn_views
 from materials_plot import draw_all
@@ -21,7 +22,7 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 
 TINY = replace(
-    benchmark.QUICK,
+    QUICK,
     perfect_gaussians=600,
     light_points=8,
     reference_rays=64,
@@ -160,7 +161,7 @@ def test_all_of_it_runs(device, tiny_capture, tmp_path):
     pytest.importorskip("matplotlib")
     target = resolve_device(device)
     pictures = tmp_path / "pictures"
-    bench = benchmark.bench_of_capture(tiny_capture, target, lambda text: None)
+    bench = bench_of_capture(tiny_capture, target, lambda text: None)
     bench = replace(bench, effort=TINY, pictures=pictures)
     states = []
     result = benchmark.measure(bench, only=("perfect", "cost"), keep=lambda state: states.append(json.dumps(state)))
@@ -192,7 +193,7 @@ def test_ablation_runs_on_what_was_reconstructed(subject, tiny_capture, tmp_path
     kept = ("paper: image path, .02 m, 50 + 100 iid rays", "+ offset auto", "+ all frames", "offset .1 m")
     rows = [row for row in ablation_rows(high=4, low=4, steps=2) if row.name in kept]
     monkeypatch.setattr(benchmark, "ablation_rows", lambda **options: rows)
-    bench = benchmark.bench_of_capture(tiny_capture, device, lambda text: None)
+    bench = bench_of_capture(tiny_capture, device, lambda text: None)
     result = benchmark.measure(replace(bench, effort=TINY, pictures=tmp_path), only=("ablation",))
     assert result["failed"] == []
     found = {(row["group"], row["name"]): row for row in result["ablation"]["captures"]["demo"]["rows"]}
@@ -210,7 +211,7 @@ def test_a_part_that_fails_says_so_and_the_others_are_kept(tiny_capture, monkeyp
 
     monkeypatch.setitem(benchmark.PARTS, "perfect", fail)
     monkeypatch.setitem(benchmark.PARTS, "cost", lambda bench: iter([{"parts": {}}]))
-    bench = benchmark.bench_of_capture(tiny_capture, resolve_device("cpu"), lambda text: None)
+    bench = bench_of_capture(tiny_capture, resolve_device("cpu"), lambda text: None)
     result = benchmark.measure(bench, only=("perfect", "cost"))
     assert result["failed"] == ["perfect"]
     assert result["perfect"]["so far"] == 1

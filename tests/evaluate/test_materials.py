@@ -14,7 +14,7 @@ from support.figure_asset import OPENNESS, changed, figure_asset
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
-from beam_warp.evaluate.materials import score_materials, stated_raster
+from beam_warp.evaluate.materials import score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.relighters import RELIGHTERS
 from beam_warp.image.files import read_image
@@ -130,7 +130,7 @@ class TestAgainstItself:
             assert found_here.solid_psnr == pytest.approx(20.0, abs=0.01)  # alpha above .999: 0.009 dB
 
     def test_turned_normals_are_turned_by_as_much(self, asset, mirror, device):
-        """By 10 degrees about z: as much as that where a normal is level, not at all where it points up."""
+        """A turn by 10 degrees about z is seen whole where a normal is level, not at all where it points up."""
         angle = np.radians(10.0)
         turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
         turned = changed(asset, lambda _, cloud: cloud.with_arrays(normals=cloud.normals @ turn.T))
@@ -193,7 +193,7 @@ class TestAgainstTruth:
             assert scores[name].solid_psnr == pytest.approx(solid, abs=1e-6), name
 
     def test_the_shared_tool_agrees(self, evaluated, relit_capture, data_dir):
-        """It is independent of this package: PSNR to its last digit, SSIM, scale and normals to theirs."""
+        """The shared tool, independent of this package, agrees: PSNR to its last digit, the others to theirs."""
         tool = data_dir.parent / "tools" / "score_capture.py"
         if not tool.is_file():
             pytest.skip(f"the shared scoring tool {tool} is absent")
@@ -257,7 +257,7 @@ class TestRefusals:
 
 class TestWhatIsThere:
     def test_frames_that_the_asset_lacks_are_said(self, asset, mirror):
-        """Its second frame alone, stated as such, scores as it does among both."""
+        """The second frame alone, stated as such, scores as it does among both."""
         second = GaussianSequence.from_clouds([asset[1]], metadata={"capture_frames": "1"})
         found = score(second, mirror, "cpu")
         assert [view.frame for view in found.views] == [1, 1]
@@ -319,15 +319,6 @@ class TestWhatIsThere:
         assert all(image.shape == truth.shape and image.shape[2] == 3 for image, truth in seen)
         # Scaled colours differ by rounding: 1e-6 of colour, at most 12.92 times as much when encoded.
         assert all(score.perceptual["flip"] < 2e-5 for score in found.mean_channels().values())
-
-
-def test_the_filter_that_an_asset_states():
-    assert stated_raster({}) == RasterOptions()
-    stated = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
-    assert stated_raster(stated) == RasterOptions(antialiased=True, low_pass=0.1)
-    for wrong in ({"raster_antialiased": "maybe"}, {"raster_low_pass": "soft"}, {"raster_low_pass": "-1"}):
-        with pytest.raises(InvalidOptionError):
-            stated_raster(wrong)
 
 
 def test_a_capture_without_relit_images_is_scored_all_the_same(asset, mirror):

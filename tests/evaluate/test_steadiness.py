@@ -210,7 +210,7 @@ class TestSurface:
 
 
 def test_rays_stop_at_a_box(device):
-    """At the distance that arithmetic gives, from outside and from within; those that miss are NaN."""
+    """Rays hit at the distance that arithmetic gives, from outside and from within; those that miss are NaN."""
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in squares for face in ((a, b, c), (a, c, d))]

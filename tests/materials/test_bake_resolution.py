@@ -60,7 +60,7 @@ class TestFactor:
 
 class TestBlocks:
     @pytest.mark.parametrize("factor", [1, 2, 3, 16])
-    @pytest.mark.parametrize("shape", [(1, 1, 4), (1, 7, 1), (9, 6, 4), (8, 11, 5)])
+    @pytest.mark.parametrize("shape", [(1, 7, 1), (8, 11, 5)])
     def test_means_and_sums(self, device, rng, factor, shape):
         height, width, columns = shape
         where = resolve_device(device)

@@ -1,4 +1,4 @@
-"""From evidence to base colour: standard errors that few views and few frames cannot make small, and honest flags."""
+"""Base colour from evidence: standard errors that few views and few frames cannot make small, and honest flags."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def bare(count):
 
 
 def evidence(targets, *, noise=0.0, **changed):
-    """Of views of equal weight under light of radiance 1, whose targets are ``(V, N, 3)``."""
+    """Evidence of views of equal weight under light of radiance 1, whose targets are ``(V, N, 3)``."""
     views, count = targets.shape[:2]
     arrays = {
         "numerator": targets.sum(0),

@@ -20,7 +20,7 @@ from beam_warp.world.harmonics import SH_C0
 
 ROUGHNESS = 0.8
 SPECULAR_ALBEDO = 0.04
-"""Of a rough dielectric, to about 0.02 over the views that count: what a view-independent capture cannot resolve."""
+"""Error of a rough dielectric over the views that count, about 0.02: a view-independent capture cannot resolve it."""
 
 
 def with_radiance(cloud, linear, color_space=LINEAR_REC709):

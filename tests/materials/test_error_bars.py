@@ -146,7 +146,7 @@ def test_base_colour_is_found(decomposed):
 
 @pytest.mark.parametrize("part", ["ball", "wall"])
 def test_two_standard_errors_hold(decomposed, part):
-    """At least 95 % of errors lie within two standard errors, and few lie far beyond: they err on the safe side."""
+    """Standard errors err on the safe side: at least 95 % of errors lie within two, and few lie far beyond."""
     error, stated, good, ball = decomposed
     rows = good & (ball if part == "ball" else ~ball)
     z = error[rows] / stated[rows]

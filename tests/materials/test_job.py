@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.changed_code import changed_code
 from support.figure_asset import figure_asset
 from support.shapes import cloud_of, sphere_points, tiles
 
@@ -15,10 +16,10 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
-from beam_warp.jobs.store import frame_key, read_frame, write_frame
-from beam_warp.materials.frame import CaptureImages
+from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.images import ImagePathOptions
-from beam_warp.materials.job import OverviewOptions, RoughnessTexture
+from beam_warp.materials.job import OverviewOptions
+from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
 from beam_warp.world.camera import Camera
@@ -115,21 +116,23 @@ def test_stopped_job_continues_to_identical_bytes(tmp_path, light, monkeypatch):
     assert not differing
 
 
-def test_other_input_or_options_start_over(tmp_path, light):
+def test_other_input_options_or_code_start_over(tmp_path, light):
     sequence = GaussianSequence.from_clouds([frame()])
     run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
-    again = run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
-    assert again.report["resumed_frames"] == 1
     for changed in (
         {"sequence": GaussianSequence.from_clouds([frame(0.5)])},
         {"environment": light.scaled(2.0)},
         {"options": RunOptions(materials=MaterialOptions(sample_count=16), device="cpu")},
     ):
         arguments = {"sequence": sequence, "environment": light, "options": FAST} | changed
-        fresh = run(
-            arguments["sequence"], arguments["environment"], tmp_path / "out", arguments["options"], overview=SMALL
-        )
+        fresh = run(out=tmp_path / "out", overview=SMALL, **arguments)
         assert fresh.report["resumed_frames"] == 0
+    run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    with changed_code():
+        for resumed in (0, 1):
+            found = run(sequence, light, tmp_path / "out", FAST, overview=SMALL).report
+            assert found["resumed_frames"] == resumed
+            assert found["versions"]["code"] == "another algorithm"
 
 
 def test_persistent_frames_share_one_base_colour(tmp_path, light):
@@ -341,7 +344,7 @@ class TestWithACapture:
         assert not (tmp_path / "out" / "asset.usda").exists()
 
     def test_the_image_path_follows_its_first_frame(self, discs, studio, tiny_capture, tmp_path):
-        """Its colours are drawn towards those of the frame before: when that changes, it is done again."""
+        """Colours are drawn towards those of the frame before: when that frame changes, the next is done again."""
         options = replace(FAST, images=ImagePathOptions(occlusion_samples=4, light_samples=4))
         self.run(discs, studio, tmp_path / "out", tiny_capture, options)
         again = self.run(discs, studio, tmp_path / "out", tiny_capture, options)
@@ -349,24 +352,3 @@ class TestWithACapture:
         other = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
         changed = GaussianSequence.from_clouds([other, discs[1]], metadata=discs.metadata)
         assert self.run(changed, studio, tmp_path / "out", tiny_capture, options).report["resumed_frames"] == 0
-
-
-class TestStore:
-    def test_round_trip(self, tmp_path, rng):
-        arrays = {"a": rng.normal(size=(5, 3)).astype(np.float32), "b": np.arange(4), "empty": np.zeros((0, 3))}
-        write_frame(tmp_path / "f.h5", "key", arrays)
-        back = read_frame(tmp_path / "f.h5")
-        assert set(back) == set(arrays)
-        assert all(np.array_equal(back[name], arrays[name]) for name in arrays)
-        assert frame_key(tmp_path / "f.h5") == "key"
-
-    def test_missing_and_cut_files_have_no_key(self, tmp_path):
-        assert frame_key(tmp_path / "none.h5") is None
-        write_frame(tmp_path / "f.h5", "key", {"a": np.zeros(1000)})
-        (tmp_path / "f.h5").write_bytes((tmp_path / "f.h5").read_bytes()[:300])
-        assert frame_key(tmp_path / "f.h5") is None
-
-    def test_nothing_is_left_of_a_failed_write(self, tmp_path):
-        with pytest.raises(OutputError, match="must be writable"):
-            write_frame(tmp_path / "missing" / "f.h5", "key", {"a": np.zeros(3)})
-        assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from support.shapes import cloud_of, sphere_points, tiles
 from beam_warp import Scene
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.kernels.materials.residues import LightRays, Observations, PointLight
+from beam_warp.kernels.materials.residues import GatheredLight, LightRays, Observations
 from beam_warp.kernels.materials.roughness_profile import ProfileFit, launch_lobe_shares, launch_profile
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import specular_albedo
@@ -31,7 +31,7 @@ from beam_warp.materials.roughness import (
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 NOISE = 0.01
-"""Of every view's colour, as a part of what a white surface shows: a good photograph of a well known surface."""
+"""Noise of every view's colour, as a part of what a white surface shows: a good photograph of a well known surface."""
 
 SKY = SmoothSky(
     (0.25, 0.3, 0.4),
@@ -270,7 +270,7 @@ class TestKernels:
             "visibility": rng.uniform(size=(self.POINTS, self.RAYS)).astype(np.float32),
             "colors": rng.uniform(0.05, 0.9, (self.VIEWS, self.POINTS, 4)).astype(np.float32),
         }
-        batch, rays, point_light, views = RayBatch(), LightRays(), PointLight(), Observations()
+        batch, rays, point_light, views = RayBatch(), LightRays(), GatheredLight(), Observations()
         batch.normals = wp.array(host["normals"], dtype=wp.vec3, device=device)
         batch.rows = wp.array(np.arange(self.POINTS), dtype=int, device=device)
         batch.sample_count = self.RAYS

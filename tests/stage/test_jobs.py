@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.changed_code import changed_code
 
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
@@ -126,6 +127,13 @@ def test_whatever_changes_images_is_noticed(pattern, other):
     assert changed.render_frames(pattern, frames(), overwrite=True).rendered[-1] == 4
     with pytest.raises(OutputError, match="must be of the same render"):
         job(MadeUpRenderer()).render_frames(pattern, frames())
+
+
+def test_frames_of_other_code_are_refused(pattern):
+    job(MadeUpRenderer()).render_frames(pattern, frames())
+    with changed_code(), pytest.raises(OutputError, match="must be of the same render"):
+        job(MadeUpRenderer()).render_frames(pattern, frames())
+    assert job(MadeUpRenderer()).render_frames(pattern, frames()).rendered == []
 
 
 def test_a_camera_of_its_own(pattern):

@@ -6,14 +6,14 @@ import hashlib
 import json
 from typing import Any
 
-from beam_warp._version import __version__
+from beam_warp.digests import code_digest
 from beam_warp.reconstruction.frames.protocols import FrameSteps
 
 
 def common_inputs(steps: FrameSteps, device: Any) -> str:
-    """Return all that every frame of a job depends on, as JSON: the version, the kind of Warp device, the options."""
+    """Return all that every frame of a job depends on, as JSON: the code, the kind of Warp device, the options."""
     content = {
-        "version": __version__,
+        "code": code_digest(),
         "device": "cuda" if device.is_cuda else "cpu",
         "options": steps.options(),
     }

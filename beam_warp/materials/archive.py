@@ -1,0 +1,114 @@
+"""Finished frames of the main job on disk: a stopped job continues with them, and its result is read from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.jobs.store import frame_key, read_frame, write_frame
+from beam_warp.materials.base_color import BaseColor
+from beam_warp.materials.direct import ColorEvidence
+from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
+
+EVIDENCE = "evidence_"
+"""Prefix of the stored arrays of evidence."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasuredFrame:
+    """Measurements of one frame.
+
+    Attributes:
+        number: Number of the frame in the sequence.
+        key: Key of everything that it was measured from.
+        cloud: The Gaussians with normals, roughness and ambient occlusion; on the image path with base colour.
+        evidence: Evidence on base colour; None on the image path, which leaves nothing to solve.
+        from_shape: Where the normal is the Gaussian's own shortest axis, ``(N,)`` bool.
+        report: Gaussians that were traced, dropped as transparent, and given a larger scale, ``(3,)``.
+    """
+
+    number: int
+    key: str
+    cloud: GaussianCloud
+    evidence: ColorEvidence | None
+    from_shape: NDArray[np.bool_]
+    report: NDArray[np.int64]
+
+    @classmethod
+    def from_arrays(
+        cls, number: int, key: str, radiance_color_space: str | None, arrays: Mapping[str, NDArray[Any]]
+    ) -> MeasuredFrame:
+        """Collect arrays by name: those of a cloud, ``from_shape``, ``report``, and evidence if there is any."""
+        told = {name: arrays[EVIDENCE + name] for name in ColorEvidence.ARRAYS if EVIDENCE + name in arrays}
+        return cls(
+            number=number,
+            key=key,
+            cloud=GaussianCloud(
+                **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
+                axes=WORLD_AXES,
+                radiance_color_space=radiance_color_space,
+            ),
+            evidence=ColorEvidence.from_arrays(told) if told else None,
+            from_shape=arrays["from_shape"],
+            report=arrays["report"],
+        )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that `from_arrays` takes."""
+        told = {}
+        if self.evidence is not None:
+            told = {EVIDENCE + name: getattr(self.evidence, name) for name in ColorEvidence.ARRAYS}
+        return {**self.cloud.arrays(), **told, "from_shape": self.from_shape, "report": self.report}
+
+
+class FrameArchive:
+    """A folder of finished frames and their solutions.
+
+    Attributes:
+        folder: Where the files are; other results that a job need not find twice lie beside the frames.
+    """
+
+    def __init__(self, folder: Path, radiance_color_space: str | None) -> None:
+        """Open an existing folder; the colour space is that of the Gaussians' captured radiance."""
+        self.folder = folder
+        self._color_space = radiance_color_space
+
+    def find(self, number: int, key: str) -> MeasuredFrame | None:
+        """Return the frame that is stored under a key; None if there is none."""
+        return self.read(number) if frame_key(self._frame(number)) == key else None
+
+    def read(self, number: int) -> MeasuredFrame:
+        """Return a frame that was found or kept."""
+        path = self._frame(number)
+        return MeasuredFrame.from_arrays(number, frame_key(path) or "", self._color_space, read_frame(path))
+
+    def keep(self, frame: MeasuredFrame) -> None:
+        """Store a frame.
+
+        Raises:
+            OutputError: The file cannot be written; nothing is left behind.
+        """
+        write_frame(self._frame(frame.number), frame.key, frame.arrays())
+
+    def keep_solution(self, number: int, key: str, solved: BaseColor) -> None:
+        """Store the base colour of a frame.
+
+        Raises:
+            OutputError: The file cannot be written; nothing is left behind.
+        """
+        write_frame(self._solution(number), key, solved.arrays())
+
+    def solution(self, number: int) -> dict[str, NDArray[Any]]:
+        """Return base colour, its standard error and observability of a frame, as arrays of a cloud."""
+        return read_frame(self._solution(number))
+
+    def _frame(self, number: int) -> Path:
+        return self.folder / f"frame_{number:06d}.h5"
+
+    def _solution(self, number: int) -> Path:
+        return self.folder / f"solution_{number:06d}.h5"

@@ -1,0 +1,138 @@
+"""Third step of the main job: the light of the capture, with its exposure, and whether it fits what was captured."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beam_warp.capture.findings import Finding
+from beam_warp.digests import array_digest
+from beam_warp.jobs.progress import JobLog
+from beam_warp.jobs.report import write_json
+from beam_warp.jobs.store import kept_frame
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.agreement import judge_clipping, judge_environment, match_silhouettes, require_match
+from beam_warp.materials.exposure import estimate_exposure
+from beam_warp.materials.light import check_light
+from beam_warp.materials.options import ESTIMATE, RunOptions
+from beam_warp.materials.roughness_source import stated_roughness
+from beam_warp.materials.seen import SeenFrame
+from beam_warp.materials.source import Source
+from beam_warp.world.environment import EnvironmentMap
+
+EXPOSURE_ROUGHNESS = 0.5
+"""Assumed while the exposure of the light is looked for, where roughness is yet to be found."""
+
+NOTHING_IN_COMMON = 0.05
+"""Overlap of silhouettes below which a sequence cannot be of a capture, whatever it says."""
+
+SILHOUETTES = 6
+"""Views, evenly chosen, in which silhouettes are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureLight:
+    """The light that a sequence was captured under.
+
+    Attributes:
+        environment: The given one times the exposure.
+        prepared: The same, prepared on the job's device.
+        stops: The exposure, as a power of two.
+    """
+
+    environment: EnvironmentMap
+    prepared: PreparedEnvironment
+    stops: float
+
+
+def prepare_light(
+    environment: EnvironmentMap, source: Source, options: RunOptions, described: str, folder: Path, log: JobLog
+) -> CaptureLight:
+    """Prepare an environment and find its exposure.
+
+    Args:
+        environment: The light as it was given.
+        source: What was captured.
+        options: Exposure, and what it is found with.
+        described: The code and options that an automatic exposure depends on; it is kept under their key.
+        folder: Where it is kept, so that a resumed job has it at once.
+        log: Told how long steps take.
+    """
+    device = source.first.device
+    with log.timer("prepare light"):
+        given = PreparedEnvironment(environment, device)
+    stops = 0.0
+    if options.exposure != "auto":
+        stops = float(options.exposure)
+    elif source.is_display_referred():
+        first = source.first
+        text = f"{described} {source.image_digest(0)}"
+        key = array_digest(environment.radiance, *first.cloud.arrays().values(), text=text)
+        found = kept_frame(
+            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(first, given, options, log)])}
+        )
+        stops = float(found["stops"][0])
+    return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops)
+
+
+def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOptions, log: JobLog) -> float:
+    """Return the stops by which the light explains a frame best."""
+    scene, points = frame.scene, frame.points
+    # Highlights cannot be told from the light before its exposure is known.
+    stated = EXPOSURE_ROUGHNESS if options.roughness == ESTIMATE else options.roughness
+    roughness = stated_roughness(frame.original, stated)
+    with log.timer("exposure"):
+        return float(
+            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.materials))
+        )
+
+
+def light_findings(
+    frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str, log: JobLog
+) -> list[dict[str, Any]]:
+    """Look at the light and the images of a frame before anything is measured.
+
+    Args:
+        frame: The first frame.
+        environment: The light, exposure included.
+        path: JSON file where findings are kept.
+        key: What they depend on.
+        log: Told how long it takes.
+
+    Returns:
+        Findings as records.
+
+    Raises:
+        InvalidOptionError: The light is black, or the images show something else than the Gaussians.
+    """
+    # Whatever is wrong with what was kept, it is found again.
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        known = json.loads(path.read_text(encoding="utf-8"))
+        if known["key"] == key:
+            return list(known["findings"])
+    with log.timer("check"):
+        findings = [vars(finding) for finding in _judge(frame, environment)]
+    write_json(path, {"key": key, "findings": findings})
+    return findings
+
+
+def _judge(frame: SeenFrame, environment: EnvironmentMap) -> list[Finding]:
+    """Find what is wrong with the light and the images."""
+    findings = judge_environment(environment)
+    capture, views = frame.capture, frame.views
+    if capture is None or views is None:
+        return findings
+    images = frame.images()
+    some = images[:: max(1, len(images) // SILHOUETTES)]
+    match = match_silhouettes(frame.cloud, some, options=capture.raster, device=frame.device)
+    # Gaussians that say which frames they were made from may be poorly fitted, but hardly lie elsewhere.
+    if not capture.is_stated or not match.overlap > NOTHING_IN_COMMON:
+        require_match(match)
+    findings += [match.finding] if match.finding is not None else []
+    findings += judge_clipping(images, capture.ceiling(frame.number, images))
+    return findings + list(check_light(frame.scene, frame.points, views, environment).findings)

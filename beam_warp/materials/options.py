@@ -1,0 +1,79 @@
+"""Options of the main job."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from beam_warp.checks import require_number
+from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.roughness_source import RoughnessTexture
+from beam_warp.render.sheet import Relighting
+
+ESTIMATE = "estimate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Options of `beam_warp.run`.
+
+    Attributes:
+        materials: Rays, offset, bounce, seed of the direct path.
+        images: Options of the image path, the paper's, which is then taken; None takes the direct path.
+        roughness: Perceptual roughness of everything, a texture, or ``"estimate"``: found from the specular residue
+            over views and frames.
+        exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
+            colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear. With a capture,
+            its images decide, because they are what is explained.
+        persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
+            frames at once; sequences that carry ids state it themselves.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+
+    Raises:
+        InvalidOptionError: The exposure is out of range.
+    """
+
+    materials: MaterialOptions = field(default_factory=MaterialOptions)
+    images: ImagePathOptions | None = None
+    roughness: float | RoughnessTexture | Literal["estimate"] = 0.5
+    exposure: float | Literal["auto"] = "auto"
+    persistent: bool = False
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the exposure; the other options check themselves."""
+        if self.exposure != "auto":
+            require_number("exposure", self.exposure, -32.0, 32.0)
+
+    @property
+    def roughness_source(self) -> str:
+        """The asset's word for where roughness comes from."""
+        if isinstance(self.roughness, RoughnessTexture):
+            return "texture"
+        return "estimated" if self.roughness == ESTIMATE else "constant"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the options as JSON-able values, without the device, which reports state by its name."""
+        described = asdict(self)
+        described.pop("device")
+        if isinstance(self.roughness, RoughnessTexture):
+            described["roughness"] = {key: str(value) for key, value in described["roughness"].items()}
+        return described
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverviewOptions:
+    """Options of the contact sheet.
+
+    Attributes:
+        second_light: Shown beside the light of the capture; that light turned by 180 degrees if None.
+        azimuth: Camera angle; 0 looks along +y [degree].
+        elevation: Camera angle above the horizon [degree].
+        height: Height of a panel [pixel].
+    """
+
+    second_light: Relighting | None = None
+    azimuth: float = 0.0
+    elevation: float = 5.0
+    height: int = 640

@@ -1,0 +1,125 @@
+"""Second step of the main job: evidence of a frame's views on its Gaussians, and points where light is gathered."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.jobs.progress import JobLog
+from beam_warp.materials.base_color import fill_from_neighbors
+from beam_warp.materials.capture_images import CaptureImages
+from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.evidence import ViewEvidence, view_evidence
+from beam_warp.materials.normals import SurfaceNormals, SurfacePoints, estimate_normals
+from beam_warp.trace.scene import Scene
+from beam_warp.world.gaussians import GaussianCloud
+
+
+class SeenFrame:
+    """One frame and what its views show of it. Each part is worked out when it is first asked for, and once.
+
+    Attributes:
+        number: Number of the frame in the sequence.
+        original: The Gaussians in the axes of the input.
+        cloud: The Gaussians in the world's axes.
+        capture: Images of the capture; None without one.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        original: GaussianCloud,
+        cloud: GaussianCloud,
+        capture: CaptureImages | None,
+        options: MaterialOptions,
+        *,
+        device: str,
+        log: JobLog,
+    ) -> None:
+        """Take a frame; nothing is worked out yet.
+
+        Args:
+            number: Number of the frame in the sequence.
+            original: The Gaussians in the axes of the input.
+            cloud: The Gaussians in the world's axes, with captured radiance.
+            capture: Images of the capture; None to do without.
+            options: Offset of ray origins, and seed.
+            device: Warp device.
+            log: Told how far and how long steps take.
+        """
+        self.number, self.original, self.cloud, self.capture = number, original, cloud, capture
+        self.device = device
+        self._options, self._log = options, log
+
+    def forget(self) -> None:
+        """Free what was worked out, which lies on the device; it is worked out again when it is asked for."""
+        for name in ("scene", "views", "points", "surface"):
+            self.__dict__.pop(name, None)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The Gaussians as occluders."""
+        with self._log.timer("upload and build"):
+            return Scene.from_gaussians(self.cloud, self.device)
+
+    def images(self) -> list[CapturedView]:
+        """Read what the cameras saw; nothing without a capture."""
+        if self.capture is None:
+            return []
+        with self._log.timer("read images"):
+            return self.capture.views(self.number)
+
+    @cached_property
+    def views(self) -> ViewEvidence | None:
+        """Evidence of the capture's images on the Gaussians; None without a capture."""
+        if self.capture is None:
+            return None
+        images = self.images()
+        with self._log.timer("views"):
+            return view_evidence(
+                self.cloud,
+                [image.camera for image in images],
+                images,
+                options=self.capture.raster,
+                ceiling=self.capture.ceiling(self.number, images),
+                device=self.device,
+                progress=self._log.within("views", self.number),
+            )
+
+    @cached_property
+    def points(self) -> SurfacePoints:
+        """Points where light is gathered: where views show the surface, or the Gaussians' own centres."""
+        views, offset = self.views, self._options.offset
+        if views is None:
+            return SurfacePoints.at_centers(self.cloud, self.scene, self.surface, offset)
+        scene = self.scene
+        with self._log.timer("surface"):
+            return SurfacePoints.seen_by(self.cloud, views, scene, offset)
+
+    @cached_property
+    def surface(self) -> SurfaceNormals:
+        """Normals of all Gaussians: as views show them, those of neighbours where none does; or estimated."""
+        if self.views is None:
+            scene = self.scene
+            with self._log.timer("normals"):
+                return estimate_normals(
+                    self.cloud, scene, seed=self._options.seed, progress=self._log.within("normals", self.number)
+                )
+        points = self.points
+        normals = points.normals.numpy()
+        filled, _ = fill_from_neighbors(self.cloud.positions, normals, np.zeros_like(normals), ~points.seen)
+        length = np.linalg.norm(filled, axis=1, keepdims=True)
+        upright = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), filled.shape)
+        unit = np.where(length > 1e-6, filled / np.maximum(length, 1e-6), upright).astype(np.float32)
+        return SurfaceNormals(unit, points.confidence, np.zeros(len(unit), bool))
+
+    def filled_occlusion(
+        self, visibility: NDArray[np.float32], error: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Give Gaussians that no view shows the ambient occlusion of their neighbours, ``(N,)`` each."""
+        missing = ~self.points.seen
+        mean, spread = fill_from_neighbors(self.cloud.positions, visibility[:, None], error[:, None], missing)
+        return mean[:, 0].astype(np.float32), spread[:, 0].astype(np.float32)

@@ -1,0 +1,98 @@
+"""First step of the main job: read the sequence, and the images of its capture, frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beam_warp.capture.digests import CaptureDigests
+from beam_warp.digests import array_digest
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.jobs.progress import JobLog
+from beam_warp.materials.capture_images import CaptureImages
+from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.seen import SeenFrame
+from beam_warp.world.axes import change_axes
+from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
+
+
+class Source:
+    """Input of a job, read one frame at a time.
+
+    Attributes:
+        sequence: The sequence as it was given.
+        images: Images of the capture; None without one.
+        first: Frame 0, which the light is judged by.
+    """
+
+    def __init__(
+        self,
+        sequence: GaussianSequence,
+        images: CaptureImages | None,
+        options: MaterialOptions,
+        *,
+        digests: Path,
+        device: str,
+        log: JobLog,
+    ) -> None:
+        """Read the first frame.
+
+        Args:
+            sequence: Frames with captured radiance, in any axes.
+            images: Images of the capture; None to do without.
+            options: Offset and seed, for what frames show.
+            digests: Folder of the digests of image files.
+            device: Warp device.
+            log: Told how far and how long steps take.
+
+        Raises:
+            InvalidArrayError: As `frame`.
+        """
+        self.sequence = sequence
+        self.images = images
+        self._options, self._device, self._log = options, device, log
+        self._digests = CaptureDigests(digests)
+        self.first = self._read(0)
+
+    def frame(self, number: int) -> SeenFrame:
+        """Read a frame and bring it to the world's axes.
+
+        Raises:
+            InvalidArrayError: There is no Gaussian, or they have no captured radiance.
+        """
+        return self.first if number == 0 else self._read(number)
+
+    def _read(self, number: int) -> SeenFrame:
+        original = self.sequence[number]
+        if len(original) == 0:
+            raise InvalidArrayError(
+                f"a frame must hold at least one Gaussian, got none at frame {number}. Leave empty frames out."
+            )
+        if original.radiance is None:
+            raise InvalidArrayError(
+                f"radiance must be given to decompose materials, got none at frame {number}. "
+                "Import Gaussians with captured colour."
+            )
+        cloud = change_axes(original, WORLD_AXES)
+        return SeenFrame(number, original, cloud, self.images, self._options, device=self._device, log=self._log)
+
+    def is_display_referred(self) -> bool:
+        """Return whether the captured colour has no scale: that of the first frame's images, if there are any."""
+        if self.images is not None:
+            return self.images.is_display_referred(0)
+        return self.first.cloud.radiance_color_space == DISPLAY_SRGB
+
+    def image_digest(self, number: int) -> str:
+        """Return the digest of a frame's images; empty without a capture."""
+        return "" if self.images is None else self.images.digest(number, self._digests)
+
+    def key(self, job: str, frame: SeenFrame) -> str:
+        """Return the key of everything that the measurements of a frame depend on.
+
+        Args:
+            job: Key of the code, the options and the light.
+            frame: The frame.
+        """
+        cloud = frame.cloud
+        text = f"{job} {frame.number} {cloud.radiance_color_space} {self.image_digest(frame.number)}"
+        return array_digest(*cloud.arrays().values(), text=text)

@@ -1,0 +1,64 @@
+"""The digest of the code: the same wherever it lies, another when a source changes."""
+
+import pytest
+
+from beam_warp.digests import code_digest, source_digest
+
+
+def write(folder, files):
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return folder
+
+
+SOURCES = {
+    "a.py": b"x = 1\ny = 2\n",
+    "trace/rays.py": b"z = 3\n",
+    "kernels/bvh.py": b"k = 4\n",
+    "schema/s.usda": b"#\n",
+}
+
+
+@pytest.fixture
+def wheel(tmp_path):
+    """All packages in one folder."""
+    return {"": write(tmp_path / "wheel", SOURCES)}
+
+
+def test_a_checkout_has_the_digest_of_its_wheel(wheel, tmp_path):
+    """There, some packages lie beside the others, lines may end as on Windows, and compiled files lie around."""
+    inside = {
+        name: content.replace(b"\n", b"\r\n") for name, content in SOURCES.items() if name in ("a.py", "trace/rays.py")
+    }
+    checkout = {
+        "schema": write(tmp_path / "checkout" / "schema", {"s.usda": SOURCES["schema/s.usda"]}),
+        "kernels": write(tmp_path / "checkout" / "kernels", {"bvh.py": SOURCES["kernels/bvh.py"]}),
+        "": write(
+            tmp_path / "checkout" / "beam_warp", inside | {"__pycache__/a.pyc": b"?", "py.typed": b"", "page.js": b""}
+        ),
+    }
+    assert source_digest(checkout) == source_digest(wheel)
+    assert source_digest({**wheel, "kernels": wheel[""] / "kernels"}) == source_digest(wheel)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"a.py": b"x = 1\ny = 3\n"},
+        {"kernels/bvh.py": b"k = 5\n"},
+        {"schema/s.usda": b"#usda\n"},
+        {"new.py": b""},
+        {"a.py": b"x = 1\n", "b.py": b"y = 2\n"},  # a line that moved to another file
+    ],
+)
+def test_any_change_of_a_source_shows(wheel, change):
+    before = source_digest(wheel)
+    write(wheel[""], change)
+    assert source_digest(wheel) != before
+
+
+def test_the_digest_of_this_package_is_found_once():
+    assert len(code_digest()) == 32
+    assert code_digest() is code_digest()
