@@ -1,4 +1,4 @@
-"""PLY files of Gaussians, read: the 3DGS training layout in any property order, the beam profile, the packed form.
+"""Reader of PLY files of Gaussians: the 3DGS training layout in any property order, the beam profile, the packed form.
 
 Source of the layout: the exporter of Kerbl et al. 2023: x y z, nx ny nz, f_dc, f_rest channel after channel, opacity
 as a logit, scale as natural logs, rot as w x y z. A file without ``scale_2`` (2D Gaussians) is read as flat ones.
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_choice, require_number
+from beam_warp.checks import require_choice, require_number, rows_at
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.options import ReadOptions
-from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types, rows_at
-from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, Table, malformed, read_header, read_table
+from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types
+from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, PlyTable, malformed, read_header, read_table
 from beam_warp.converters.producers import (
     LAYOUTS,
     NORMAL_NAMES,
@@ -36,7 +36,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, sh_degree
 from beam_warp.world.metadata import LOW_PASS_RANGE, raster_metadata
 
 DEFAULT_AXES = "rdf"
-"""Axes of a PLY that does not say: those of COLMAP, in which 3DGS is trained."""
+"""Axes of a PLY that does not state any: those of COLMAP, in which 3DGS is trained."""
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -44,12 +44,12 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _FLAT = _SCALE[:2]
 _UNIT_ROUNDING = 1e-6
-"""Lengths this close to 1 are float32 rounding of unit vectors, which are kept bit for bit."""
+"""Largest difference of a length from 1 that is float32 rounding; such vectors are kept bit for bit."""
 
 
 @dataclass(frozen=True)
 class PlyFrame:
-    """One file as read: the Gaussians, what the file says of its place in time, and what to tell the user."""
+    """One file as read: the Gaussians, the rate and provenance that it states, and notes for the user."""
 
     cloud: GaussianCloud
     frames_per_second: float
@@ -63,9 +63,9 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
 
 
 def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequence:
-    """Make a sequence of files that are read as their frames are asked for.
+    """Make a sequence of files, each of which is read when its frame is asked for.
 
-    Every header is checked at once, so that a cut file is found before any work is done.
+    All headers are checked at once, so that a truncated file is found before any work is done.
 
     Raises:
         AssetFormatError, MissingFileError: A header or the first frame is refused.
@@ -88,7 +88,7 @@ def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequen
 
 
 def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
-    """Read the Gaussians of a file whose header is read.
+    """Read the Gaussians of a file whose header has been read.
 
     Raises:
         AssetFormatError: It holds no Gaussians, or values outside their contract; the message names file and row.
@@ -126,7 +126,7 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
 
 @dataclass(frozen=True)
 class _Statements:
-    """What the comments of our own writer say, checked."""
+    """Values that the comments of our own writer state, checked."""
 
     axes: str | None
     meters_per_unit: float
@@ -173,7 +173,7 @@ class _Statements:
 
 
 def _raster(text: str) -> tuple[bool, float]:
-    """Read ``antialiased 0.1``: how splats are to be drawn."""
+    """Parse ``antialiased 0.1``, which states how splats are to be drawn."""
     word, _, low_pass = text.partition(" ")
     require_choice("beam_raster", word, tuple(RASTER_WORDS.values()))
     return word == RASTER_WORDS[True], require_number("beam_raster's low-pass", low_pass, *LOW_PASS_RANGE)  # type: ignore[arg-type]
@@ -238,39 +238,48 @@ def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, no
 _DROP_REMEDY = "Repair those rows, or drop them with --drop-invalid."
 
 
-def _without_invalid_rows(table: Table, options: ReadOptions, notes: list[str]) -> Table:
-    """Leave out rows that no reading can make a Gaussian of."""
+def _without_invalid_rows(table: PlyTable, options: ReadOptions, notes: list[str]) -> PlyTable:
+    """Leave out rows that are no valid Gaussian."""
     geometry = table.columns([name for name in table.names if name in (*_POSITION, "opacity", *_SCALE, *_DC)])
     rotations = table.columns(_ROTATION).astype(np.float64)
     valid = np.isfinite(geometry).all(axis=1) & (np.linalg.norm(rotations, axis=1) > 1e-12)
     valid &= np.isfinite(rotations).all(axis=1)
     if not valid.all():
         notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} Gaussians dropped: not finite, or zero quaternions")
-    return table if valid.all() else Table(table.names, table.rows[valid])
+    return table if valid.all() else PlyTable(table.names, table.rows[valid])
 
 
-def _orientations(path: Path, table: Table) -> NDArray[np.float32]:
+def _orientations(path: Path, table: PlyTable) -> NDArray[np.float32]:
     """Return unit quaternions xyzw; those that are unit already keep their bits."""
     wxyz = table.columns(_ROTATION)
-    length = np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz, dtype=np.float64))
+    length = _lengths(wxyz)
     bad = ~((length > 1e-12) & np.isfinite(length))
     if bad.any():
         zero = length[int(np.flatnonzero(bad)[0])] <= 1e-12
         got = f"{'a zero quaternion' if zero else 'NaN or infinity'} at {rows_at(bad)}"
         raise malformed(path, "rot_0 … rot_3 must be a quaternion", got, _DROP_REMEDY)
-    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
-    return (wxyz[:, [1, 2, 3, 0]] / divisor[:, None]).astype(np.float32)
+    return _unit(wxyz[:, [1, 2, 3, 0]], length)
+
+
+def _lengths(vectors: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors, dtype=np.float64))
+
+
+def _unit(vectors: NDArray[np.float32], lengths: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Divide vectors by their lengths, except where these are 1 to rounding."""
+    divisor = np.where(np.abs(lengths - 1.0) <= _UNIT_ROUNDING, 1.0, lengths)
+    return (vectors / divisor[:, None]).astype(np.float32)
 
 
 def _radiance(
     header: PlyHeader,
-    table: Table,
+    table: PlyTable,
     statements: _Statements,
     has_base_color: bool,
     notes: list[str],
     read_names: set[str],
 ) -> dict[str, Any]:
-    """Return the captured colour, unless the file says that its colour only repeats the material."""
+    """Return the captured colour, unless the file states that its colour only repeats the material."""
     rest = [name for name in table.names if name.startswith("f_rest_")]
     present = [name for name in _DC if name in table.names]
     if not present and not rest:
@@ -299,13 +308,13 @@ def _radiance(
 
 def _materials(
     header: PlyHeader,
-    table: Table,
+    table: PlyTable,
     options: ReadOptions,
     statements: _Statements,
     notes: list[str],
     read_names: set[str],
 ) -> dict[str, Any]:
-    """Return the material channels and normals, as far as the file or the caller says how they are stored."""
+    """Return the material channels and normals whose storage the file or the caller states."""
     activation = options.material_activation or ("linear" if statements.material_linear else None)
     layout = LAYOUTS[activation or "linear"]
     fields: dict[str, Any] = {}
@@ -330,7 +339,7 @@ def _materials(
     return fields | _normals(table, layout, notes, read_names)
 
 
-def _activated(table: Table, layout: MaterialLayout, read_names: set[str]) -> dict[str, Any]:
+def _activated(table: PlyTable, layout: MaterialLayout, read_names: set[str]) -> dict[str, Any]:
     """Return the channels of a layout that a table holds, linear."""
     fields: dict[str, Any] = {}
     for channel, (names, activate) in layout.channels.items():
@@ -341,18 +350,17 @@ def _activated(table: Table, layout: MaterialLayout, read_names: set[str]) -> di
     return fields
 
 
-def _normals(table: Table, layout: MaterialLayout, notes: list[str], read_names: set[str]) -> dict[str, Any]:
-    """Return unit normals, or nothing where the file holds the usual zeros."""
+def _normals(table: PlyTable, layout: MaterialLayout, notes: list[str], read_names: set[str]) -> dict[str, Any]:
+    """Return unit normals, or nothing if the file has the usual zeros."""
     if not set(layout.normals) <= set(table.names):
         return {}
     read_names |= set(layout.normals)
     normals = table.columns(layout.normals)
-    length = np.sqrt(np.einsum("ij,ij->i", normals, normals, dtype=np.float64))
+    length = _lengths(normals)
     usable = (length > 1e-6) & np.isfinite(length)
     if not usable.any():
         return {}
     if not usable.all():
         notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
         return {}
-    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
-    return {"normals": (normals / divisor[:, None]).astype(np.float32)}
+    return {"normals": _unit(normals, length)}

@@ -1,4 +1,4 @@
-"""Which files a USD stage is made of."""
+"""Files that a USD stage consists of."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beam_warp.errors import AssetFormatError
 
 
 def layer_files(path: Path) -> list[Path]:
-    """Return the files of all layers that a stage reads, value clips included, the stage's own first.
+    """Return the files of all layers of a stage, including value clips, with the stage's own file first.
 
     Raises:
         AssetFormatError: OpenUSD cannot open it, or a layer is missing.

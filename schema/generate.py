@@ -1,7 +1,7 @@
-"""Generates generatedSchema.usda and plugInfo.json from schema.usda: ``python -m beam_warp.schema.generate``.
+"""Generator of generatedSchema.usda and plugInfo.json from schema.usda: ``python -m beam_warp.schema.generate``.
 
-Wraps usdGenSchema, which usd-core carries; it needs jinja2 (the ``dev`` extra). A test regenerates and compares, so
-that the three files cannot drift apart.
+It runs usdGenSchema, a part of usd-core, which needs jinja2 (the ``dev`` extra). A test generates the files and
+compares them, so that the three files cannot drift apart.
 """
 
 from __future__ import annotations

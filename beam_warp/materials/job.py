@@ -38,8 +38,9 @@ from beam_warp.materials.roughness import measure_roughness_profile, solve_rough
 from beam_warp.materials.tally import Tally, warnings_about
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud, GaussianSequence, Observability
 
 Progress = Callable[[str, int, int], None]

@@ -21,7 +21,7 @@ from beam_warp.world.environment import EnvironmentMap, texel_directions
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import SUN_DIAMETER, DirectionalLight, PointLight
 from beam_warp.world.mesh import MaterialMesh
-from beam_warp.world.shapes import Surface, rectangle, sphere_zone, tile
+from beam_warp.world.shapes import TiledSurface, rectangle, sphere_zone, tile
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
 
 DEFERRED, PATH = "deferred", "path"
@@ -152,12 +152,12 @@ class RelightStudio:
         surface = sphere_zone(np.zeros(3), RADIUS, -1.0, 1.0, spacing or self.spacing)
         return _relightable(tile((surface,)), base_color, roughness)
 
-    def floor(self, wall: tuple[Surface, ...] = ()) -> GaussianCloud:
+    def floor(self, wall: tuple[TiledSurface, ...] = ()) -> GaussianCloud:
         """Return a floor of 2 m, tiled with flat Gaussians, and a wall on it if one is given."""
         x, y, _ = np.eye(3)
         return _relightable(tile((rectangle(np.zeros(3), x, y, self.spacing), *wall)), 0.8)
 
-    def wall(self) -> tuple[Surface, Surface]:
+    def wall(self) -> tuple[TiledSurface, TiledSurface]:
         """Return both sides of the wall, the first towards the sun."""
         _, y, z = np.eye(3)
         place, height, half = WALL
@@ -530,7 +530,7 @@ def _wall_seen(studio: RelightStudio) -> float:
     return studio.spacing + 2.0 * FIELD / studio.size
 
 
-def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
+def _behind(studio: RelightStudio, wall: tuple[TiledSurface, ...]) -> RelightStress:
     """Return a sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
     cloud, camera, sun = studio.floor(wall), studio.from_above(), sun_at(GRAZING)
     expected, judged = _wall_shadow(studio, camera, studio.spacing)

@@ -1,4 +1,4 @@
-"""Distant light as a lat-long map: reading, turning, resizing, and integrals over the sphere.
+"""Distant light as a lat-long map: reading, rotation, resizing, and integrals over the sphere.
 
 The mapping, for a unit world direction d (z up): u = 0.5 - atan2(d.y, d.x) / 2π, v = acos(d.z) / π from the top row.
 The centre of the image is +x, its left quarter +y. Radiance is constant inside a texel; all integrals here are of that
@@ -24,7 +24,7 @@ MIN_HEIGHT = 4
 """Fewest rows of a map: below, a texel spans more than an octant."""
 
 DEFAULT_IRRADIANCE_SIZE = (64, 128)
-"""Rows and columns at which bilinear lookup of irradiance errs by 3e-4."""
+"""Rows and columns of an irradiance map whose bilinear lookup has an error of 3e-4."""
 
 IRRADIANCE_ROWS = 512
 """Rows of the grid behind `EnvironmentMap.irradiance_map`. Texels that straddle the horizon lose at most the fraction
@@ -162,7 +162,7 @@ class EnvironmentMap:
 
     @cached_property
     def default_irradiance(self) -> NDArray[np.float32]:
-        """`irradiance_map` of the default size, computed once; scaling and turning by whole columns carry it along."""
+        """`irradiance_map` of the default size, computed once; scaling and rotation by whole columns keep it."""
         return self.irradiance_map(*DEFAULT_IRRADIANCE_SIZE)
 
     def irradiance_map(self, height: int = 64, width: int = 128) -> NDArray[np.float32]:

@@ -90,8 +90,8 @@ def sh_transform(linear: ArrayLike, degree: int) -> NDArray[np.float64]:
     """Return the matrix that carries coefficients along when the scene is turned or mirrored.
 
     If g(d) = f(M^T d) for an orthogonal M, then ``coefficients(g) = sh_transform(M, degree) @ coefficients(f)``.
-    Found by evaluating the basis on more directions than it has terms and solving the (consistent, well conditioned)
-    linear system, which is exact to rounding for every orthogonal M, flips included: no Wigner recursion to get wrong.
+    The basis is evaluated in more directions than it has terms, and the consistent, well-conditioned linear system is
+    solved. This is exact to rounding for every orthogonal M, flips included, and needs no Wigner recursion.
 
     Args:
         linear: Orthogonal ``(3, 3)``.

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
+from beam_warp.world.framing import bulk
 
 SIZE = {"width": 40, "height": 30, "vertical_fov": 60.0}
 
