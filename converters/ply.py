@@ -32,7 +32,7 @@ from beam_warp.converters.producers import (
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, sh_degree_of
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import LOW_PASS_RANGE, raster_metadata
 
 DEFAULT_AXES = "rdf"
@@ -198,47 +198,79 @@ def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:
     return names
 
 
+@dataclass
+class _Reading:
+    """A file while its columns are read.
+
+    Attributes:
+        header: The header.
+        options: What the caller states.
+        statements: What the file states.
+        notes: Receives what was assumed or left out.
+        table: The vertices.
+        read_names: Properties that have been read.
+    """
+
+    header: PlyHeader
+    options: ReadOptions
+    statements: _Statements
+    notes: list[str]
+    table: PlyTable
+    read_names: set[str]
+
+    def has(self, names: Sequence[str]) -> bool:
+        """Return True if the file has all these properties."""
+        return set(names) <= set(self.table.names)
+
+    def columns(self, names: Sequence[str]) -> NDArray[np.float32]:
+        """Return properties as ``(N, len(names))``."""
+        self.read_names |= set(names)
+        return self.table.columns(names)
+
+
 def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, notes: list[str]) -> dict[str, Any]:
     """Return the fields of a cloud in the file's axes and units."""
     names = _require_gaussians(header)
-    table = read_table(header, "vertex")
+    reading = _Reading(header, options, statements, notes, read_table(header, "vertex"), set())
     if options.drop_invalid:
-        table = _without_invalid_rows(table, options, notes)
-
-    scale_names = _SCALE if "scale_2" in names else _FLAT
-    scales, opacities = table.columns(scale_names), table.columns(["opacity"])[:, 0]
-    if options.activation != "linear":
-        if options.activation is None:
-            require_not_linear(header.path, scales, opacities)
-        require_log_scales(header.path, scales)
-        finite = np.isfinite(opacities)
-        if not finite.all():
-            raise malformed(
-                header.path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY
-            )
-        scales, opacities = exp_scale(scales), sigmoid(opacities)
-    if scale_names == _FLAT:
-        notes.append("no scale_2: read as 2D Gaussians of thickness 0")
-        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
-    fields: dict[str, Any] = {
-        "positions": table.columns(_POSITION),
-        "orientations": _orientations(header.path, table),
-        "scales": scales,
-        "opacities": opacities,
-    }
-    read_names = {*_POSITION, "opacity", *scale_names, *_ROTATION}
-    fields |= _materials(header, table, options, statements, notes, read_names)
-    fields |= _radiance(header, table, statements, "base_color" in fields, notes, read_names)
-    unread = [name for name in names if name not in read_names and name not in NORMAL_NAMES]
+        reading.table = _without_invalid_rows(reading.table, notes)
+    fields = _geometry(reading)
+    fields |= _materials(reading)
+    fields |= _radiance(reading, "base_color" in fields)
+    unread = [name for name in names if name not in reading.read_names and name not in NORMAL_NAMES]
     if unread:
         notes.append(f"properties left out: {', '.join(unread[:12])}{', …' if len(unread) > 12 else ''}")
     return fields
 
 
+def _geometry(reading: _Reading) -> dict[str, Any]:
+    """Return positions, orientations, scales and opacities."""
+    path, activation = reading.header.path, reading.options.activation
+    is_flat = not reading.has(_SCALE)
+    scales, opacities = reading.columns(_FLAT if is_flat else _SCALE), reading.columns(["opacity"])[:, 0]
+    if activation != "linear":
+        if activation is None:
+            require_not_linear(path, scales, opacities)
+        require_log_scales(path, scales)
+        finite = np.isfinite(opacities)
+        if not finite.all():
+            raise malformed(path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY)
+        scales, opacities = exp_scale(scales), sigmoid(opacities)
+    if is_flat:
+        reading.notes.append("no scale_2: read as 2D Gaussians of thickness 0")
+        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
+    return {
+        "positions": reading.columns(_POSITION),
+        "orientations": _orientations(path, reading.columns(_ROTATION)),
+        "scales": scales,
+        "opacities": opacities,
+    }
+
+
 _DROP_REMEDY = "Repair those rows, or drop them with --drop-invalid."
 
 
-def _without_invalid_rows(table: PlyTable, options: ReadOptions, notes: list[str]) -> PlyTable:
+def _without_invalid_rows(table: PlyTable, notes: list[str]) -> PlyTable:
     """Leave out rows that are no valid Gaussian."""
     geometry = table.columns([name for name in table.names if name in (*_POSITION, "opacity", *_SCALE, *_DC)])
     rotations = table.columns(_ROTATION).astype(np.float64)
@@ -249,9 +281,8 @@ def _without_invalid_rows(table: PlyTable, options: ReadOptions, notes: list[str
     return table if valid.all() else PlyTable(table.names, table.rows[valid])
 
 
-def _orientations(path: Path, table: PlyTable) -> NDArray[np.float32]:
+def _orientations(path: Path, wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return unit quaternions xyzw; those that are unit already keep their bits."""
-    wxyz = table.columns(_ROTATION)
     length = _lengths(wxyz)
     bad = ~((length > 1e-12) & np.isfinite(length))
     if bad.any():
@@ -271,96 +302,74 @@ def _unit(vectors: NDArray[np.float32], lengths: NDArray[np.float64]) -> NDArray
     return (vectors / divisor[:, None]).astype(np.float32)
 
 
-def _radiance(
-    header: PlyHeader,
-    table: PlyTable,
-    statements: _Statements,
-    has_base_color: bool,
-    notes: list[str],
-    read_names: set[str],
-) -> dict[str, Any]:
+def _radiance(reading: _Reading, has_base_color: bool) -> dict[str, Any]:
     """Return the captured colour, unless the file states that its colour only repeats the material."""
-    rest = [name for name in table.names if name.startswith("f_rest_")]
-    present = [name for name in _DC if name in table.names]
+    statements = reading.statements
+    rest = [name for name in reading.table.names if name.startswith("f_rest_")]
+    present = [name for name in _DC if name in reading.table.names]
     if not present and not rest:
-        notes.append("no f_dc_0 … f_dc_2: read without colour")
+        reading.notes.append("no f_dc_0 … f_dc_2: read without colour")
         return {}
     ordered = tuple(f"f_rest_{index}" for index in range(len(rest)))
     if len(present) != 3 or set(ordered) != set(rest) or len(rest) not in (0, 9, 24, 45, 72):
         raise malformed(
-            header.path,
+            reading.header.path,
             "spherical harmonics must be f_dc_0 … 2 and f_rest_0 … with 0, 9, 24, 45 or 72 of them",
             f"{len(present)} and {len(rest)}",
             "Export it again with full bands.",
         )
-    read_names |= {*_DC, *rest}
+    reading.read_names |= {*_DC, *rest}
     if statements.radiance_meaning == NO_COLOR or (statements.radiance_meaning == BASE_COLOR_ONLY and has_base_color):
         return {}
     if statements.radiance_meaning == BASE_COLOR_ONLY:
-        notes.append("colour is base colour times ambient occlusion, not captured radiance")
-    radiance = np.empty((len(table.rows), 1 + len(rest) // 3, 3), np.float32)
-    radiance[:, 0] = table.columns(_DC)
+        reading.notes.append("colour is base colour times ambient occlusion, not captured radiance")
+    radiance = np.empty((len(reading.table.rows), 1 + len(rest) // 3, 3), np.float32)
+    radiance[:, 0] = reading.columns(_DC)
     if rest:
-        radiance[:, 1:] = table.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
-    sh_degree_of(radiance.shape[1])
+        radiance[:, 1:] = reading.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
     return {"radiance": radiance, "radiance_color_space": statements.radiance_color_space}
 
 
-def _materials(
-    header: PlyHeader,
-    table: PlyTable,
-    options: ReadOptions,
-    statements: _Statements,
-    notes: list[str],
-    read_names: set[str],
-) -> dict[str, Any]:
+def _materials(reading: _Reading) -> dict[str, Any]:
     """Return the material channels and normals whose storage the file or the caller states."""
-    activation = options.material_activation or ("linear" if statements.material_linear else None)
+    asked = reading.options.material_activation
+    activation = asked or ("linear" if reading.statements.material_linear else None)
     layout = LAYOUTS[activation or "linear"]
     fields: dict[str, Any] = {}
-    found = material_properties(table.names)
+    found = material_properties(reading.table.names)
     if activation is None and found:
-        producer = material_producer(table.names)
+        producer = material_producer(reading.table.names)
         named = f" of {producer[0]}" if producer else ""
         choice = producer[1] if producer and producer[1] else "linear|r3dg|gsir|irgs"
-        notes.append(
+        reading.notes.append(
             f"materials{named} left out ({', '.join(found)}): pass --material-activation {choice} to read them"
         )
     elif activation is not None:
-        fields = _activated(table, layout, read_names)
-        if options.material_activation is not None and not fields:
+        for channel, (names, activate) in layout.channels.items():
+            if reading.has(names):
+                values = activate(reading.columns(names))
+                fields[channel] = values if len(names) == 3 else values[:, 0]
+        if asked is not None and not fields:
             wanted = ", ".join(name for names, _ in layout.channels.values() for name in names)
             raise malformed(
-                header.path,
+                reading.header.path,
                 f"materials of {activation} must have {wanted}",
                 ", ".join(found) or "no material channels",
                 "Choose another --material-activation, or leave it out.",
             )
-    return fields | _normals(table, layout, notes, read_names)
+    return fields | _normals(reading, layout)
 
 
-def _activated(table: PlyTable, layout: MaterialLayout, read_names: set[str]) -> dict[str, Any]:
-    """Return the channels of a layout that a table holds, linear."""
-    fields: dict[str, Any] = {}
-    for channel, (names, activate) in layout.channels.items():
-        if set(names) <= set(table.names):
-            read_names |= set(names)
-            values = activate(table.columns(names))
-            fields[channel] = values if len(names) == 3 else values[:, 0]
-    return fields
-
-
-def _normals(table: PlyTable, layout: MaterialLayout, notes: list[str], read_names: set[str]) -> dict[str, Any]:
+def _normals(reading: _Reading, layout: MaterialLayout) -> dict[str, Any]:
     """Return unit normals, or nothing if the file has the usual zeros."""
-    if not set(layout.normals) <= set(table.names):
+    if not reading.has(layout.normals):
         return {}
-    read_names |= set(layout.normals)
-    normals = table.columns(layout.normals)
+    normals = reading.columns(layout.normals)
     length = _lengths(normals)
     usable = (length > 1e-6) & np.isfinite(length)
     if not usable.any():
         return {}
     if not usable.all():
-        notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
+        reading.notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
         return {}
     return {"normals": _unit(normals, length)}

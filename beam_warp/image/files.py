@@ -171,24 +171,12 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     if suffix == ".exr":
         import OpenEXR
 
-        try:
+        with _intact(path):
             first, end = _window(path, OpenEXR.File(str(path), header_only=True).header(), "displayWindow")
-        except AssetFormatError:
-            raise
-        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise _damaged(path, error) from error
         width, height = (end - first).tolist()
         return width, height
-    from PIL import Image as PillowImage
-
-    try:
-        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
-            _require_size(path, *picture.size)
-            return picture.size
-    except AssetFormatError:
-        raise
-    except (OSError, SyntaxError, ValueError, EOFError, PillowImage.DecompressionBombError) as error:
-        raise _damaged(path, error) from error
+    with _picture(path) as picture:
+        return picture.size
 
 
 def _require_file(path: Path) -> None:
@@ -216,6 +204,34 @@ def _damaged(path: Path, error: object) -> AssetFormatError:
     )
 
 
+_DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, SyntaxError, TypeError, ValueError)
+"""Errors that OpenEXR and Pillow raise about damaged files, beside those of the system."""
+
+
+@contextmanager
+def _intact(path: Path) -> Iterator[None]:
+    """Report what a library raises about a file as an error of ours; errors of ours pass."""
+    try:
+        yield
+    except AssetFormatError:
+        raise
+    except (*_DAMAGE, OSError, RuntimeError, MemoryError) as error:
+        raise _damaged(path, error) from error
+
+
+@contextmanager
+def _picture(path: Path) -> Iterator[Any]:
+    """Open a PNG or JPEG file with Pillow, after checking its size."""
+    from PIL import Image as PillowImage
+
+    try:
+        with _intact(path), PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
+            _require_size(path, *picture.size)
+            yield picture
+    except PillowImage.DecompressionBombError as error:
+        raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
+
+
 def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first and last + 1 corner of an EXR window as (x, y), after checking its size."""
     first, last = (np.asarray(corner, np.int64) for corner in header[name])
@@ -226,7 +242,7 @@ def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[n
 def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
     import OpenEXR
 
-    try:
+    with _intact(path):
         lead = OpenEXR.File(str(path), header_only=True)
         header = lead.header()
         described = header["channels"]
@@ -246,10 +262,6 @@ def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
         pixels = {name: channel.pixels for name, channel in stored.items()}
         if any(array.shape != tuple(data_end - data_first)[::-1] for array in pixels.values()):
             raise ValueError("a channel is incomplete")
-    except AssetFormatError:
-        raise
-    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError) as error:
-        raise _damaged(path, error) from error
     low, high = np.maximum(data_first, first), np.minimum(data_end, end)
     into = tuple(slice(*pair) for pair in zip((low - first)[::-1], (high - first)[::-1], strict=True))
     part = tuple(slice(*pair) for pair in zip((low - data_first)[::-1], (high - data_first)[::-1], strict=True))
@@ -269,35 +281,24 @@ _PILLOW_CHANNELS = {"L": ("Y",), "LA": ("Y", "A"), "RGB": ("R", "G", "B"), "RGBA
 
 
 def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
-    from PIL import Image as PillowImage
-
-    try:
-        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
-            _require_size(path, *picture.size)
-            coding = str(picture.tile[0][3] if picture.tile else "")
-            if picture.mode == "P":
-                picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
-            if picture.mode in ("I;16", "I"):
-                return {"Y": np.asarray(picture).astype(np.float32) / np.float32(65535)}
-            names = _PILLOW_CHANNELS.get(picture.mode)
-            if names is None or coding == "LA;16B":
-                raise AssetFormatError(
-                    f"image must be grey, RGB or RGBA, of 8 or 16 bits (grey with alpha: 8), got mode {picture.mode} "
-                    f"in {path}. Convert it."
-                )
-            values = np.asarray(picture)
-        full = 255
-        if coding.endswith(";16B"):  # Pillow keeps the high bytes only: decode the low ones as a second picture
-            with PillowImage.open(path, formats=("PNG",)) as picture:
-                codec, extents, offset, _ = picture.tile[0]
-                picture.tile = [(codec, extents, offset, f"{picture.mode};16L")]
-                values, full = values * np.uint16(256) + np.asarray(picture), 65535
-    except AssetFormatError:
-        raise
-    except PillowImage.DecompressionBombError as error:
-        raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise _damaged(path, error) from error
+    with _picture(path) as picture:
+        coding = str(picture.tile[0][3] if picture.tile else "")
+        if picture.mode == "P":
+            picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
+        if picture.mode in ("I;16", "I"):
+            return {"Y": np.asarray(picture).astype(np.float32) / np.float32(65535)}
+        names = _PILLOW_CHANNELS.get(picture.mode)
+        if names is None or coding == "LA;16B":
+            raise AssetFormatError(
+                f"image must be grey, RGB or RGBA, of 8 or 16 bits (grey with alpha: 8), got mode {picture.mode} "
+                f"in {path}. Convert it."
+            )
+        values, full = np.asarray(picture), 255
+    if coding.endswith(";16B"):  # Pillow keeps the high bytes only: decode the low ones as a second picture
+        with _picture(path) as picture:
+            codec, extents, offset, _ = picture.tile[0]
+            picture.tile = [(codec, extents, offset, f"{picture.mode};16L")]
+            values, full = values * np.uint16(256) + np.asarray(picture), 65535
     values = values.reshape(*values.shape[:2], -1)
     return {name: values[..., index].astype(np.float32) / np.float32(full) for index, name in enumerate(names)}
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import require_array, require_count, require_number, require_unit
+from beam_warp.checks import require_array, require_count, require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError
 from beam_warp.image.files import MAX_SIDE, read_image
 
@@ -95,23 +95,6 @@ class EnvironmentMap:
         """Return the exact solid angle of every texel [sr], ``(H, W)``; they sum to 4π."""
         rows = (2.0 * np.pi / self.width) * -np.diff(np.cos(_row_edges(self.height)))
         return np.broadcast_to(rows[:, None], (self.height, self.width))
-
-    def lookup(self, directions: ArrayLike) -> NDArray[np.float32]:
-        """Return the radiance of the texel that holds each unit direction, ``(..., 3)`` to ``(..., 3)``.
-
-        The float64 twin of ``latlong_nearest``: they differ only for directions within rounding of a texel's edge.
-
-        Raises:
-            InvalidArrayError: A direction is not of unit length.
-        """
-        d = np.asarray(directions, np.float64)
-        flat = require_array("directions", d.reshape(-1, d.shape[-1] if d.ndim else 1), (None, 3), np.float64)
-        require_unit("directions", flat)
-        u = 0.5 - np.arctan2(flat[:, 1], flat[:, 0]) / (2.0 * np.pi)
-        v = np.arccos(np.clip(flat[:, 2], -1.0, 1.0)) / np.pi
-        row = np.minimum((v * self.height).astype(np.int64), self.height - 1)
-        column = (u * self.width).astype(np.int64) % self.width
-        return self.radiance[row, column].reshape(d.shape)
 
     def mean_radiance(self) -> NDArray[np.float64]:
         """Return the mean over the sphere, ``(3,)``: every texel weighted by its solid angle."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from reference.harmonics import sh_color
 from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
@@ -14,7 +15,6 @@ from beam_warp.raster import rasterizer
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.world.harmonics import sh_color
 
 GRADIENT_ERROR = 1e-5
 """Relative L2 of every gradient against float64 frozen-decision differences."""
