@@ -204,9 +204,9 @@ class _Reading:
 
     Attributes:
         header: The header.
-        options: What the caller states.
-        statements: What the file states.
-        notes: Receives what was assumed or left out.
+        options: Statements of the caller.
+        statements: Statements of the file.
+        notes: List to which assumptions and omissions are added.
         table: The vertices.
         read_names: Properties that have been read.
     """

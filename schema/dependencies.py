@@ -13,7 +13,7 @@ def layer_files(path: Path) -> list[Path]:
     """Return the files of all layers of a stage, including value clips, with the stage's own file first.
 
     Raises:
-        AssetFormatError: OpenUSD cannot open it, or a layer is missing.
+        AssetFormatError: OpenUSD cannot open the stage, or a layer is missing.
     """
     try:
         layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))

@@ -33,7 +33,7 @@ _VALIDATOR_PLUGIN = {
     "Root": "host_validator.py",  # OpenUSD tells plug-ins apart by this path
     "Type": "python",
 }
-"""What lets other hosts run our rules: OpenUSD imports the module when the validator is first asked for."""
+"""Entry of plugInfo.json by which other hosts run our rules; OpenUSD imports the module on first use."""
 
 
 def generate(folder: Path) -> None:

@@ -45,7 +45,7 @@ class Survey:
 
 
 def survey_sequence(sequence: GaussianSequence) -> Survey:
-    """Read every frame once and say what a file must hold.
+    """Read every frame once and return the properties of the sequence.
 
     Raises:
         InvalidOptionError: A stage cannot state the axes, frames differ in axes or colour space, or the count changes

@@ -32,7 +32,7 @@ def judge_cameras(rig: Mapping[str, Camera], split: str, findings: Findings) -> 
     Args:
         rig: Training cameras by name.
         split: The split that they belong to, for messages.
-        findings: Receives what is found.
+        findings: List to which findings are added.
 
     Returns:
         The volume that most cameras see, None if there is none; and the names of cameras that see nothing of it.

@@ -96,7 +96,7 @@ def read(folder: Path, model: Path, keep: float) -> CaptureContents:
 
     Args:
         folder: The capture.
-        model: What `find` found.
+        model: Folder that `find` returned.
         keep: See `Capture.read`.
 
     Raises:

@@ -63,7 +63,7 @@ def require_files(records: Iterable[CaptureRecord]) -> None:
     """Refuse records whose files are not there, before any work starts.
 
     Raises:
-        MissingFileError: Names the first one and says how many there are.
+        MissingFileError: A file does not exist; the message names the first one and their number.
     """
     missing = [path for record in records for path in files_of(record) if not path.is_file()]
     if missing:

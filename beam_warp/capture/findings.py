@@ -17,9 +17,9 @@ class Finding:
         severity: ``error``: reconstruction is impossible or its result would be meaningless; ``warning``: it goes on
             with the fallback that ``what`` states; ``note``: an assumption that was made.
         code: Identifies the kind of finding, for programs.
-        what: One sentence without its full stop.
+        what: The fault in one sentence, without its full stop.
         where: Records, cameras or frames, in words; empty for the capture as a whole.
-        remedy: What to do, a sentence or two.
+        remedy: Advice in a sentence or two; empty if there is none.
     """
 
     severity: Severity

@@ -44,11 +44,11 @@ class Glimpse:
     Attributes:
         record: The record of the image.
         pixels: Display sRGB, not premultiplied, ``(H, W, 3)`` uint8.
-        alpha: Coverage, ``(H, W)`` float32; None where it is not known.
+        alpha: Coverage, ``(H, W)`` float32; None if it is unknown.
         brightest: Largest value of a colour channel.
         exposure: Median luminance of the subject, or of all where coverage is not known, as a power of two; None for
             an image without a subject, or a black one.
-        coverage: Mean alpha; None where it is not known.
+        coverage: Mean alpha; None if it is unknown.
     """
 
     record: CaptureRecord
@@ -85,12 +85,12 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
 
 
 def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse], findings: Findings) -> set[str]:
-    """Check what images show.
+    """Check the contents of images.
 
     Args:
         training: The records that are reconstructed from.
         glimpses: Images that were looked at, of training records and others.
-        findings: Receives what is found.
+        findings: List to which findings are added.
 
     Returns:
         Names of records whose images show nothing.

@@ -114,7 +114,7 @@ class Readiness:
 
 
 def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES) -> Readiness:
-    """Refuse a capture that cannot be reconstructed; of any other, say what is left out or assumed.
+    """Refuse a capture that cannot be reconstructed; for any other, return what is left out or assumed.
 
     Args:
         capture: The capture, whose training records are to be reconstructed from.

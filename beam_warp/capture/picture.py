@@ -62,7 +62,7 @@ class Rig:
 
     @classmethod
     def of(cls, report: CaptureReport) -> Rig:
-        """Gather what is drawn of a report."""
+        """Make the rig of a report."""
         poses = np.array([camera.camera_to_world for camera in report.cameras.values()])
         point = meeting_point(poses)
         if point is None:

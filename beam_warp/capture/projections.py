@@ -253,7 +253,7 @@ def _infer_scale(parts: dict[str, Decomposition], sizes: dict[str, tuple[int, in
 def _require_facing(parts: dict[str, Decomposition], folder: Path) -> None:
     """Refuse mirrored matrices.
 
-    Changing the sign of a mirrored matrix gives a camera with what it shows behind it. A single matrix does not tell:
+    If the sign of a mirrored matrix is changed, the camera has the scene behind it. A single matrix does not tell:
     a mirrored camera and the negative of a camera that looks the other way are the same. Where signs were changed, the
     point nearest to all optical axes is examined: it must lie in front of the cameras, since photographs show it.
     """

@@ -80,7 +80,7 @@ class Undistortion:
 
     @classmethod
     def fit(cls, lens: Lens, photograph: Intrinsics, keep: float = 0.0) -> Undistortion:
-        """Choose a pinhole that shows what a photograph does.
+        """Choose a pinhole for a photograph.
 
         Args:
             lens: Distortion of the photograph.
@@ -114,7 +114,7 @@ class Undistortion:
         NaN and infinity stay with their neighbours.
 
         Args:
-            image: The photograph, of the size that `photograph` says.
+            image: The photograph, with the size of `photograph`.
 
         Returns:
             The image in the same channels, colour space and association with alpha; itself through a straight lens.

@@ -20,7 +20,7 @@ class CapturedView:
         name: Name of the view in messages and files.
         camera: The pinhole that took the image.
         color: Scene-linear Rec.709, premultiplied by ``alpha`` where there is one, ``(H, W, 3)`` float32.
-        alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None where it is not known.
+        alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None if it is unknown.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.

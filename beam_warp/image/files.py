@@ -210,7 +210,7 @@ _DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, SyntaxError, 
 
 @contextmanager
 def _intact(path: Path) -> Iterator[None]:
-    """Report what a library raises about a file as an error of ours; errors of ours pass."""
+    """Turn errors that a library raises about a file into `AssetFormatError`."""
     try:
         yield
     except AssetFormatError:

@@ -10,8 +10,8 @@ result, so that there is one sRGB curve and one rounding:
   inset), 2^-10 to 2^6.5 of middle grey are encoded by their logarithm and bent by a sigmoid, the mix is undone, and the
   display's power of 2.2. The inset's numbers are those of Wrensch 2023 (Minimal AgX Implementation), its rows made to
   sum to 1 so that grey stays grey; the sigmoid is the closed form behind the polynomial there. No look is applied.
-- ``neutral``: Khronos PBR Neutral (specification of 2024): what reflects white light keeps its colour up to 0.76, and
-  what is brighter is compressed and fades to white.
+- ``neutral``: Khronos PBR Neutral (specification of 2024): surfaces under white light keep their colour up to 0.76;
+  brighter light is compressed and fades to white.
 
 Alpha: a view transform is not linear. So light is divided by alpha, transformed, and then composited over the
 background: the edge of a highlight has the highlight's colour, and a picture over a colour equals the picture with

@@ -212,7 +212,7 @@ def _overlap_means(old_edges: NDArray[np.float64], new_edges: NDArray[np.float64
 
 
 def _require_environment(name: str, radiance: NDArray[np.float32], where: str, error: type[BeamError]) -> None:
-    """Refuse what is not 2:1, finite and non-negative, naming the first bad texel."""
+    """Refuse a map that is not 2:1, finite and non-negative; the message names the first bad texel."""
     height, width = radiance.shape[:2]
     if height < MIN_HEIGHT or width != 2 * height:
         raise error(
