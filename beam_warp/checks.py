@@ -1,6 +1,6 @@
-"""The single voice of boundary errors: each check either passes or raises with name, contract, finding and remedy.
+"""Checks of arguments: each one passes, or raises an error that states name, contract, finding and remedy.
 
-All guards are phrased positively (``not (value >= low)``), so that NaN fails them.
+All conditions are phrased positively (``not (value >= low)``), so that NaN fails them.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 
 UNIT_TOLERANCE = 1e-3
-"""Largest | |v| - 1 | accepted as unit length: half-precision quaternions, the coarsest we read, are within 1e-3."""
+"""Largest | |v| - 1 | accepted as unit length; half-precision quaternions, the coarsest input, are within it."""
 
 
-def _rows(bad: NDArray[np.bool_]) -> str:
-    """Say where a per-row failure is: ``at row 12 (3 rows in all)``."""
+def rows_at(bad: NDArray[np.bool_]) -> str:
+    """Return which rows of a mask are set, in words: ``row 12 (3 rows in all)``."""
     rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
-    return f"at row {rows[0]}" + (f" ({len(rows)} rows in all)" if len(rows) > 1 else "")
+    return f"row {rows[0]}" + (f" ({len(rows)} rows in all)" if len(rows) > 1 else "")
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """Return ``value`` as a contiguous array of ``dtype`` whose shape matches (``None`` matches any length).
 
     Raises:
-        InvalidArrayError: It cannot be converted, or its shape is another.
+        InvalidArrayError: The value cannot be converted, or its shape differs.
     """
     try:
         array = np.ascontiguousarray(value, dtype=dtype)
@@ -46,16 +46,16 @@ def require_finite(name: str, array: NDArray[Any]) -> None:
     """Refuse NaN and infinity."""
     finite = np.isfinite(array)
     if not finite.all():
-        where = _rows(~finite)
-        raise InvalidArrayError(f"{name} must be finite, got NaN or infinity {where}. Drop or repair those rows.")
+        where = rows_at(~finite)
+        raise InvalidArrayError(f"{name} must be finite, got NaN or infinity at {where}. Drop or repair those rows.")
 
 
 def require_range(name: str, array: NDArray[Any], low: float, high: float, remedy: str = "Clip or rescale it.") -> None:
     """Refuse values outside ``[low, high]``; NaN is outside."""
     inside = (array >= low) & (array <= high)
     if not inside.all():
-        worst = array[~inside].flat[0]
-        raise InvalidArrayError(f"{name} must lie in [{low:g}, {high:g}], got {worst:g} {_rows(~inside)}. {remedy}")
+        worst, where = array[~inside].flat[0], rows_at(~inside)
+        raise InvalidArrayError(f"{name} must lie in [{low:g}, {high:g}], got {worst:g} at {where}. {remedy}")
 
 
 def require_unit(name: str, array: NDArray[Any], remedy: str = "Normalise it.") -> None:
@@ -64,11 +64,12 @@ def require_unit(name: str, array: NDArray[Any], remedy: str = "Normalise it.") 
     unit = np.abs(length - 1.0) <= UNIT_TOLERANCE
     if not unit.all():
         row = int(np.flatnonzero(~unit)[0])
-        raise InvalidArrayError(f"{name} must have unit length, got |v| = {length[row]:.4g} {_rows(~unit)}. {remedy}")
+        where = rows_at(~unit)
+        raise InvalidArrayError(f"{name} must have unit length, got |v| = {length[row]:.4g} at {where}. {remedy}")
 
 
 def require_same_length(name: str, array: NDArray[Any], other_name: str, count: int) -> None:
-    """Refuse an array whose first axis differs from that of the array it belongs to."""
+    """Refuse an array with another number of rows than the array it belongs to."""
     if len(array) != count:
         raise InvalidArrayError(
             f"{name} must have as many rows as {other_name} ({count}), got {len(array)}. Pass one row each."
@@ -76,14 +77,14 @@ def require_same_length(name: str, array: NDArray[Any], other_name: str, count: 
 
 
 def require_count(name: str, value: int, low: int = 1, high: int = 2**31 - 1) -> int:
-    """Return an integer option after checking its range."""
+    """Return an integer after checking its range."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not (low <= value <= high):
         raise InvalidOptionError(f"{name} must be an integer in [{low}, {high}], got {value!r}. Choose one in range.")
     return int(value)
 
 
 def require_number(name: str, value: float, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a real option after checking its range; NaN is outside every range."""
+    """Return a number as a float after checking its range; NaN is outside every range."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -94,17 +95,17 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
 
 
 def require_choice(name: str, value: str, choices: tuple[str, ...]) -> str:
-    """Return a named option after checking that it is one of ``choices``."""
+    """Return a text after checking that it is one of ``choices``."""
     if value not in choices:
         raise InvalidOptionError(f"{name} must be one of {', '.join(choices)}, got {value!r}. Choose one of them.")
     return value
 
 
 def require_package(name: str) -> Any:
-    """Import a drawing package.
+    """Import a package of the extra ``charts``.
 
     Raises:
-        InvalidOptionError: It is not installed; the message names the extra.
+        InvalidOptionError: The package is not installed; the message names the extra.
     """
     try:
         return import_module(name)

@@ -1,11 +1,11 @@
-"""What can go wrong at an edge of the package, one class per kind of edge.
+"""Errors that users of the package can cause and correct, one class for each kind of input or output.
 
 Every message reads ``<name> must <contract>, got <what came>[ at <where>]. <What to do>.``
 """
 
 
 class BeamError(Exception):
-    """Base of all errors that a caller can cause and mend; its message is fit to be shown as it is."""
+    """Base class of all errors that a caller can cause and correct; the message can be shown to users as it is."""
 
 
 class InvalidArrayError(BeamError, ValueError):
@@ -17,7 +17,7 @@ class InvalidOptionError(BeamError, ValueError):
 
 
 class AssetFormatError(BeamError, ValueError):
-    """A file is not what its name or header says: truncated, wrong types, values outside their range."""
+    """A file breaks its format: it is truncated, or has wrong types or values out of range."""
 
 
 class SchemaVersionError(AssetFormatError):
@@ -25,11 +25,11 @@ class SchemaVersionError(AssetFormatError):
 
 
 class DeviceError(BeamError, RuntimeError):
-    """A compute device was asked for that is not there."""
+    """A requested compute device does not exist."""
 
 
 class MissingPackageError(BeamError, ImportError):
-    """A room was imported whose optional package is not installed; the message names the extra."""
+    """A module was imported whose optional package is not installed; the message names the extra."""
 
 
 class MissingFileError(BeamError, FileNotFoundError):
@@ -37,4 +37,4 @@ class MissingFileError(BeamError, FileNotFoundError):
 
 
 class OutputError(BeamError, OSError):
-    """An output could not be written; nothing half-written is left behind."""
+    """An output could not be written; no partial output is left behind."""

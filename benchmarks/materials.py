@@ -102,7 +102,7 @@ def measure_row(row: AblationRow, subject: Subject, warm: Subject, truth: TruthV
     scores = truth.score(cloud, done.materials)
     if row.group == "ladder":
         found = done.materials if done.materials.normals is not None else replace(done.materials, normals=normals)
-        scores["relit"] = {name: truth.score_relit(cloud, found, make()) for name, make in RELIGHTERS.items()}
+        scores["relit"] = {name: truth.score_relit(cloud, found, make) for name, make in RELIGHTERS.items()}
     return {
         "seconds": sum(done.seconds.values()),
         "seconds_per_frame": sum(done.seconds.values()) / done.frames,

@@ -16,7 +16,7 @@ from tracing_scenes import FLATNESS, JITTER, Surface, spun_orientations
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.camera import Camera, focal_length
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import sh_color
+from beam_warp.world.harmonics import sh_basis
 
 BUMP = 0.06
 """Height of the bumps over the radius."""
@@ -42,8 +42,9 @@ class RasterScene(NamedTuple):
         cloud = self.cloud
         toward = cloud.positions - self.camera.position
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        basis = sh_basis(toward, cloud.sh_degree)
         columns = (
-            sh_color(cloud.radiance, toward),
+            np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, cloud.radiance.astype(np.float64)), 0.0),
             cloud.base_color,
             cloud.roughness[:, None],
             cloud.ambient_occlusion[:, None],

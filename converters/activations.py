@@ -1,6 +1,6 @@
-"""How training stores a quantity and what it means: logit and log against linear, raw materials against [0, 1].
+"""Activations: conversion between the values that training stores (logits, logs, raw materials) and linear values.
 
-The one place that knows; everything else in the package is linear. Plain NumPy, float64 inside, float32 out.
+Everything else in the package is linear. Plain NumPy, float64 inside, float32 out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.world.harmonics import SH_C0
 
 LOG_SCALE_LIMITS = (-30.0, 20.0)
-"""Natural logs of a believable standard deviation: below is nothing, above is a wrong activation."""
+"""Range of the natural log of a plausible standard deviation; above it, the activation is wrong."""
 
 LOGIT_LIMIT = 20.0
 """Largest logit written: sigmoid(20) rounds to 1 in float32, and sigmoid(-20) = 2.1e-9 shows nothing."""
@@ -54,7 +54,7 @@ def color_from_dc(coefficients: ArrayLike) -> NDArray[np.float32]:
 
 
 def linear(raw: ArrayLike) -> NDArray[np.float32]:
-    """Return a material that is stored as it is meant."""
+    """Return a material that is stored linearly."""
     return np.asarray(raw, dtype=np.float32)
 
 

@@ -1,4 +1,4 @@
-"""What colour a file shows in a viewer that knows no materials."""
+"""Colours of a file in viewers that ignore materials."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def srgb_slope(linear: ArrayLike) -> NDArray[np.float64]:
 
 
 def display_radiance(cloud: GaussianCloud) -> tuple[NDArray[np.float32], str]:
-    """Return spherical harmonics in display sRGB, ``(N, K, 3)``, and what they mean.
+    """Return spherical harmonics in display sRGB, ``(N, K, 3)``, and their meaning.
 
     Captured radiance is kept; if it is linear, its mean colour is encoded exactly and the higher bands to first order
     about it (an encoding is not linear, so no finite set of bands is exact). Without radiance, the colour is the

@@ -1,4 +1,4 @@
-"""What a file holds, what it leaves open, and the evidence for either."""
+"""Inspection of a file: its contents, what it does not state, and the evidence for what a reader assumes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 _MATERIALS = ("base_color", "roughness", "ambient_occlusion", "normals")
 
 _INVISIBLE = 1.0 / 255.0
-"""Opacity that an 8-bit picture cannot show."""
+"""Opacities below this are invisible in an 8-bit picture."""
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Least, middle and greatest of some values."""
+class ValueRange:
+    """Least value, median and greatest value."""
 
     least: float
     median: float
@@ -35,25 +35,25 @@ class Spread:
 
 @dataclass(frozen=True)
 class Inspection:
-    """One file or folder, as found.
+    """Facts about one file or folder.
 
     Attributes:
         name: File or folder name.
         format: Container, encoding and layout.
-        producer: Who wrote it, with the grounds for saying so.
-        frame_count: Frames; the values below are those of the first.
+        producer: Program that wrote it, with the evidence.
+        frame_count: Number of frames; the values below are those of the first.
         frames_per_second: Playback rate.
-        gaussian_count: Gaussians.
+        gaussian_count: Number of Gaussians.
         axes: Axis code that a reader will use.
-        axes_evidence: Why, and what speaks for or against it.
+        axes_evidence: Evidence for or against these axes, a sentence each.
         bounds: Least and greatest corner of the centres [m], or None without Gaussians.
         scales: Standard deviations [m], linear.
         opacities: Peak alphas, linear.
         sh_degree: Degree of the captured radiance, or None without one.
-        color_state: What the colour is and in which space.
-        materials: Material channels that a reader delivers.
+        color_state: Meaning and colour space of the colour.
+        materials: Material channels that a reader returns.
         comments: Header comments of a PLY.
-        notes: What a reader assumed or left out, and what looks odd.
+        notes: Assumptions and omissions of the reader, and unusual values.
     """
 
     name: str
@@ -65,8 +65,8 @@ class Inspection:
     axes: str
     axes_evidence: tuple[str, ...]
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None
-    scales: Spread | None
-    opacities: Spread | None
+    scales: ValueRange | None
+    opacities: ValueRange | None
     sh_degree: int | None
     color_state: str
     materials: tuple[str, ...]
@@ -74,7 +74,7 @@ class Inspection:
     notes: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return plain lists, numbers and text."""
+        """Return the facts, JSON-able."""
         return asdict(self)
 
     def as_text(self) -> str:
@@ -108,11 +108,11 @@ class Inspection:
 
 
 def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
-    """Describe what `beam_warp.converters.read` made of a path.
+    """Describe the file or folder that a sequence was read from.
 
     Args:
-        sequence: What was read; only its first frame is looked at.
-        path: Where it was read from.
+        sequence: Result of `beam_warp.converters.read`; only its first frame is read.
+        path: Path that it was read from.
 
     Raises:
         AssetFormatError: The first frame is malformed.
@@ -134,8 +134,8 @@ def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
         axes=cloud.axes,
         axes_evidence=("stated by the file",) if stated else _axes_evidence(cloud),
         bounds=_bounds(cloud),
-        scales=_spread(cloud.scales),
-        opacities=_spread(cloud.opacities),
+        scales=_value_range(cloud.scales),
+        opacities=_value_range(cloud.opacities),
         sh_degree=cloud.sh_degree,
         color_state=_color_state(cloud, header),
         materials=tuple(name for name in _MATERIALS if getattr(cloud, name) is not None),
@@ -153,10 +153,10 @@ def _format_of(header: PlyHeader | None, path: Path) -> str:
     return f"{kind}, {encoding[header.encoding]}, {layout}"
 
 
-def _spread(values: np.ndarray) -> Spread | None:
+def _value_range(values: np.ndarray) -> ValueRange | None:
     if not values.size:
         return None
-    return Spread(float(values.min()), float(np.median(values)), float(values.max()))
+    return ValueRange(float(values.min()), float(np.median(values)), float(values.max()))
 
 
 def _bounds(cloud: GaussianCloud) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
@@ -173,7 +173,7 @@ def _color_state(cloud: GaussianCloud, header: PlyHeader | None) -> str:
 
 
 def _axes_evidence(cloud: GaussianCloud) -> tuple[str, ...]:
-    """Say what the shape tells of the vertical: the tallest axis, and which of its ends is at the origin."""
+    """Return what the shape tells about the vertical: the tallest axis, and which of its ends is at the origin."""
     lines = ["not stated by the file: rdf is what 3DGS training writes; pass --source-axes to say otherwise"]
     if len(cloud) < 2:
         return tuple(lines)
@@ -197,7 +197,7 @@ def _axes_evidence(cloud: GaussianCloud) -> tuple[str, ...]:
 
 
 def _oddities(cloud: GaussianCloud) -> list[str]:
-    """Say what is legal and yet likely to surprise."""
+    """Return notes on values that are valid but unusual."""
     if not len(cloud):
         return []
     notes = []

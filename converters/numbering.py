@@ -1,4 +1,4 @@
-"""Sequences as folders of numbered files: find them in order, and name them."""
+"""Sequences as folders of numbered files: their names and their order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 
 DIGITS = 6
-"""Digits of a frame number that we write: prefix000000.ply."""
+"""Digits of the frame numbers that are written: prefix000000.ply."""
 
 _NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)(?:\.compressed)?\.ply", re.IGNORECASE)
 
@@ -24,7 +24,7 @@ def numbered_files(folder: Path) -> list[Path]:
 
     Raises:
         MissingFileError: The folder cannot be listed.
-        AssetFormatError: There are none, several sequences share the folder, a number is missing or comes twice.
+        AssetFormatError: There is no frame, several sequences share the folder, or a number is missing or occurs twice.
     """
     try:
         found = [(match, path) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))]
@@ -57,7 +57,7 @@ def numbered_files(folder: Path) -> list[Path]:
 
 
 def require_no_stale_frames(path: Path, frame_count: int) -> None:
-    """Refuse to write a sequence beside later frames of an older, longer one: they would join it unseen.
+    """Refuse to write a sequence into a folder with later frames of an older one, which would become part of it.
 
     Raises:
         OutputError: There are such frames.

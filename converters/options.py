@@ -1,4 +1,4 @@
-"""What a caller may ask of a reader and of a writer."""
+"""Options of readers and writers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Profile = Literal["standard", "beam"]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """What a file does not say about itself. A value given here wins over what the file says.
+    """Properties that a file does not state about itself; a value given here overrides what the file states.
 
     Attributes:
         source_axes: Axis code of the file (see `beam_warp.world.axes`).
         meters_per_unit: Length of one unit of the file [m].
         activation: ``log`` if scales are natural logs and opacities logits, as 3DGS training leaves them; ``linear``
             if both are linear. None means ``log``, with files that look linear refused.
-        material_activation: Whose material channels the file holds, and so how they are stored.
+        material_activation: Producer whose material channels the file holds, which determines how they are stored.
         drop_invalid: Leave out Gaussians with non-finite values or zero quaternions instead of refusing the file.
 
     Raises:
@@ -50,10 +50,10 @@ class ReadOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class WriteOptions:
-    """What a writer is asked for.
+    """Options of a writer.
 
     Attributes:
-        target: Whose axes and units to write; None keeps the cloud's axes in metres (USD is always ``usd``).
+        target: Consumer whose axes and units to write; None keeps the cloud's axes in metres (USD is always ``usd``).
         profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
         full_float: USD only. Single precision throughout instead of half where half suffices.

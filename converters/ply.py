@@ -1,4 +1,4 @@
-"""PLY files of Gaussians, read: the 3DGS training layout in any property order, the beam profile, the packed form.
+"""Reader of PLY files of Gaussians: the 3DGS training layout in any property order, the beam profile, the packed form.
 
 Source of the layout: the exporter of Kerbl et al. 2023: x y z, nx ny nz, f_dc, f_rest channel after channel, opacity
 as a logit, scale as natural logs, rot as w x y z. A file without ``scale_2`` (2D Gaussians) is read as flat ones.
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_choice, require_number
+from beam_warp.checks import require_choice, require_number, rows_at
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.options import ReadOptions
-from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types, rows_at
-from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, Table, malformed, read_header, read_table
+from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types
+from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, PlyTable, malformed, read_header, read_table
 from beam_warp.converters.producers import (
     LAYOUTS,
     NORMAL_NAMES,
@@ -32,11 +32,11 @@ from beam_warp.converters.producers import (
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, sh_degree_of
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import LOW_PASS_RANGE, raster_metadata
 
 DEFAULT_AXES = "rdf"
-"""Axes of a PLY that does not say: those of COLMAP, in which 3DGS is trained."""
+"""Axes of a PLY that does not state any: those of COLMAP, in which 3DGS is trained."""
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -44,12 +44,12 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _FLAT = _SCALE[:2]
 _UNIT_ROUNDING = 1e-6
-"""Lengths this close to 1 are float32 rounding of unit vectors, which are kept bit for bit."""
+"""Largest difference of a length from 1 that is float32 rounding; such vectors are kept bit for bit."""
 
 
 @dataclass(frozen=True)
 class PlyFrame:
-    """One file as read: the Gaussians, what the file says of its place in time, and what to tell the user."""
+    """One file as read: the Gaussians, the rate and provenance that it states, and notes for the user."""
 
     cloud: GaussianCloud
     frames_per_second: float
@@ -63,9 +63,9 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
 
 
 def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequence:
-    """Make a sequence of files that are read as their frames are asked for.
+    """Make a sequence of files, each of which is read when its frame is asked for.
 
-    Every header is checked at once, so that a cut file is found before any work is done.
+    All headers are checked at once, so that a truncated file is found before any work is done.
 
     Raises:
         AssetFormatError, MissingFileError: A header or the first frame is refused.
@@ -88,7 +88,7 @@ def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequen
 
 
 def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
-    """Read the Gaussians of a file whose header is read.
+    """Read the Gaussians of a file whose header has been read.
 
     Raises:
         AssetFormatError: It holds no Gaussians, or values outside their contract; the message names file and row.
@@ -126,7 +126,7 @@ def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
 
 @dataclass(frozen=True)
 class _Statements:
-    """What the comments of our own writer say, checked."""
+    """Values that the comments of our own writer state, checked."""
 
     axes: str | None
     meters_per_unit: float
@@ -173,7 +173,7 @@ class _Statements:
 
 
 def _raster(text: str) -> tuple[bool, float]:
-    """Read ``antialiased 0.1``: how splats are to be drawn."""
+    """Parse ``antialiased 0.1``, which states how splats are to be drawn."""
     word, _, low_pass = text.partition(" ")
     require_choice("beam_raster", word, tuple(RASTER_WORDS.values()))
     return word == RASTER_WORDS[True], require_number("beam_raster's low-pass", low_pass, *LOW_PASS_RANGE)  # type: ignore[arg-type]
@@ -198,161 +198,178 @@ def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:
     return names
 
 
+@dataclass
+class _Reading:
+    """A file while its columns are read.
+
+    Attributes:
+        header: The header.
+        options: Statements of the caller.
+        statements: Statements of the file.
+        notes: List to which assumptions and omissions are added.
+        table: The vertices.
+        read_names: Properties that have been read.
+    """
+
+    header: PlyHeader
+    options: ReadOptions
+    statements: _Statements
+    notes: list[str]
+    table: PlyTable
+    read_names: set[str]
+
+    def has(self, names: Sequence[str]) -> bool:
+        """Return True if the file has all these properties."""
+        return set(names) <= set(self.table.names)
+
+    def columns(self, names: Sequence[str]) -> NDArray[np.float32]:
+        """Return properties as ``(N, len(names))``."""
+        self.read_names |= set(names)
+        return self.table.columns(names)
+
+
 def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, notes: list[str]) -> dict[str, Any]:
     """Return the fields of a cloud in the file's axes and units."""
     names = _require_gaussians(header)
-    table = read_table(header, "vertex")
+    reading = _Reading(header, options, statements, notes, read_table(header, "vertex"), set())
     if options.drop_invalid:
-        table = _without_invalid_rows(table, options, notes)
-
-    scale_names = _SCALE if "scale_2" in names else _FLAT
-    scales, opacities = table.columns(scale_names), table.columns(["opacity"])[:, 0]
-    if options.activation != "linear":
-        if options.activation is None:
-            require_not_linear(header.path, scales, opacities)
-        require_log_scales(header.path, scales)
-        finite = np.isfinite(opacities)
-        if not finite.all():
-            raise malformed(
-                header.path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY
-            )
-        scales, opacities = exp_scale(scales), sigmoid(opacities)
-    if scale_names == _FLAT:
-        notes.append("no scale_2: read as 2D Gaussians of thickness 0")
-        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
-    fields: dict[str, Any] = {
-        "positions": table.columns(_POSITION),
-        "orientations": _orientations(header.path, table),
-        "scales": scales,
-        "opacities": opacities,
-    }
-    read_names = {*_POSITION, "opacity", *scale_names, *_ROTATION}
-    fields |= _materials(header, table, options, statements, notes, read_names)
-    fields |= _radiance(header, table, statements, "base_color" in fields, notes, read_names)
-    unread = [name for name in names if name not in read_names and name not in NORMAL_NAMES]
+        reading.table = _without_invalid_rows(reading.table, notes)
+    fields = _geometry(reading)
+    fields |= _materials(reading)
+    fields |= _radiance(reading, "base_color" in fields)
+    unread = [name for name in names if name not in reading.read_names and name not in NORMAL_NAMES]
     if unread:
         notes.append(f"properties left out: {', '.join(unread[:12])}{', …' if len(unread) > 12 else ''}")
     return fields
 
 
+def _geometry(reading: _Reading) -> dict[str, Any]:
+    """Return positions, orientations, scales and opacities."""
+    path, activation = reading.header.path, reading.options.activation
+    is_flat = not reading.has(_SCALE)
+    scales, opacities = reading.columns(_FLAT if is_flat else _SCALE), reading.columns(["opacity"])[:, 0]
+    if activation != "linear":
+        if activation is None:
+            require_not_linear(path, scales, opacities)
+        require_log_scales(path, scales)
+        finite = np.isfinite(opacities)
+        if not finite.all():
+            raise malformed(path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY)
+        scales, opacities = exp_scale(scales), sigmoid(opacities)
+    if is_flat:
+        reading.notes.append("no scale_2: read as 2D Gaussians of thickness 0")
+        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
+    return {
+        "positions": reading.columns(_POSITION),
+        "orientations": _orientations(path, reading.columns(_ROTATION)),
+        "scales": scales,
+        "opacities": opacities,
+    }
+
+
 _DROP_REMEDY = "Repair those rows, or drop them with --drop-invalid."
 
 
-def _without_invalid_rows(table: Table, options: ReadOptions, notes: list[str]) -> Table:
-    """Leave out rows that no reading can make a Gaussian of."""
+def _without_invalid_rows(table: PlyTable, notes: list[str]) -> PlyTable:
+    """Leave out rows that are no valid Gaussian."""
     geometry = table.columns([name for name in table.names if name in (*_POSITION, "opacity", *_SCALE, *_DC)])
     rotations = table.columns(_ROTATION).astype(np.float64)
     valid = np.isfinite(geometry).all(axis=1) & (np.linalg.norm(rotations, axis=1) > 1e-12)
     valid &= np.isfinite(rotations).all(axis=1)
     if not valid.all():
         notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} Gaussians dropped: not finite, or zero quaternions")
-    return table if valid.all() else Table(table.names, table.rows[valid])
+    return table if valid.all() else PlyTable(table.names, table.rows[valid])
 
 
-def _orientations(path: Path, table: Table) -> NDArray[np.float32]:
+def _orientations(path: Path, wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return unit quaternions xyzw; those that are unit already keep their bits."""
-    wxyz = table.columns(_ROTATION)
-    length = np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz, dtype=np.float64))
+    length = _lengths(wxyz)
     bad = ~((length > 1e-12) & np.isfinite(length))
     if bad.any():
         zero = length[int(np.flatnonzero(bad)[0])] <= 1e-12
         got = f"{'a zero quaternion' if zero else 'NaN or infinity'} at {rows_at(bad)}"
         raise malformed(path, "rot_0 … rot_3 must be a quaternion", got, _DROP_REMEDY)
-    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
-    return (wxyz[:, [1, 2, 3, 0]] / divisor[:, None]).astype(np.float32)
+    return _unit(wxyz[:, [1, 2, 3, 0]], length)
 
 
-def _radiance(
-    header: PlyHeader,
-    table: Table,
-    statements: _Statements,
-    has_base_color: bool,
-    notes: list[str],
-    read_names: set[str],
-) -> dict[str, Any]:
-    """Return the captured colour, unless the file says that its colour only repeats the material."""
-    rest = [name for name in table.names if name.startswith("f_rest_")]
-    present = [name for name in _DC if name in table.names]
+def _lengths(vectors: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors, dtype=np.float64))
+
+
+def _unit(vectors: NDArray[np.float32], lengths: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Divide vectors by their lengths, except where these are 1 to rounding."""
+    divisor = np.where(np.abs(lengths - 1.0) <= _UNIT_ROUNDING, 1.0, lengths)
+    return (vectors / divisor[:, None]).astype(np.float32)
+
+
+def _radiance(reading: _Reading, has_base_color: bool) -> dict[str, Any]:
+    """Return the captured colour, unless the file states that its colour only repeats the material."""
+    statements = reading.statements
+    rest = [name for name in reading.table.names if name.startswith("f_rest_")]
+    present = [name for name in _DC if name in reading.table.names]
     if not present and not rest:
-        notes.append("no f_dc_0 … f_dc_2: read without colour")
+        reading.notes.append("no f_dc_0 … f_dc_2: read without colour")
         return {}
     ordered = tuple(f"f_rest_{index}" for index in range(len(rest)))
     if len(present) != 3 or set(ordered) != set(rest) or len(rest) not in (0, 9, 24, 45, 72):
         raise malformed(
-            header.path,
+            reading.header.path,
             "spherical harmonics must be f_dc_0 … 2 and f_rest_0 … with 0, 9, 24, 45 or 72 of them",
             f"{len(present)} and {len(rest)}",
             "Export it again with full bands.",
         )
-    read_names |= {*_DC, *rest}
+    reading.read_names |= {*_DC, *rest}
     if statements.radiance_meaning == NO_COLOR or (statements.radiance_meaning == BASE_COLOR_ONLY and has_base_color):
         return {}
     if statements.radiance_meaning == BASE_COLOR_ONLY:
-        notes.append("colour is base colour times ambient occlusion, not captured radiance")
-    radiance = np.empty((len(table.rows), 1 + len(rest) // 3, 3), np.float32)
-    radiance[:, 0] = table.columns(_DC)
+        reading.notes.append("colour is base colour times ambient occlusion, not captured radiance")
+    radiance = np.empty((len(reading.table.rows), 1 + len(rest) // 3, 3), np.float32)
+    radiance[:, 0] = reading.columns(_DC)
     if rest:
-        radiance[:, 1:] = table.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
-    sh_degree_of(radiance.shape[1])
+        radiance[:, 1:] = reading.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
     return {"radiance": radiance, "radiance_color_space": statements.radiance_color_space}
 
 
-def _materials(
-    header: PlyHeader,
-    table: Table,
-    options: ReadOptions,
-    statements: _Statements,
-    notes: list[str],
-    read_names: set[str],
-) -> dict[str, Any]:
-    """Return the material channels and normals, as far as the file or the caller says how they are stored."""
-    activation = options.material_activation or ("linear" if statements.material_linear else None)
+def _materials(reading: _Reading) -> dict[str, Any]:
+    """Return the material channels and normals whose storage the file or the caller states."""
+    asked = reading.options.material_activation
+    activation = asked or ("linear" if reading.statements.material_linear else None)
     layout = LAYOUTS[activation or "linear"]
     fields: dict[str, Any] = {}
-    found = material_properties(table.names)
+    found = material_properties(reading.table.names)
     if activation is None and found:
-        producer = material_producer(table.names)
+        producer = material_producer(reading.table.names)
         named = f" of {producer[0]}" if producer else ""
         choice = producer[1] if producer and producer[1] else "linear|r3dg|gsir|irgs"
-        notes.append(
+        reading.notes.append(
             f"materials{named} left out ({', '.join(found)}): pass --material-activation {choice} to read them"
         )
     elif activation is not None:
-        fields = _activated(table, layout, read_names)
-        if options.material_activation is not None and not fields:
+        for channel, (names, activate) in layout.channels.items():
+            if reading.has(names):
+                values = activate(reading.columns(names))
+                fields[channel] = values if len(names) == 3 else values[:, 0]
+        if asked is not None and not fields:
             wanted = ", ".join(name for names, _ in layout.channels.values() for name in names)
             raise malformed(
-                header.path,
+                reading.header.path,
                 f"materials of {activation} must have {wanted}",
                 ", ".join(found) or "no material channels",
                 "Choose another --material-activation, or leave it out.",
             )
-    return fields | _normals(table, layout, notes, read_names)
+    return fields | _normals(reading, layout)
 
 
-def _activated(table: Table, layout: MaterialLayout, read_names: set[str]) -> dict[str, Any]:
-    """Return the channels of a layout that a table holds, linear."""
-    fields: dict[str, Any] = {}
-    for channel, (names, activate) in layout.channels.items():
-        if set(names) <= set(table.names):
-            read_names |= set(names)
-            values = activate(table.columns(names))
-            fields[channel] = values if len(names) == 3 else values[:, 0]
-    return fields
-
-
-def _normals(table: Table, layout: MaterialLayout, notes: list[str], read_names: set[str]) -> dict[str, Any]:
-    """Return unit normals, or nothing where the file holds the usual zeros."""
-    if not set(layout.normals) <= set(table.names):
+def _normals(reading: _Reading, layout: MaterialLayout) -> dict[str, Any]:
+    """Return unit normals, or nothing if the file has the usual zeros."""
+    if not reading.has(layout.normals):
         return {}
-    read_names |= set(layout.normals)
-    normals = table.columns(layout.normals)
-    length = np.sqrt(np.einsum("ij,ij->i", normals, normals, dtype=np.float64))
+    normals = reading.columns(layout.normals)
+    length = _lengths(normals)
     usable = (length > 1e-6) & np.isfinite(length)
     if not usable.any():
         return {}
     if not usable.all():
-        notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
+        reading.notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
         return {}
-    divisor = np.where(np.abs(length - 1.0) <= _UNIT_ROUNDING, 1.0, length)
-    return {"normals": (normals / divisor[:, None]).astype(np.float32)}
+    return {"normals": _unit(normals, length)}

@@ -1,4 +1,4 @@
-"""What a PLY of Gaussians must hold, checked on the raw values where names and rows are still the file's own."""
+"""Checks of a PLY of Gaussians on its raw values, so that errors name the file's own properties and rows."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.checks import rows_at
 from beam_warp.converters.activations import LOG_SCALE_LIMITS
 from beam_warp.converters.ply_container import Element, malformed
 
 _WORDS = {"u1": "uchar", "u4": "uint", "f4": "float", "f8": "double"}
 
 
-def rows_at(bad: NDArray[np.bool_]) -> str:
-    """Say which rows of a mask are set: ``row 12 (3 rows in all)``."""
-    rows = np.flatnonzero(bad)
-    return f"row {rows[0]}" + (f" ({len(rows)} rows in all)" if len(rows) > 1 else "")
-
-
 def require_types(path: Path, element: Element, names: tuple[str, ...], codes: tuple[str, ...]) -> None:
-    """Refuse properties that are absent or of another type."""
+    """Refuse an element that lacks properties or has them in another type."""
     missing = [name for name in names if name not in element.names]
     if missing:
         raise malformed(
@@ -51,10 +46,10 @@ def require_log_scales(path: Path, log_scales: NDArray[np.floating]) -> None:
 
 
 def require_not_linear(path: Path, log_scales: NDArray[np.floating], logits: NDArray[np.floating]) -> None:
-    """Refuse a file whose every scale is above 0 and every opacity in [0, 1]: it was activated already.
+    """Refuse a file in which all scales are above 0 and all opacities in [0, 1], since they seem to be linear.
 
-    As logs and logits the same numbers would mean that every Gaussian is over a unit wide and none more than 73 %
-    opaque, which no training leaves.
+    As logs and logits, these numbers would mean that every Gaussian is wider than a unit and none is more than 73 %
+    opaque, which no training produces.
     """
     if len(logits) and log_scales.min() > 0.0 and logits.min() >= 0.0 and logits.max() <= 1.0:
         raise malformed(

@@ -1,4 +1,4 @@
-"""What bytes a PLY file holds: header and tables, every size checked against the file before memory is asked for.
+"""Header and tables of a PLY file; every size is checked against the file before memory is allocated.
 
 Source: Turk 1994, "The PLY Polygon File Format". CRLF headers, comments and ``obj_info`` are accepted; lists are
 accepted in elements that are not read.
@@ -40,19 +40,18 @@ SCALAR_TYPES = {
     }.items()
     for word in words
 }
-"""Type words, old and new, by NumPy code."""
+"""NumPy code of each type word, old or new."""
 
 RASTER_WORDS = {False: "classic", True: "antialiased"}
-"""First word of the comment ``beam_raster``: whether splats are drawn antialiased."""
-
+"""First word of the comment ``beam_raster``, by whether splats are drawn antialiased."""
 
 _CONTROL_CHARACTERS = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n\r"}
-"""What a header must not smuggle into the terminal that its names and comments are shown on."""
+"""Characters of a header that are replaced, since its names and comments are shown on a terminal."""
 
 
 @dataclass(frozen=True)
 class Property:
-    """One column: its name, its type word, its NumPy code (empty for a list)."""
+    """One column with its name, type word and NumPy code, which is empty for a list."""
 
     name: str
     word: str
@@ -61,7 +60,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """One table: its name, row count and columns."""
+    """Description of one table: its name, row count and columns."""
 
     name: str
     count: int
@@ -82,7 +81,7 @@ class Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a header says, checked against the size of its file."""
+    """Contents of a header, checked against the size of its file."""
 
     path: Path
     encoding: str
@@ -97,14 +96,14 @@ class PlyHeader:
 
     @property
     def statements(self) -> dict[str, str]:
-        """Comments of the form ``beam_<key> <value>``: what our own writer says of a file."""
+        """Comments of the form ``beam_<key> <value>``, by which our own writer describes a file."""
         pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
         return {key: value.strip() for key, _, value in pairs}
 
 
 @dataclass(frozen=True)
-class Table:
-    """The rows of one element: a matrix where all columns share a type, else a structured array."""
+class PlyTable:
+    """Rows of one element: a matrix if all columns have the same type, else a structured array."""
 
     names: tuple[str, ...]
     rows: NDArray[Any]
@@ -126,7 +125,7 @@ def malformed(path: Path, contract: str, got: str, remedy: str) -> AssetFormatEr
 
 
 def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:
-    """Return the header's lines and where the data start."""
+    """Return the header's lines and the offset of the data."""
     if not start:
         raise malformed(
             path, "a PLY file must start with the line ply", "an empty file", "Export or download it again."
@@ -160,7 +159,7 @@ def _property(path: Path, line: str, words: list[str]) -> Property:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read and check a header; nothing of the data is read.
+    """Read and check a header without reading data.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be opened.
@@ -227,14 +226,14 @@ def _check_limits(header: PlyHeader) -> None:
 
 
 def _least_row_bytes(header: PlyHeader, element: Element) -> int | None:
-    """Return the fewest bytes a row can take, or None if nothing can be said."""
+    """Return the least size of a row [byte], or None if it is unknown."""
     if header.encoding == "ascii":
         return max(1, 2 * len(element.properties))  # a digit and a separator each; at least a line end
     return element.stride
 
 
 def _check_sizes(header: PlyHeader) -> None:
-    """Refuse counts that the bytes of the file cannot hold, before anything of that size is allocated."""
+    """Refuse counts that are too large for the size of the file, before memory is allocated for them."""
     left = header.file_size - header.data_start + (header.encoding == "ascii")  # the last line may lack its end
     for element in header.elements:
         row_bytes = _least_row_bytes(header, element)
@@ -251,11 +250,11 @@ def _check_sizes(header: PlyHeader) -> None:
             )
 
 
-def read_table(header: PlyHeader, name: str) -> Table:
+def read_table(header: PlyHeader, name: str) -> PlyTable:
     """Read the rows of one element.
 
     Raises:
-        AssetFormatError: It is absent, has list properties, follows lists whose length is unknown, or is cut short.
+        AssetFormatError: The element is absent, has list properties, follows lists of unknown length, or is cut short.
     """
     element = header.element(name)
     if element is None:
@@ -271,11 +270,11 @@ def read_table(header: PlyHeader, name: str) -> Table:
                 "Export Gaussians, not a mesh.",
             )
     if not element.properties or not element.count:
-        return Table(element.names, np.empty((element.count if element.properties else 0, len(element.names)), "f4"))
+        return PlyTable(element.names, np.empty((element.count if element.properties else 0, len(element.names)), "f4"))
     if header.encoding == "ascii":
-        return Table(element.names, _ascii_rows(header, element, sum(other.count for other in before)))
+        return PlyTable(element.names, _ascii_rows(header, element, sum(other.count for other in before)))
     offset = header.data_start + sum(other.count * (other.stride or 0) for other in before)
-    return Table(element.names, _binary_rows(header, element, offset))
+    return PlyTable(element.names, _binary_rows(header, element, offset))
 
 
 def _binary_rows(header: PlyHeader, element: Element, offset: int) -> NDArray[Any]:

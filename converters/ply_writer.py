@@ -1,6 +1,6 @@
-"""PLY files of Gaussians, written so that every importer we know of reads them.
+"""Writer of PLY files of Gaussians, in a form that every importer known to us reads.
 
-The rules behind the layout, each from an importer that breaks otherwise: only the type word ``float``; the standard
+Each rule of the layout is there because an importer fails without it: only the type word ``float``; the standard
 properties first and in order, extras strictly after ``rot_3``; only ``comment`` lines and one element in the header;
 finite values; LF line ends; less than 2 GB per file.
 """
@@ -28,10 +28,10 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import stated_raster
 
 MAX_FILE_BYTES = 2**31 - 1
-"""Importers index with signed 32-bit integers."""
+"""Largest file [byte]: importers index with signed 32-bit integers."""
 
 _BLOCK_ROWS = 1 << 14
-"""Rows converted at a time: a block of 62 floats stays within a core's cache."""
+"""Rows converted at a time; a block of 62 floats a row fits into a core's cache."""
 
 _MATERIALS = ("base_color", "roughness", "ambient_occlusion")
 
@@ -45,8 +45,8 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     """Write one file, or one for each frame numbered from the given name.
 
     Raises:
-        InvalidOptionError: The beam profile is asked for and there are no materials, or the metadata state how the
-            Gaussians are to be drawn in other words than those of `beam_warp.world.metadata`.
+        InvalidOptionError: The beam profile is requested without materials, or the metadata that state how the
+            Gaussians are to be drawn break the contract of `beam_warp.world.metadata`.
         OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
     """
     paths = output_paths(sequence, path)
@@ -133,7 +133,7 @@ def _property_names(coefficient_count: int, extras: list[str]) -> list[str]:
 def _row_source(
     cloud: GaussianCloud, radiance: NDArray[np.float32], extras: list[str], width: int
 ) -> Callable[[slice], NDArray[np.float32]]:
-    """Return a function that makes the file's rows of a slice of the cloud."""
+    """Return a function that converts a slice of the cloud to rows of the file."""
     rest = 3 * (radiance.shape[1] - 1)
     tail = 9 + rest
 

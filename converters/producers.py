@@ -1,7 +1,7 @@
-"""Who wrote a PLY, and how that producer names and stores materials.
+"""Producers of PLY files: how to recognise them, and how they name and store materials.
 
 Names and activations were read in the producers' own exporters: Relightable 3D Gaussian (Gao et al. 2024), GS-IR
-(Liang et al. 2024), IRGS (Gu et al. 2025) and mesh2splat. No two agree, so none is read on a guess.
+(Liang et al. 2024), IRGS (Gu et al. 2025) and mesh2splat. No two agree, so materials are never read on a guess.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class MaterialLayout:
     """Property names of one producer's materials and their activations.
 
     Attributes:
-        channels: Attribute of a cloud → the property names that hold it and the map from stored to linear.
+        channels: For each attribute of a cloud, the names of its properties and the map from stored to linear values.
         normals: Property names of the normals.
     """
 
@@ -65,7 +65,7 @@ _SIGNATURES: tuple[tuple[frozenset[str], str, MaterialActivation | None], ...] =
     (frozenset({"base_color_0", "metallic"}), "IRGS", "irgs"),
     (frozenset({"metallicFactor", "roughnessFactor"}), "mesh2splat", None),
 )
-"""Properties that only one producer writes together, its name, and how to read its materials."""
+"""Properties that only one producer writes together, with its name and the activation of its materials."""
 
 _MATERIAL_STEMS = (
     "base_color",
@@ -85,7 +85,7 @@ def material_properties(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def material_producer(names: tuple[str, ...]) -> tuple[str, MaterialActivation | None] | None:
-    """Return whose material names these are and how to read them, or None if nobody's known."""
+    """Return the producer that uses these names for materials and its activation, or None if it is unknown."""
     for signature, producer, activation in _SIGNATURES:
         if signature <= set(names):
             return producer, activation
@@ -93,7 +93,7 @@ def material_producer(names: tuple[str, ...]) -> tuple[str, MaterialActivation |
 
 
 def guess_producer(header: PlyHeader) -> str:
-    """Say who wrote a PLY, as far as its comments and property names tell."""
+    """Return the producer of a PLY, as far as comments and property names tell, with the evidence."""
     vertex = header.element("vertex")
     names = vertex.names if vertex else ()
     if "beam_schema" in header.statements:

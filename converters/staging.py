@@ -1,4 +1,4 @@
-"""Outputs that appear whole or not at all: written beside their place under a temporary name, then renamed."""
+"""Outputs that appear complete or not at all: written under a temporary name beside their place, then renamed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beam_warp.errors import BeamError, OutputError
 
 
 def require_writable(path: Path) -> None:
-    """Refuse an output whose folder is missing or closed to us, before any work is done.
+    """Refuse an output whose folder does not exist or cannot be written, before any work is done.
 
     Raises:
         OutputError: The folder does not exist or cannot be written, or the path is a folder itself.
@@ -33,17 +33,17 @@ class Staging:
         self.names: dict[Path, Path] = {}
 
     def path_for(self, final: Path) -> Path:
-        """Return where to write an output for now."""
+        """Return the temporary path of an output."""
         self.names[final] = final.with_name(f".{final.name}.{os.getpid()}.part")
         return self.names[final]
 
 
 @contextmanager
 def staged_outputs() -> Iterator[Staging]:
-    """Hold outputs back until the block has ended well; then put them all in place.
+    """Put all outputs in place once the block has ended without an error.
 
     Raises:
-        OutputError: The file system refused; every temporary file has been removed.
+        OutputError: The file system reported an error; all temporary files have been removed.
     """
     staging = Staging()
     try:

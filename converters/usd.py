@@ -1,4 +1,4 @@
-"""USD files: a thin row of the table; the schema room knows the rest."""
+"""USD as a format of `beam_warp.converters`, by the reader and writer of `beam_warp.schema`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
     """Read an asset; a stage states its own axes, units and activations.
 
     Raises:
-        InvalidOptionError: An option says what the stage says itself.
+        InvalidOptionError: An option is given, although the stage states its value itself.
     """
     given = [field.name for field in dataclasses.fields(options) if getattr(options, field.name)]
     if given:
@@ -32,7 +32,7 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     """Write an asset, y up and in metres.
 
     Raises:
-        InvalidOptionError: Another target's axes are asked for.
+        InvalidOptionError: The axes of another target are requested.
     """
     if options.target not in (None, "usd"):
         raise InvalidOptionError(

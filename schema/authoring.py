@@ -1,7 +1,7 @@
-"""What a layer says: the stage's metadata, the two prims, their tokens, and the arrays of a frame.
+"""Authoring of layers: the stage's metadata, the two prims, their tokens, and the arrays of a frame.
 
-Everything is authored through Sdf with its type spelled out, so the result does not depend on whether OpenUSD knows
-our schema, and each layer is complete for a host that does not.
+Everything is authored through Sdf with explicit types. The result does not depend on whether OpenUSD knows our schema,
+and each layer is complete for a host that does not know it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from beam_warp.schema.layout import (
     SH_DEGREE,
     SPLAT_TYPE,
     SPLATS_PATH,
+    UP_AXES,
     to_vt,
 )
-from beam_warp.schema.survey import UP_AXES, Survey, display_color, stored_arrays
+from beam_warp.schema.survey import Survey, display_color, stored_arrays
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import stated_capture_frames, stated_raster
+from beam_warp.world.quaternions import matrix_of
 
 KERNEL_EXTENT = 3.0
 """OpenUSD's Gaussian kernel ends at three standard deviations."""
@@ -42,12 +44,12 @@ RADIANCE_MEANINGS = ("captured", "shaded")
 
 @dataclass(frozen=True)
 class AssetContents:
-    """A sequence and everything that was decided about it before the first layer is written.
+    """A sequence and all decisions about its file, made before the first layer is written.
 
     Attributes:
         sequence: Source of the frames.
-        survey: What the sequence holds.
-        half: Names of the arrays that are written in half precision.
+        survey: Properties of the sequence.
+        half: Names of the arrays to write in half precision.
         segment_length: Frames in one value clip; 0 if the asset has none.
     """
 
@@ -57,7 +59,9 @@ class AssetContents:
     segment_length: int = 0
 
     def attribute(self, name: str) -> tuple[str, str]:
-        """Name and USD type of the variant that holds an array."""
+        """Return name and USD type of the attribute that holds an array, or the extent."""
+        if name == "extent":
+            return "extent", "float3[]"
         channel = CHANNELS[name]
         if name in self.half and channel.half_type_name is not None:
             return channel.usd_name + "h", channel.half_type_name
@@ -65,13 +69,13 @@ class AssetContents:
 
     @property
     def varying(self) -> frozenset[str]:
-        """Names of the arrays that have time samples, the extent included."""
+        """Names of the arrays that have time samples, including the extent."""
         moves = not self.survey.varying.isdisjoint({"positions", "orientations", "scales"})
         return self.survey.varying | ({"extent"} if moves else set())
 
     @property
     def byte_count(self) -> int:
-        """Bytes of all arrays, without the small rest of the layers."""
+        """Size of all arrays [byte]; the rest of the layers is small."""
         total = 0
         for name in self.survey.names:
             rows = sum(self.survey.counts) if name in self.survey.varying else self.survey.counts[0]
@@ -81,10 +85,10 @@ class AssetContents:
         return total
 
     def frames(self) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
-        """Read every frame in order, as it is stored.
+        """Yield every frame's number and arrays in order, as they are stored.
 
-        Where rows keep their identity, a quaternion takes the sign that is nearer to its predecessor: engines that
-        blend components would otherwise spin the Gaussian.
+        With constant topology, a quaternion takes the sign that is nearer to its predecessor: engines that blend
+        components would otherwise spin the Gaussian.
         """
         keep_signs = self.sequence.topology == "constant" and "orientations" in self.survey.varying
         previous: NDArray[Any] | None = None
@@ -113,7 +117,7 @@ class AssetContents:
 
 
 def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:
-    """Say how the stage is scaled, turned and timed; every layer says the same, or USD would retime references."""
+    """Author unit, up axis and time codes, the same in every layer, since USD would retime references otherwise."""
     rate = float(contents.sequence.frames_per_second)
     layer.defaultPrim = ASSET_PATH.strip("/")
     layer.timeCodesPerSecond = rate
@@ -126,7 +130,7 @@ def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:
 
 
 def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
-    """Define /Asset: how the sequence plays and where it came from."""
+    """Define /Asset with playback and provenance."""
     sequence, metadata = contents.sequence, contents.sequence.metadata
     prim = _define(layer, ASSET_PATH, "Xform", SEQUENCE_API)
     prim.SetInfo("kind", "component")
@@ -149,9 +153,9 @@ def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
 
 
 def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
-    """Define /Asset/Splats: tokens, hints, constant arrays, and the declarations of what varies.
+    """Define /Asset/Splats with tokens, hints, constant arrays, and declarations of the arrays that vary.
 
-    Varying attributes are declared without a value, so that a host that does not know our schema still types them.
+    Varying attributes are declared without a value, so that a host that does not know our schema sees their types.
     """
     survey, metadata = contents.survey, contents.sequence.metadata
     prim = _define(layer, SPLATS_PATH, SPLAT_TYPE, MATERIAL_API, "ColorSpaceAPI")
@@ -184,30 +188,30 @@ def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     arrays = contents.stored(first)
     for name in (*survey.names, "extent"):
         if name not in contents.varying:
-            usd_name, type_name = _attribute(contents, name)
+            usd_name, type_name = contents.attribute(name)
             prim.attributes[usd_name].default = to_vt(type_name, arrays[name])
 
 
 def author_declarations(prim: Sdf.PrimSpec, contents: AssetContents, names: tuple[str, ...]) -> None:
     """Declare array attributes with their types and colour spaces, without values."""
     for name in names:
-        usd_name, type_name = _attribute(contents, name)
+        usd_name, type_name = contents.attribute(name)
         spec = Sdf.AttributeSpec(prim, usd_name, Sdf.ValueTypeNames.Find(type_name))
         if type_name in _BASE_COLOR_SPACE:
             spec.colorSpace = _BASE_COLOR_SPACE[type_name]
 
 
 def author_frame(layer: Sdf.Layer, contents: AssetContents, frame: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Add one frame's time samples of what varies."""
+    """Add one frame's time samples of the arrays that vary."""
     for name in sorted(contents.varying):
-        usd_name, type_name = _attribute(contents, name)
+        usd_name, type_name = contents.attribute(name)
         layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), to_vt(type_name, arrays[name]))
 
 
 def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, str]], last_frame: int) -> None:
-    """Say which binary layer holds which frames.
+    """Author value clips, which state which binary layer holds which frames.
 
-    Clips are explicit and their times the identity over the whole range: template clips with a stride freeze after
+    Clips are explicit and their times are the identity over the whole range: template clips with a stride freeze after
     the start of the last segment.
     """
     clips = {
@@ -218,10 +222,6 @@ def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, st
         "times": Vt.Vec2dArray([(0.0, 0.0), (float(last_frame), float(last_frame))]),
     }
     prim.SetInfo("clips", {"default": clips})
-
-
-def _attribute(contents: AssetContents, name: str) -> tuple[str, str]:
-    return ("extent", "float3[]") if name == "extent" else contents.attribute(name)
 
 
 def _define(layer: Sdf.Layer, path: str, type_name: str, *schemas: str) -> Sdf.PrimSpec:
@@ -238,31 +238,25 @@ def _uniform(prim: Sdf.PrimSpec, name: str, type_name: str, value: Any) -> None:
 
 
 def _choice(metadata: Mapping[str, str], key: str, choices: tuple[str, ...]) -> str:
-    """Take a token from the metadata; what is absent or another word is the first choice (the word itself is kept in
-    the metadata)."""
+    """Return a token of the metadata, or the first choice if it is absent or unknown; the metadata keep it as it is."""
     value = metadata.get(key, choices[0])
     return value if value in choices else choices[0]
 
 
 def _nearly_unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Renormalise the rows that are further from unit length than rounding to half explains.
+    """Normalise the rows whose length differs from 1 by more than rounding to half explains.
 
-    Rows that came from half stay as they are: writing what was read changes no bit.
+    Rows that were read from half stay as they are, so that writing them again changes no bit.
     """
     length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
     return np.where(np.abs(length - 1.0) > HALF_EPSILON, vectors / length, vectors).astype(np.float32)
 
 
 def _extent(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
+    """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
     if not len(cloud):
         return np.zeros((2, 3), np.float32)
-    x, y, z, w = cloud.orientations.astype(np.float64).T
-    rotation = np.empty((len(cloud), 3, 3))
-    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
-    rotation[:, 1] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1)
-    rotation[:, 2] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
-    reach = KERNEL_EXTENT * np.linalg.norm(rotation * cloud.scales[:, None, :], axis=2)
+    reach = KERNEL_EXTENT * np.linalg.norm(matrix_of(cloud.orientations) * cloud.scales[:, None, :], axis=2)
     low, high = (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
     return np.stack(
         [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]

@@ -1,8 +1,8 @@
 """Cameras of USD stages, over time, in the internal world.
 
-USD cameras look along -z with y up, and see through an aperture in tenths of the stage's unit, as their focal length
-is: only ratios matter. Where an image has another shape than the aperture, nothing of the aperture is cut off: the
-image sees more above and below, or at its sides (USD's aspect-ratio policy ``expandAperture``).
+USD cameras look along -z with y up. Aperture and focal length are in tenths of the stage's unit; only their ratio
+matters. If the image's shape differs from that of the aperture, the image shows all of the aperture and more above and
+below it, or at its sides (USD's aspect-ratio policy ``expandAperture``).
 """
 
 from __future__ import annotations
@@ -13,21 +13,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Tf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidOptionError
-from beam_warp.schema import register
 from beam_warp.schema.dependencies import layer_files
-from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.placement import placement_of
-from beam_warp.schema.stage_queries import stage_axes, stage_meters
+from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters, transform_times
 from beam_warp.world.axes import axes_matrix
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import WORLD_AXES
 
 MAX_SAMPLES = 1_000_000
-"""Most times at which a camera is looked at before it is used."""
+"""Most time samples of a camera; each of them is checked."""
 
 _LENS = ("focalLength", "horizontalAperture", "verticalAperture")
 _OFFSETS = ("horizontalApertureOffset", "verticalApertureOffset")
@@ -40,9 +38,9 @@ class UsdCamera:
     """A camera of a USD stage; time 0 is the stage's start, or the camera's first sample if the stage states none.
 
     Attributes:
-        files: The stage's layers, its own first.
-        prim_path: The camera's prim.
-        notes: What had to be assumed.
+        files: Files of the stage's layers, its own first.
+        prim_path: Path of the camera's prim.
+        notes: Assumptions, a sentence each.
     """
 
     files: tuple[Path, ...]
@@ -50,11 +48,11 @@ class UsdCamera:
     notes: tuple[str, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
-        """Open the stage, and look at the camera wherever it has a sample.
+        """Open the stage and check the camera at each of its samples.
 
         Raises:
-            AssetFormatError: It is no perspective camera, its lens is out of range, or its pose not rigid; names the
-                time.
+            AssetFormatError: The camera is not perspective, its lens is out of range, or its pose is not rigid; the
+                message names the time.
         """
         stage = Usd.Stage.Open(str(self.files[0]), Usd.Stage.LoadAll)
         prim = stage.GetPrimAtPath(self.prim_path)
@@ -83,7 +81,7 @@ class UsdCamera:
 
     @property
     def duration(self) -> float | None:
-        """When its last sample is [s]."""
+        """Time of the last sample [s]; None if it is not after time 0."""
         last = (self._last - self._start) / self._rate
         return last if last > 0.0 else None
 
@@ -96,7 +94,7 @@ class UsdCamera:
     def camera_at(self, time: float, width: int, height: int) -> Camera:
         """Return the camera at a time [s], for images of a size [pixel].
 
-        Between samples, USD's values are taken; a matrix that it mixed of two is brought to the nearest rotation.
+        Between samples, USD interpolates; an interpolated matrix is replaced by the nearest rotation.
 
         Raises:
             InvalidOptionError: The time is not finite, or a size is out of range.
@@ -126,7 +124,7 @@ class UsdCamera:
         return np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(self._prim))
 
     def _placement(self, code: float) -> None:
-        """Refuse a pose that is not rigid but for a scale."""
+        """Refuse a pose that is not rigid, apart from a uniform scale."""
         where = f"{self._where} at time {code:g}"
         matrix = self._matrix(code)
         if not np.isfinite(matrix).all():
@@ -135,7 +133,7 @@ class UsdCamera:
             raise AssetFormatError(f"{where} must not be mirrored, got a negative scale. Take it out.")
 
     def _between(self, code: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the rotation, right down forward, and the position in the world [m]."""
+        """Return the rotation, with columns right, down and forward, and the position in the world [m]."""
         matrix = self._matrix(code)
         left, _, right = np.linalg.svd(matrix[:3, :3].T)
         return self._axes @ left @ right @ _TO_OPENCV, self._axes @ matrix[3, :3] * self._meters
@@ -160,23 +158,16 @@ def read_usd_camera(path: Path, *, prim_path: str | None = None, trusted: bool =
 
     Args:
         path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file; its up axis and unit are honoured.
-        prim_path: Which camera, where there are several.
-        trusted: True skips the child process that opens the file first: a corrupt file may then end this process.
+        prim_path: Path of the camera, if there are several.
+        trusted: True skips the child process that opens the file first; a corrupt file may then end this process.
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is broken, has no camera or several, or the camera is none that we can be.
+        AssetFormatError: The file is broken, has no camera or several, or the camera is not a pinhole.
     """
-    source = require_asset_file(path)
-    if not trusted:
-        require_opens(source)
-    register()
-    try:
-        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
-        every: Any = Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
-        paths = [str(prim.GetPath()) for prim in every if prim.IsA(UsdGeom.Camera)]
-    except Tf.ErrorException as error:
-        raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
+    source, stage = open_asset(path, trusted=trusted)
+    every: Any = Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
+    paths = [str(prim.GetPath()) for prim in every if prim.IsA(UsdGeom.Camera)]
     if not paths:
         raise AssetFormatError(f"{source} must hold a camera, got none. Export one with the stage.")
     if prim_path is None and len(paths) > 1:
@@ -193,8 +184,4 @@ def _sample_times(prim: Usd.Prim) -> list[float]:
     times: set[float] = set()
     for name in (*_LENS, *_OFFSETS):
         times.update(prim.GetAttribute(name).GetTimeSamples())
-    while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdGeom.Xformable):
-            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
-        prim = prim.GetParent()
-    return sorted(times)
+    return sorted(times | transform_times(prim))

@@ -1,4 +1,4 @@
-"""Which files a USD stage is made of."""
+"""Files that a USD stage consists of."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from beam_warp.errors import AssetFormatError
 
 
 def layer_files(path: Path) -> list[Path]:
-    """Return the files of all layers that a stage reads, value clips included, the stage's own first.
+    """Return the files of all layers of a stage, including value clips, with the stage's own file first.
 
     Raises:
-        AssetFormatError: OpenUSD cannot open it, or a layer is missing.
+        AssetFormatError: OpenUSD cannot open the stage, or a layer is missing.
     """
     try:
         layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))

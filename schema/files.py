@@ -1,7 +1,7 @@
-"""Is a file what its name says? Checks bytes before OpenUSD sees them, and opens doubtful files in a child first.
+"""Checks of a file before OpenUSD opens it: its bytes, and a trial in a child process.
 
-OpenUSD can end the whole process on a corrupt binary layer, so nothing that this package did not just write is opened
-here before a child process has opened it and read from it.
+OpenUSD can end the whole process on a corrupt binary layer. So a file that this package has not just written is opened
+here only after a child process has opened it and read from it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beam_warp.errors import AssetFormatError, MissingFileError
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 PROBE_SECONDS = 60.0
-"""How long a child may take to open an asset before it counts as unreadable."""
+"""Time limit for a child process that opens an asset [s]."""
 
 MAX_PACKAGE_ENTRIES = 4096
 ZIP_ALIGNMENT = 64
@@ -31,7 +31,7 @@ _MAX_CRATE_SECTIONS = 64
 
 
 def require_asset_file(path: str | Path) -> Path:
-    """Return the absolute path of a USD file after looking at its header, table of contents or zip directory.
+    """Return the absolute path of a USD file after checking its header, table of contents or zip directory.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be read.
@@ -58,7 +58,7 @@ def require_asset_file(path: str | Path) -> Path:
 
 
 def require_whole_crate(path: Path) -> None:
-    """Refuse a binary layer whose table of contents or sections lie outside the file: it is cut short."""
+    """Refuse a binary layer whose table of contents or sections reach beyond the end of the file."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(_CRATE_BOOTSTRAP.size)
@@ -78,7 +78,7 @@ def require_whole_crate(path: Path) -> None:
 
 
 def require_opens(path: Path) -> None:
-    """Open an asset in a child process, read from every layer, and refuse what fails or crashes there.
+    """Open an asset in a child process, read from every layer there, and refuse the asset if this fails.
 
     Raises:
         AssetFormatError: The child found a fault, crashed, or took longer than `PROBE_SECONDS`.
@@ -113,7 +113,7 @@ def run_child(module: str, path: Path, seconds: float) -> dict[str, object]:
 
 
 def _require_whole_package(path: Path) -> None:
-    """Refuse a package that is cut short, compressed, misaligned or that names files outside itself."""
+    """Refuse a package that is cut short, compressed or misaligned, or that names files outside itself."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()

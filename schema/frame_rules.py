@@ -1,12 +1,13 @@
 """Rules about the arrays of one frame: lengths, finiteness, ranges, unit lengths, and what may change between frames.
 
-A value that is not finite breaks one rule only: the others look past it.
+A value that is not finite breaks one rule only: the other rules ignore it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,17 +23,17 @@ FRAME_RULES: list[Rule] = []
 
 
 @dataclass(frozen=True)
-class Frame:
-    """Arrays of a prim at one time, as stored.
+class FrameArrays:
+    """Arrays of a prim in one frame, as stored.
 
     Attributes:
-        arrays: By the names of `beam_warp.schema.layout.CHANNELS`; what has no value is left out.
-        changed: Names of those that can differ from the previous frame; in the first frame all.
-        attributes: The name of the authored variant of each array.
-        extent: ``(2, 3)``, or None.
-        sh_degree: As authored, or None.
-        constant_topology: True if the asset says that rows keep their identity.
-        previous: Arrays of the frame before, or None.
+        arrays: Arrays by their names in `beam_warp.schema.layout.CHANNELS`, without those that have no value.
+        changed: Names of the arrays that can differ from the previous frame; in the first frame, all.
+        attributes: Name of the authored variant of each array.
+        extent: Box ``(2, 3)``, or None.
+        sh_degree: Degree as authored, or None.
+        constant_topology: True if the asset states that rows keep their identity.
+        previous: Arrays of the previous frame, or None.
     """
 
     arrays: Mapping[str, NDArray[Any]]
@@ -49,15 +50,15 @@ class Frame:
         return len(self.arrays.get("positions", ()))
 
     def to_check(self, *names: str) -> Iterator[tuple[str, NDArray[Any]]]:
-        """Yield the attribute name and the array of those names that are there and may have changed."""
+        """Yield attribute name and array of each named channel that exists and may have changed; by default of all."""
         for name in names or tuple(self.arrays):
             if name in self.changed and name in self.arrays:
                 yield self.attributes[name], self.arrays[name]
 
 
 @entering(FRAME_RULES, "BEAM-GEO-010", "error")
-def _lengths(frame: Frame) -> Iterator[Fault]:
-    """Every array has one element for each position: USD ignores shorter ones."""
+def _lengths(frame: FrameArrays) -> Iterator[Fault]:
+    """Every array has one element for each position; USD ignores shorter arrays."""
     for name, array in frame.arrays.items():
         if name != "radiance" and len(array) != frame.count:
             yield Fault(
@@ -66,7 +67,7 @@ def _lengths(frame: Frame) -> Iterator[Fault]:
 
 
 @entering(FRAME_RULES, "BEAM-GEO-011", "error")
-def _finite(frame: Frame) -> Iterator[Fault]:
+def _finite(frame: FrameArrays) -> Iterator[Fault]:
     """No array holds NaN or infinity."""
     for name, array in frame.to_check():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -74,26 +75,8 @@ def _finite(frame: Frame) -> Iterator[Fault]:
             yield Fault(f"values must be finite, got NaN or infinity at element {row}. Drop that Gaussian.", name)
 
 
-@entering(FRAME_RULES, "BEAM-GEO-012", "error")
-def _unit_quaternions(frame: Frame) -> Iterator[Fault]:
-    """Orientations are unit quaternions."""
-    return _unit(frame, "orientations")
-
-
-@entering(FRAME_RULES, "BEAM-GEO-013", "error")
-def _scales(frame: Frame) -> Iterator[Fault]:
-    """Scales are linear and not negative (logarithms would be)."""
-    return _range(frame, 0.0, np.inf, "scales")
-
-
-@entering(FRAME_RULES, "BEAM-GEO-014", "error")
-def _opacities(frame: Frame) -> Iterator[Fault]:
-    """Opacities are linear, in [0, 1] (logits are not)."""
-    return _range(frame, 0.0, 1.0, "opacities")
-
-
 @entering(FRAME_RULES, "BEAM-GEO-015", "error")
-def _extent(frame: Frame) -> Iterator[Fault]:
+def _extent(frame: FrameArrays) -> Iterator[Fault]:
     """extent is a box that contains every position."""
     if frame.extent is None or not frame.count:
         return
@@ -105,14 +88,14 @@ def _extent(frame: Frame) -> Iterator[Fault]:
 
 
 @entering(FRAME_RULES, "BEAM-GEO-016", "warning")
-def _not_empty(frame: Frame) -> Iterator[Fault]:
+def _not_empty(frame: FrameArrays) -> Iterator[Fault]:
     """A frame holds at least one Gaussian."""
     if not frame.count:
         yield Fault("a frame should hold Gaussians, got none. Leave the frame out, or hide the prim.", "positions")
 
 
 @entering(FRAME_RULES, "BEAM-SH-002", "error")
-def _sh_size(frame: Frame) -> Iterator[Fault]:
+def _sh_size(frame: FrameArrays) -> Iterator[Fault]:
     """There are (degree + 1)^2 spherical-harmonics coefficients for each Gaussian."""
     if "radiance" in frame.arrays and frame.sh_degree is not None:
         wanted, got = frame.count * (frame.sh_degree + 1) ** 2, len(frame.arrays["radiance"])
@@ -122,51 +105,9 @@ def _sh_size(frame: Frame) -> Iterator[Fault]:
             )
 
 
-@entering(FRAME_RULES, "BEAM-MAT-010", "error")
-def _base_color(frame: Frame) -> Iterator[Fault]:
-    """Base colour is in [0, 1]."""
-    return _range(frame, 0.0, 1.0, "base_color")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-011", "error")
-def _roughness(frame: Frame) -> Iterator[Fault]:
-    """Roughness is in [0, 1]."""
-    return _range(frame, 0.0, 1.0, "roughness")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-012", "error")
-def _ambient_occlusion(frame: Frame) -> Iterator[Fault]:
-    """Ambient occlusion is a visibility in [0, 1]."""
-    return _range(frame, 0.0, 1.0, "ambient_occlusion")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-013", "error")
-def _metallic(frame: Frame) -> Iterator[Fault]:
-    """Metallic is in [0, 1]."""
-    return _range(frame, 0.0, 1.0, "metallic")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-014", "error")
-def _unit_normals(frame: Frame) -> Iterator[Fault]:
-    """Normals are unit vectors."""
-    return _unit(frame, "normals")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-015", "error")
-def _confidence(frame: Frame) -> Iterator[Fault]:
-    """Normal confidence is in [0, 1]."""
-    return _range(frame, 0.0, 1.0, "normal_confidence")
-
-
-@entering(FRAME_RULES, "BEAM-MAT-016", "error")
-def _standard_errors(frame: Frame) -> Iterator[Fault]:
-    """Standard errors are not negative."""
-    return _range(frame, 0.0, np.inf, "ambient_occlusion_error", "base_color_error", "roughness_error")
-
-
 @entering(FRAME_RULES, "BEAM-MAT-017", "warning")
-def _observability(frame: Frame) -> Iterator[Fault]:
-    """Observability has no flags that the schema does not define."""
+def _observability(frame: FrameArrays) -> Iterator[Fault]:
+    """Observability has only flags that the schema defines."""
     for name, array in frame.to_check("observability"):
         unknown = array & (255 - KNOWN_FLAGS)
         if unknown.any():
@@ -177,15 +118,15 @@ def _observability(frame: Frame) -> Iterator[Fault]:
 
 
 @entering(FRAME_RULES, "BEAM-SEQ-005", "error")
-def _constant_count(frame: Frame) -> Iterator[Fault]:
-    """Where the topology is constant, so is the number of Gaussians."""
+def _constant_count(frame: FrameArrays) -> Iterator[Fault]:
+    """With constant topology, the number of Gaussians does not change."""
     if frame.constant_topology and frame.previous is not None and len(frame.previous["positions"]) != frame.count:
         before = len(frame.previous["positions"])
         yield Fault(f"the count must be constant, got {frame.count} after {before}. Say perFrame.", "positions")
 
 
 @entering(FRAME_RULES, "BEAM-SEQ-006", "error")
-def _unique_ids(frame: Frame) -> Iterator[Fault]:
+def _unique_ids(frame: FrameArrays) -> Iterator[Fault]:
     """Identities are unique within a frame."""
     for name, array in frame.to_check("ids"):
         if len(np.unique(array)) != len(array):
@@ -193,8 +134,8 @@ def _unique_ids(frame: Frame) -> Iterator[Fault]:
 
 
 @entering(FRAME_RULES, "BEAM-SEQ-007", "error")
-def _constant_ids(frame: Frame) -> Iterator[Fault]:
-    """Where the topology is constant, so is the identity of each row."""
+def _constant_ids(frame: FrameArrays) -> Iterator[Fault]:
+    """With constant topology, the identity of each row does not change."""
     if frame.constant_topology and frame.previous is not None and "ids" in frame.changed:
         ids, before = frame.arrays.get("ids"), frame.previous.get("ids")
         if ids is not None and before is not None and len(ids) == len(before) and not np.array_equal(ids, before):
@@ -202,8 +143,8 @@ def _constant_ids(frame: Frame) -> Iterator[Fault]:
 
 
 @entering(FRAME_RULES, "BEAM-SEQ-008", "warning")
-def _continuous_quaternions(frame: Frame) -> Iterator[Fault]:
-    """Where rows keep their identity, quaternions keep their sign: engines that blend components would spin them."""
+def _continuous_quaternions(frame: FrameArrays) -> Iterator[Fault]:
+    """With constant topology, quaternions keep their sign; engines that blend components would spin the Gaussians."""
     if not frame.constant_topology or frame.previous is None or "orientations" not in frame.changed:
         return
     now, before = frame.arrays.get("orientations"), frame.previous.get("orientations")
@@ -217,7 +158,10 @@ def _continuous_quaternions(frame: Frame) -> Iterator[Fault]:
             )
 
 
-def _range(frame: Frame, low: float, high: float, *names: str) -> Iterator[Fault]:
+def _out_of_range(
+    frame: FrameArrays, *, names: tuple[str, ...], low: float = 0.0, high: float = 1.0
+) -> Iterator[Fault]:
+    """Find values outside an interval."""
     for name, array in frame.to_check(*names):
         bad = np.isfinite(array) & ~((array >= low) & (array <= high))
         if bad.any():
@@ -228,10 +172,31 @@ def _range(frame: Frame, low: float, high: float, *names: str) -> Iterator[Fault
             )
 
 
-def _unit(frame: Frame, channel: str) -> Iterator[Fault]:
-    for name, array in frame.to_check(channel):
+def _not_unit(frame: FrameArrays, *, names: tuple[str, ...]) -> Iterator[Fault]:
+    """Find vectors or quaternions whose length is not 1."""
+    for name, array in frame.to_check(*names):
         length = np.linalg.norm(array.astype(np.float32), axis=1)
         bad = np.isfinite(length) & ~(np.abs(length - 1.0) <= UNIT_TOLERANCE)
         if bad.any():
             row = np.flatnonzero(bad)[0]
             yield Fault(f"vectors must have unit length, got {length[row]:.4g} at element {row}. Normalise them.", name)
+
+
+_ERRORS = ("ambient_occlusion_error", "base_color_error", "roughness_error")
+_not_negative = partial(_out_of_range, high=np.inf)
+
+FRAME_RULES += [
+    Rule(rule_id, "error", text, partial(check, names=names))
+    for rule_id, text, check, names in (
+        ("BEAM-GEO-012", "Orientations are unit quaternions.", _not_unit, ("orientations",)),
+        ("BEAM-GEO-013", "Scales are linear and not negative (logarithms would be).", _not_negative, ("scales",)),
+        ("BEAM-GEO-014", "Opacities are linear, in [0, 1] (logits are not).", _out_of_range, ("opacities",)),
+        ("BEAM-MAT-010", "Base colour is in [0, 1].", _out_of_range, ("base_color",)),
+        ("BEAM-MAT-011", "Roughness is in [0, 1].", _out_of_range, ("roughness",)),
+        ("BEAM-MAT-012", "Ambient occlusion is a visibility in [0, 1].", _out_of_range, ("ambient_occlusion",)),
+        ("BEAM-MAT-013", "Metallic is in [0, 1].", _out_of_range, ("metallic",)),
+        ("BEAM-MAT-014", "Normals are unit vectors.", _not_unit, ("normals",)),
+        ("BEAM-MAT-015", "Normal confidence is in [0, 1].", _out_of_range, ("normal_confidence",)),
+        ("BEAM-MAT-016", "Standard errors are not negative.", _not_negative, _ERRORS),
+    )
+]

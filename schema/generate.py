@@ -1,7 +1,7 @@
-"""Generates generatedSchema.usda and plugInfo.json from schema.usda: ``python -m beam_warp.schema.generate``.
+"""Generator of generatedSchema.usda and plugInfo.json from schema.usda: ``python -m beam_warp.schema.generate``.
 
-Wraps usdGenSchema, which usd-core carries; it needs jinja2 (the ``dev`` extra). A test regenerates and compares, so
-that the three files cannot drift apart.
+It runs usdGenSchema, a part of usd-core, which needs jinja2 (the ``dev`` extra). A test generates the files and
+compares them, so that the three files cannot drift apart.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _VALIDATOR_PLUGIN = {
     "Root": "host_validator.py",  # OpenUSD tells plug-ins apart by this path
     "Type": "python",
 }
-"""What lets other hosts run our rules: OpenUSD imports the module when the validator is first asked for."""
+"""Entry of plugInfo.json by which other hosts run our rules; OpenUSD imports the module on first use."""
 
 
 def generate(folder: Path) -> None:

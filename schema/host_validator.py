@@ -1,4 +1,4 @@
-"""Our rules as a validator that OpenUSD finds in plugInfo.json and imports when a host first asks for it."""
+"""Our rules as an OpenUSD validator, which OpenUSD finds in plugInfo.json and imports when a host asks for it."""
 
 from __future__ import annotations
 

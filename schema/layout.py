@@ -1,6 +1,6 @@
-"""Where each array of a cloud lives in a file: attribute name, USD types, and when half precision is safe for it.
+"""Layout of an asset: the attribute name and USD types of each array, and when half precision is safe for it.
 
-The writer, the reader and the rules all read this one table. Names and types follow OpenUSD's ParticleField schema
+Writer, reader and rules share this table. Names and types follow OpenUSD's ParticleField schema
 (26.03 and later) and schema.usda.
 """
 
@@ -19,6 +19,9 @@ SPLATS_PATH = "/Asset/Splats"
 SPLAT_TYPE = "ParticleField3DGaussianSplat"
 
 SH_DEGREE = "radiance:sphericalHarmonicsDegree"
+
+UP_AXES = {"rub": "Y", "rfu": "Z"}
+"""Axes that a stage can have, with the up axis that states them: both are right-handed with x to the right."""
 
 HALF_MAX = 65504.0
 """Largest finite half."""
@@ -39,13 +42,13 @@ class Channel:
 
     Attributes:
         name: Field of `beam_warp.world.gaussians.GaussianCloud`, or ``metallic``, which a cloud does not hold.
-        usd_name: Attribute of the float variant; the half variant has the suffix ``h``.
+        usd_name: Attribute of the float variant; that of the half variant has the suffix ``h``.
         type_name: USD type of the float variant, or of the only one.
         half_type_name: USD type of the half variant; None if there is none.
         columns: Components of one element.
-        relative: True if small values must keep their relative precision: then half is safe only without values
-            below `HALF_MIN_NORMAL` other than 0.
-        position_like: True if the array is always written in float: half would move centres by a millimetre.
+        relative: True if small values must keep their relative precision. Half is then safe only if no value other
+            than 0 is below `HALF_MIN_NORMAL`.
+        position_like: True if the array is always written in float, since half would move centres by a millimetre.
     """
 
     name: str
@@ -62,7 +65,7 @@ class Channel:
         return (self.usd_name,) if self.half_type_name is None else (self.usd_name, self.usd_name + "h")
 
     def half_is_safe(self, largest: float, smallest: float) -> bool:
-        """Say whether half precision keeps values whose non-zero magnitudes lie in [smallest, largest].
+        """Return True if half precision is safe for values whose non-zero magnitudes are in [smallest, largest].
 
         The error is then at most `HALF_EPSILON` relative or `HALF_ABSOLUTE` absolute, whichever is larger, and for
         a ``relative`` channel at most `HALF_EPSILON` relative for every element.

@@ -1,4 +1,4 @@
-"""Where a prim puts its Gaussians: the transform from the prim to the world in metres, and a cloud carried along."""
+"""Placement of a prim: the transform from the prim to the world in metres, and its application to Gaussians."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Placement:
 
     Attributes:
         scale: Metres per local unit, positive.
-        orthogonal: ``(3, 3)``; a reflection is allowed.
-        translation: In metres, ``(3,)``.
+        orthogonal: Rotation or reflection, ``(3, 3)``.
+        translation: Translation [m], ``(3,)``.
     """
 
     scale: float
@@ -34,14 +34,14 @@ class Placement:
 
     @property
     def is_identity(self) -> bool:
-        """True if nothing would change, not even in the last bit."""
+        """True if `apply` would change no bit."""
         return self.scale == 1.0 and np.array_equal(self.orthogonal, np.eye(3)) and not self.translation.any()
 
     def apply(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Carry every array along that depends on place, size or direction.
+        """Transform every array that depends on position, size or direction.
 
-        A reflection keeps the ellipsoid of its negative, a rotation, so quaternions stay rotations; normals and
-        spherical harmonics take the reflection itself.
+        A reflection and its negative, which is a rotation, have the same effect on an ellipsoid: quaternions take the
+        rotation, normals and spherical harmonics the reflection itself.
         """
         moved = dict(arrays)
         rotation = quaternion_of(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
@@ -62,10 +62,10 @@ class Placement:
 
 
 def placement_of(matrix: NDArray[np.float64], meters_per_unit: float, where: str) -> Placement:
-    """Split a local-to-world matrix of USD (row vectors, ``p' = p M``) into a similarity in metres.
+    """Decompose a local-to-world matrix of USD (row vectors, ``p' = p M``) into a similarity in metres.
 
     Raises:
-        AssetFormatError: It shears, scales unevenly, or collapses space.
+        AssetFormatError: The matrix shears, scales unevenly, or is singular.
     """
     linear = matrix[:3, :3].T
     determinant = float(np.linalg.det(linear))

@@ -1,7 +1,7 @@
-"""Opens an asset and reads from each of its layers: ``python -m beam_warp.schema.probe ASSET``, run as a child.
+"""Child process that opens an asset and reads from each of its layers: ``python -m beam_warp.schema.probe ASSET``.
 
-Prints one JSON object: empty if all went well, else with ``error``. A corrupt file may end this process instead; its
-parent takes that for an answer too.
+It prints one JSON object, which is empty or has the key ``error``. A corrupt file may end the process instead, which
+its parent treats as an error too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
 ADDRESS_SPACE = 8 * 2**30
-"""Room for OpenUSD itself [bytes]; a corrupt length that asks for more fails instead of filling the machine."""
+"""Address space for OpenUSD itself [byte]; a corrupt length that asks for more fails instead of filling memory."""
 
 
 def fault(path: Path) -> str | None:
@@ -50,13 +50,13 @@ def fault(path: Path) -> str | None:
 
 
 def said_by_usd(error: Tf.ErrorException) -> str:
-    """Return OpenUSD's own words, without its source lines, each once."""
+    """Return OpenUSD's messages without its source lines and without repetition."""
     words = dict.fromkeys(str(getattr(item, "commentary", item)) for item in error.args)
     return " ".join(" ".join(words).split())[:500]
 
 
 def _touch(prim: Usd.Prim) -> None:
-    """Read every array at the default time, at both ends, and where each value clip starts."""
+    """Read every array at the default time, at its first and last sample, and at the start of each value clip."""
     starts = [start for clips in clip_sets(prim) for start, _ in clips.active]
     for channel in CHANNELS.values():
         for usd_name in channel.usd_names:

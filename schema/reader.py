@@ -1,4 +1,4 @@
-"""Reads a Gaussian-splat asset, ours or any other, as a lazy sequence in metres."""
+"""Reader of Gaussian-splat assets, ours or others', as lazy sequences in metres."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from pxr import Tf, Usd, UsdGeom
 from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, register
-from beam_warp.schema.files import require_asset_file, require_opens
+from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, Channel, from_vt
 from beam_warp.schema.placement import Placement, placement_of
 from beam_warp.schema.stage_queries import (
+    ancestors,
     applied_schemas,
     array_attribute,
     authored,
     has_material_api,
+    open_asset,
     radiance_color_space,
     sample_times,
     sequence_prim,
@@ -42,7 +43,7 @@ _MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"
 """Arrays that a moving transform changes."""
 
 _ABSENT = {"orientations": (0.0, 0.0, 0.0, 1.0), "scales": (1.0, 1.0, 1.0), "opacities": 1.0}
-"""What OpenUSD's schema takes for arrays that are not authored."""
+"""Values of arrays that are not authored, by OpenUSD's schema."""
 
 _TOKENS = {
     "radiance_meaning": "beam:radianceMeaning",
@@ -60,19 +61,19 @@ _SEQUENCE_TOKENS = {
 def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool = False) -> GaussianSequence:
     """Open an asset; frames are read when they are asked for, from any thread.
 
-    Any ``ParticleField3DGaussianSplat`` is read, wherever it is on the stage; without our schema it is just not
+    Any ``ParticleField3DGaussianSplat`` is read, wherever it is on the stage; without our schema it is not
     relightable. The transforms above the prim are applied (spherical harmonics included), units become metres, and
     the up axis becomes the axes code: y up is ``rub``, z up is ``rfu``. Frames are the time samples of the prim.
 
     Args:
         path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
-        prim_path: Which prim to read where there are several.
-        trusted: True skips the child process that opens the file first (about 0.4 s): a corrupt file may then end
+        prim_path: Path of the prim to read, if there are several.
+        trusted: True skips the child process that opens the file first (about 0.4 s); a corrupt file may then end
             this process.
 
     Returns:
-        The sequence. ``metadata`` carries what the asset says about itself; what had to be assumed is in
-        ``metadata["notes"]``, one line each.
+        The sequence. ``metadata`` has what the asset states about itself, and assumptions in ``metadata["notes"]``, one
+        line each.
 
     Raises:
         MissingFileError: There is no such file.
@@ -80,14 +81,7 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
             transform that is no similarity. Faults inside a frame appear when that frame is read.
         SchemaVersionError: The asset has a major version that this package does not read.
     """
-    source = require_asset_file(path)
-    if not trusted:
-        require_opens(source)
-    register()
-    try:
-        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
-    except Tf.ErrorException as error:
-        raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
+    source, stage = open_asset(path, trusted=trusted)
     prim = _find(stage, source, prim_path)
     notes: list[str] = []
     metadata = _metadata(prim, source, notes)
@@ -132,7 +126,7 @@ class _FrameReader:
     kept: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)  # converted arrays that do not vary
 
     def read(self, frame: int) -> GaussianCloud:
-        """Read one frame; a fault in it is one error that names file, prim and time."""
+        """Read one frame; an error names file, prim and time."""
         time = self.times[frame]
         where = f"{self.source}: {self.prim.GetPath()} at time {time:g}"
         try:
@@ -149,7 +143,7 @@ class _FrameReader:
             raise AssetFormatError(f"{where} must be readable, got {error}. Export the file again.") from error
 
     def constant(self) -> frozenset[str]:
-        """Name the arrays that do not vary."""
+        """Return the names of the arrays that do not vary."""
         names = set()
         for name, channel in CHANNELS.items():
             attribute = array_attribute(self.prim, channel)
@@ -160,12 +154,10 @@ class _FrameReader:
         return frozenset(names - _MOVED if self._moves() else names)
 
     def _moves(self) -> bool:
-        prim = self.prim
-        while prim and not prim.IsPseudoRoot():
-            if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
-                return True
-            prim = prim.GetParent()
-        return False
+        return any(
+            prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying()
+            for prim in ancestors(self.prim)
+        )
 
     def _placement(self, time: float, where: str) -> Placement:
         cache = UsdGeom.XformCache(time)  # per call: a cache is not safe to share between threads
@@ -226,7 +218,7 @@ class _FrameReader:
 
 
 def _find(stage: Usd.Stage, source: Path, prim_path: str | None) -> Usd.Prim:
-    """Return the one splat prim, or the one that was asked for."""
+    """Return the only splat prim, or the one at ``prim_path``."""
     prims = splat_prims(stage)
     paths = [str(prim.GetPath()) for prim in prims]
     if prim_path is not None and prim_path in paths:
@@ -242,7 +234,7 @@ def _find(stage: Usd.Stage, source: Path, prim_path: str | None) -> Usd.Prim:
 
 
 def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
-    """Collect what the asset says about itself, after checking that its version can be read."""
+    """Return what the asset states about itself, after checking that its version can be read."""
     said: dict[str, str] = {}
     newer = [name for name in applied_schemas(prim) if name.startswith(f"{MATERIAL_API}_")]
     if newer:
@@ -292,7 +284,7 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
 
 
 def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) -> tuple[list[float], float, Topology]:
-    """Return the time of each frame, the playback rate, and whether rows keep their identity."""
+    """Return the time of each frame, the playback rate, and the topology."""
     times = sample_times(prim)
     rate = stage.GetTimeCodesPerSecond()
     if not rate > 0.0:
@@ -322,7 +314,7 @@ def _meters_per_unit(stage: Usd.Stage, source: Path, notes: list[str]) -> float:
 
 
 def _unit(name: str, vectors: NDArray[np.float32], where: str) -> NDArray[np.float32]:
-    """Normalise the rows that are visibly not unit, as renderers do; rows without a direction are refused."""
+    """Normalise rows that differ noticeably from unit length, as renderers do; rows of length 0 are refused."""
     length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
     if not (length > 1e-12).all():
         row = int(np.flatnonzero(~(length[:, 0] > 1e-12))[0])

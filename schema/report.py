@@ -1,4 +1,4 @@
-"""What a validation found, as plain data: one finding for each rule, prim and attribute, and where it was first."""
+"""Result of a validation as plain data: each broken rule by prim and attribute, and where it was first broken."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ Severity = Literal["error", "warning"]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One broken rule.
+class BrokenRule:
+    """A rule that an asset breaks, at one prim and attribute.
 
     Attributes:
-        rule: Stable id, ``BEAM-<AREA>-<nnn>``, or ``USD-<name>`` for OpenUSD's own validators.
+        rule: Stable id of the rule, ``BEAM-<AREA>-<nnn>``, or ``USD-<name>`` for OpenUSD's own validators.
         severity: ``error`` if a reader may fail or show something else, else ``warning``.
-        message: What must hold, what was found, and what to do.
+        message: The contract, what was found instead, and what to do.
         prim: Path of the prim, or ``/``.
         attribute: Name of the attribute, or empty.
-        time: Time code where it was first seen; None if it does not depend on time.
-        frames: In how many frames it was seen; 0 if it does not depend on time.
+        time: First time code at which the rule is broken; None if it does not depend on time.
+        frames: Number of frames in which it is broken; 0 if it does not depend on time.
     """
 
     rule: str
@@ -41,17 +41,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """All findings of one asset.
+    """All broken rules of one asset.
 
     Attributes:
-        path: The asset.
-        findings: Errors first, then by rule, prim, and attribute.
-        frames: Number of frames that were looked at.
+        path: Path of the asset.
+        findings: Broken rules, errors first, then by rule, prim, and attribute.
+        frames: Number of frames that were checked.
         gaussians: Number of Gaussians in the first frame, all prims together.
     """
 
     path: str
-    findings: tuple[Finding, ...]
+    findings: tuple[BrokenRule, ...]
     frames: int = 0
     gaussians: int = 0
 
@@ -67,5 +67,5 @@ class Report:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Report:
         """Rebuild a report from `as_dict`."""
-        findings = tuple(Finding(**finding) for finding in data["findings"])
+        findings = tuple(BrokenRule(**finding) for finding in data["findings"])
         return cls(data["path"], findings, data["frames"], data["gaussians"])

@@ -1,7 +1,7 @@
-"""The rules of an asset, one function each, with a stable id and a severity; the docstring is the rule's text.
+"""Rules about stages and prims, one function each; its docstring is the text of the rule.
 
-Rules of this file ask a stage or a prim; those of `beam_warp.schema.frame_rules` ask the arrays of a frame. Ids are
-never reused: a rule that goes leaves a gap.
+Rules about the arrays of a frame are in `beam_warp.schema.frame_rules`. Each rule has a stable id and a severity. Ids
+are never reused: a rule that is dropped leaves a gap.
 """
 
 from __future__ import annotations
@@ -33,34 +33,37 @@ from beam_warp.world.gaussians import MAX_SH_DEGREE
 
 
 class Fault(NamedTuple):
-    """What a rule found wrong; the id and the severity are the rule's."""
+    """One violation of a rule, as its check yields it."""
 
     message: str
     attribute: str = ""
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A rule: ``check`` yields what is wrong with a stage, a prim or a frame."""
-
-    id: str
-    severity: Severity
-    check: Callable[[Any], Iterator[Fault]]
-
-    @property
-    def text(self) -> str:
-        """What must hold, in one sentence."""
-        return (self.check.__doc__ or "").strip()
-
-
 Check = Callable[[Any], Iterator[Fault]]
 
 
+@dataclass(frozen=True)
+class Rule:
+    """A rule of the schema.
+
+    Attributes:
+        id: Stable id, ``BEAM-<AREA>-<nnn>``.
+        severity: ``error`` or ``warning``.
+        text: The contract, in one sentence.
+        check: Function that yields the violations of a stage, a prim or a frame.
+    """
+
+    id: str
+    severity: Severity
+    text: str
+    check: Check
+
+
 def entering(table: list[Rule], rule_id: str, severity: Severity) -> Callable[[Check], Check]:
-    """Return a decorator that enters a function in a table of rules."""
+    """Return a decorator that enters a check in a table of rules, with its docstring as the text."""
 
     def enter(check: Check) -> Check:
-        table.append(Rule(rule_id, severity, check))
+        table.append(Rule(rule_id, severity, (check.__doc__ or "").strip(), check))
         return check
 
     return enter
@@ -68,7 +71,7 @@ def entering(table: list[Rule], rule_id: str, severity: Severity) -> Callable[[C
 
 STAGE_RULES: list[Rule] = []
 FIRST_RULES: list[Rule] = []
-"""Rules about a prim without which no other can be asked: a missing clip layer makes OpenUSD raise everywhere."""
+"""Rules about a prim that are checked before all others: a missing clip layer makes OpenUSD raise errors everywhere."""
 PRIM_RULES: list[Rule] = []
 
 REQUIRED = ("positions", "orientations", "scales", "opacities", "radiance")
@@ -94,7 +97,7 @@ def _default_prim(stage: Usd.Stage) -> Iterator[Fault]:
 
 @entering(STAGE_RULES, "BEAM-STAGE-002", "error")
 def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
-    """metersPerUnit is authored and positive; USD would assume centimetres."""
+    """metersPerUnit is authored and positive; without it, USD assumes centimetres."""
     meters = UsdGeom.GetStageMetersPerUnit(stage)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         yield Fault("metersPerUnit must be authored, got none. Set it, for example to 1.")
@@ -104,7 +107,7 @@ def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
 
 @entering(STAGE_RULES, "BEAM-STAGE-003", "error")
 def _up_axis(stage: Usd.Stage) -> Iterator[Fault]:
-    """upAxis is authored and Y or Z."""
+    """upAxis is authored as Y or Z."""
     up = stage.GetRootLayer().pseudoRoot.GetInfo("upAxis") if stage.HasAuthoredMetadata("upAxis") else None
     if up not in ("Y", "Z"):
         yield Fault(f"upAxis must be Y or Z, got {up!r}. Author it.")
@@ -119,7 +122,7 @@ def _holds_splats(stage: Usd.Stage) -> Iterator[Fault]:
 
 @entering(STAGE_RULES, "BEAM-STAGE-005", "error")
 def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
-    """A stage on which something varies states its time range and timeCodesPerSecond."""
+    """A stage with time samples states its time range and timeCodesPerSecond."""
     if not any(has_whole_clips(prim) and len(sample_times(prim)) > 1 for prim in splat_prims(stage)):
         return
     if not stage.HasAuthoredTimeCodeRange() or not stage.GetStartTimeCode() <= stage.GetEndTimeCode():
@@ -130,7 +133,7 @@ def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
 
 @entering(STAGE_RULES, "BEAM-STAGE-006", "error")
 def _composes(stage: Usd.Stage) -> Iterator[Fault]:
-    """Every layer that the stage references is there and composes."""
+    """Every layer that the stage references exists and composes."""
     for problem in stage.GetCompositionErrors():
         yield Fault(f"the stage must compose, got: {' '.join(str(problem).split())} Restore the missing layer.")
 
@@ -146,7 +149,7 @@ def _required_arrays(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-GEO-002", "error")
 def _one_precision(prim: Usd.Prim) -> Iterator[Fault]:
-    """Of an array's float and half variants one is authored, so that no host can pick a stale one."""
+    """An array is authored in float or in half precision, not in both, so that no host reads a stale variant."""
     for channel in CHANNELS.values():
         if len([name for name in channel.usd_names if authored_at_all(prim, name)]) > 1:
             yield Fault("one precision must be authored, got float and half. Clear one of them.", channel.usd_name)
@@ -166,14 +169,14 @@ def _similarity(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-GEO-004", "error")
 def _extent_authored(prim: Usd.Prim) -> Iterator[Fault]:
-    """extent is authored: USD computes none for Gaussian splats."""
+    """extent is authored; USD computes none for Gaussian splats."""
     if not authored_at_all(prim, "extent"):
         yield Fault("extent must be authored, got none. Write the bounds of each frame.", "extent")
 
 
 @entering(PRIM_RULES, "BEAM-SH-001", "error")
 def _sh_degree(prim: Usd.Prim) -> Iterator[Fault]:
-    """The spherical-harmonics degree is authored (USD would assume 3) and 0 to 4."""
+    """The spherical-harmonics degree is authored, from 0 to 4; without it, USD assumes 3."""
     degree = authored(prim, SH_DEGREE)
     if not isinstance(degree, int) or not 0 <= degree <= MAX_SH_DEGREE:
         yield Fault(f"the degree must be authored, 0 to {MAX_SH_DEGREE}, got {degree!r}. Author it.", SH_DEGREE)
@@ -181,14 +184,14 @@ def _sh_degree(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-API-001", "warning")
 def _is_relightable(prim: Usd.Prim) -> Iterator[Fault]:
-    """The prim has BeamRelightableGaussianAPI; without it, it is an ordinary splat that cannot be relit."""
+    """The prim has BeamRelightableGaussianAPI; without it, the Gaussians cannot be relit."""
     if not has_material_api(prim) and not _beam_attributes(prim):
         yield Fault(f"{MATERIAL_API} should be applied, got ordinary splats. Decompose them to relight them.")
 
 
 @entering(PRIM_RULES, "BEAM-API-002", "error")
 def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
-    """A prim that authors beam: attributes has BeamRelightableGaussianAPI applied."""
+    """A prim with authored beam: attributes has BeamRelightableGaussianAPI applied."""
     names = _beam_attributes(prim)
     if names and not has_material_api(prim):
         yield Fault(f"{MATERIAL_API} must be applied, got beam: attributes without it. Apply it.", names[0])
@@ -196,7 +199,7 @@ def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-MAT-001", "warning")
 def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
-    """Base colour, roughness, ambient occlusion and normals are all authored: relighting reads them."""
+    """Base colour, roughness, ambient occlusion and normals, which relighting reads, are all authored."""
     missing = [CHANNELS[name].usd_name for name in RELIGHTABLE if array_attribute(prim, CHANNELS[name]) is None]
     if has_material_api(prim) and missing:
         yield Fault(f"relighting needs {', '.join(missing)}, got none. Decompose the asset.", missing[0])
@@ -204,7 +207,7 @@ def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-MAT-002", "error")
 def _normal_source(prim: Usd.Prim) -> Iterator[Fault]:
-    """normalSource is none exactly if there are no normals."""
+    """normalSource is none if and only if there are no normals."""
     source = authored(prim, "beam:normalSource")
     has_normals = array_attribute(prim, CHANNELS["normals"]) is not None
     if has_material_api(prim) and source in TOKENS["beam:normalSource"] and (source == "none") == has_normals:
@@ -225,7 +228,7 @@ def _base_color_space(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-COLOR-002", "error")
 def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
-    """The colour space of the radiance is authored and one that we know."""
+    """The colour space of the radiance is authored and is one of the known ones."""
     space = authored(prim, "beam:radianceColorSpace")
     if has_material_api(prim) and space not in COLOR_SPACES:
         wanted = " or ".join(COLOR_SPACES)
@@ -234,7 +237,7 @@ def _radiance_color_space(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-RASTER-001", "error")
 def _low_pass(prim: Usd.Prim) -> Iterator[Fault]:
-    """The variance of the low-pass that splats are drawn with is positive, where it is authored."""
+    """The variance of the low-pass that splats are drawn with, if authored, is positive and finite."""
     low_pass = authored(prim, "beam:rasterLowPass")
     if low_pass is not None and not 0.0 < low_pass < np.inf:
         yield Fault(f"the low-pass must be positive, got {low_pass:g}. Author that of the fit.", "beam:rasterLowPass")
@@ -242,7 +245,7 @@ def _low_pass(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-TOKEN-001", "error")
 def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
-    """brdf, aoMeaning, normalSource and radianceMeaning are authored: fallbacks are invisible without the plug-in."""
+    """brdf, aoMeaning, normalSource and radianceMeaning are authored; hosts without the plug-in see no fallbacks."""
     for name in TOKENS:
         if has_material_api(prim) and authored(prim, name) is None:
             yield Fault(f"{name} must be authored, got none. Author it.", name)
@@ -250,7 +253,7 @@ def _tokens_authored(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-TOKEN-002", "error")
 def _tokens_known(prim: Usd.Prim) -> Iterator[Fault]:
-    """Tokens hold one of their allowed values."""
+    """Every token has one of its allowed values."""
     playing = sequence_prim(prim)
     for name, allowed in {**TOKENS, **OPTIONAL_TOKENS}.items():
         holder = playing if name.startswith("beam:sequence:") else prim
@@ -269,7 +272,7 @@ def _version_authored(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-VERSION-002", "error")
 def _version_major(prim: Usd.Prim) -> Iterator[Fault]:
-    """The schema's major version is one that this validator knows."""
+    """The schema's major version is that of this validator."""
     version = _parsed(authored(prim, "beam:schemaVersion"))
     if has_material_api(prim) and version is not None and version[0] != _KNOWN[0]:
         yield Fault(f"the major version must be {_KNOWN[0]}, got {version[0]}. Upgrade.", "beam:schemaVersion")
@@ -277,7 +280,7 @@ def _version_major(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-VERSION-003", "warning")
 def _version_minor(prim: Usd.Prim) -> Iterator[Fault]:
-    """The schema's minor version is not newer than this validator."""
+    """The schema's minor version is not newer than that of this validator."""
     version = _parsed(authored(prim, "beam:schemaVersion"))
     if has_material_api(prim) and version is not None and version[0] == _KNOWN[0] and version[1] > _KNOWN[1]:
         yield Fault(f"what is newer than {SCHEMA_VERSION} was not checked, got 1.{version[1]}. Upgrade.")
@@ -285,7 +288,7 @@ def _version_minor(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-001", "error")
 def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
-    """An ancestor of a relightable prim says how it plays: BeamSequenceAPI with frameCount, rate and topology."""
+    """An ancestor of a relightable prim has BeamSequenceAPI, with frameCount, framesPerSecond and topology authored."""
     if not has_material_api(prim):
         return
     playing = sequence_prim(prim)
@@ -299,7 +302,7 @@ def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-002", "error")
 def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
-    """frameCount is the number of time codes of the stage's range, framesPerSecond its timeCodesPerSecond."""
+    """frameCount is the number of time codes in the stage's range, and framesPerSecond equals timeCodesPerSecond."""
     playing, stage = sequence_prim(prim), prim.GetStage()
     if playing is None or not stage.HasAuthoredTimeCodeRange():
         return
@@ -315,7 +318,7 @@ def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-003", "error")
 def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
-    """Arrays that vary share one set of time samples, so that each frame is whole."""
+    """All arrays that vary have the same time samples, so that each frame is complete."""
     samples = _own_samples(prim)
     union = sorted(set().union(*samples.values())) if samples else []
     for name, times in samples.items():
@@ -326,7 +329,7 @@ def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-004", "error")
 def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
-    """Time samples are every whole time code from startTimeCode to endTimeCode."""
+    """There are time samples at every whole time code from startTimeCode to endTimeCode, and at no other time."""
     stage = prim.GetStage()
     union = sorted(set().union(*_own_samples(prim).values()))
     if not has_material_api(prim) or not union or not stage.HasAuthoredTimeCodeRange():
@@ -339,7 +342,7 @@ def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-009", "error")
 def _capture_frames(prim: Usd.Prim) -> Iterator[Fault]:
-    """captureFrames, where it is authored, holds a number for each frame, none of them negative."""
+    """captureFrames, if authored, holds one number for each frame, and none is negative."""
     playing = sequence_prim(prim)
     numbers = authored(playing, "beam:sequence:captureFrames") if playing is not None else None
     if playing is None or numbers is None:
@@ -353,7 +356,7 @@ def _capture_frames(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(FIRST_RULES, "BEAM-CLIP-001", "error")
 def _clips_resolve(prim: Usd.Prim) -> Iterator[Fault]:
-    """Every layer that value clips name opens, and every clip that becomes active exists."""
+    """Every layer that value clips name can be opened, and every clip that becomes active exists."""
     for clips in clip_sets(prim):
         for path in clips.missing_layers():
             yield Fault(f"a clip layer must open, got {path}, which does not. Restore it.")
@@ -386,7 +389,7 @@ def _clips_cover(prim: Usd.Prim) -> Iterator[Fault]:
 
 
 def authored_at_all(prim: Usd.Prim, name: str) -> bool:
-    """Say whether an attribute has a value anywhere, samples and clips included."""
+    """Return True if an attribute has a value anywhere, also in time samples or clips."""
     attribute = prim.GetAttribute(name)
     return bool(attribute) and attribute.HasAuthoredValue()
 
@@ -396,7 +399,7 @@ def _beam_attributes(prim: Usd.Prim) -> list[str]:
 
 
 def _own_samples(prim: Usd.Prim) -> dict[str, list[float]]:
-    """Sample times of every array that varies by time samples of its own, not by clips."""
+    """Return the sample times of every array that varies by its own time samples, not by clips."""
     clipped = set().union(*(clips.declared() for clips in clip_sets(prim)))
     samples = {}
     for channel in CHANNELS.values():
@@ -407,7 +410,7 @@ def _own_samples(prim: Usd.Prim) -> dict[str, list[float]]:
 
 
 def _parsed(version: Any) -> tuple[int, int] | None:
-    """Split major.minor; None if it is something else."""
+    """Return major and minor of a version; None if it is not of the form major.minor."""
     major, _, minor = str(version or "").partition(".")
     return (int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else None
 

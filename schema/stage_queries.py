@@ -1,7 +1,8 @@
-"""Questions that the reader and the rules both ask of a stage: which prims, which frames, which variant of an array."""
+"""Queries of a stage that the reader and the rules share: its prims, its frames, and the variant of each array."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
-from beam_warp.schema import MATERIAL_API, SEQUENCE_API
-from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, Channel
+from beam_warp.schema import MATERIAL_API, SEQUENCE_API, register
+from beam_warp.schema.files import require_asset_file, require_opens
+from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, UP_AXES, Channel
 
 _COLOR_SPACES = {
     "srgb_rec709_display": DISPLAY_SRGB,
@@ -20,10 +22,31 @@ _COLOR_SPACES = {
     "lin_rec709_display": LINEAR_REC709,
     "lin_rec709_scene": LINEAR_REC709,
 }
-"""Names that writers give to the two spaces that splats are trained in; OpenUSD itself has none for the first."""
+"""Names that writers give to the two spaces in which splats are trained; OpenUSD has no name for the first."""
 
 
-_AXES = {"Y": "rub", "Z": "rfu"}
+def open_asset(path: str | Path, *, trusted: bool) -> tuple[Path, Usd.Stage]:
+    """Check a file, register our schema, and open the file as a stage.
+
+    Args:
+        path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        trusted: True skips the child process that opens the file first.
+
+    Returns:
+        The absolute path and the stage.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: The file is broken.
+    """
+    source = require_asset_file(path)
+    if not trusted:
+        require_opens(source)
+    register()
+    try:
+        return source, Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+    except Tf.ErrorException as error:
+        raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
 
 
 def stage_axes(stage: Usd.Stage, source: Path) -> str:
@@ -33,9 +56,10 @@ def stage_axes(stage: Usd.Stage, source: Path) -> str:
         AssetFormatError: It is neither Y nor Z.
     """
     up = str(UsdGeom.GetStageUpAxis(stage))
-    if up not in _AXES:
-        raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
-    return _AXES[up]
+    for axes, name in UP_AXES.items():
+        if up == name:
+            return axes
+    raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
 
 
 def stage_meters(stage: Usd.Stage, source: Path) -> float:
@@ -57,22 +81,25 @@ def splat_prims(stage: Usd.Stage) -> list[Usd.Prim]:
 
 
 def applied_schemas(prim: Usd.Prim) -> list[str]:
-    """Return the names of applied schemas as authored: unlike GetAppliedSchemas, also those that USD does not know."""
+    """Return the names of applied schemas as authored; GetAppliedSchemas leaves out those that USD does not know."""
     return [str(name) for name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()]
 
 
 def has_material_api(prim: Usd.Prim) -> bool:
-    """Say whether a prim states that it holds our channels."""
+    """Return True if a prim has BeamRelightableGaussianAPI."""
     return MATERIAL_API in applied_schemas(prim)
 
 
 def sequence_prim(prim: Usd.Prim) -> Usd.Prim | None:
-    """Return the nearest ancestor that says how the Gaussians play."""
+    """Return the prim itself or its nearest ancestor that has BeamSequenceAPI, or None."""
+    return next((place for place in ancestors(prim) if SEQUENCE_API in applied_schemas(place)), None)
+
+
+def ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    """Yield a prim and those above it, without the pseudo-root."""
     while prim and not prim.IsPseudoRoot():
-        if SEQUENCE_API in applied_schemas(prim):
-            return prim
+        yield prim
         prim = prim.GetParent()
-    return None
 
 
 def authored(prim: Usd.Prim, name: str) -> Any:
@@ -82,7 +109,7 @@ def authored(prim: Usd.Prim, name: str) -> Any:
 
 
 def array_attribute(prim: Usd.Prim, channel: Channel) -> Usd.Attribute | None:
-    """Return the authored variant of an array, float before half as OpenUSD's schema wants it."""
+    """Return the authored variant of an array, or None; float goes before half, as in OpenUSD's schema."""
     for name in channel.usd_names:
         attribute = prim.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
@@ -91,35 +118,35 @@ def array_attribute(prim: Usd.Prim, channel: Channel) -> Usd.Attribute | None:
 
 
 def sample_times(prim: Usd.Prim) -> list[float]:
-    """Return the union of all sample times of a prim's arrays and of the transforms above it."""
+    """Return the sample times of a prim's arrays and of the transforms above it, ascending."""
     times: set[float] = set()
     for channel in CHANNELS.values():
         attribute = array_attribute(prim, channel)
         if attribute is not None:
             times.update(attribute.GetTimeSamples())
-    while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdGeom.Xformable):
-            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
-        prim = prim.GetParent()
-    return sorted(times)
+    return sorted(times | transform_times(prim))
+
+
+def transform_times(prim: Usd.Prim) -> set[float]:
+    """Return the sample times of the transforms of a prim and those above it."""
+    xforms = (UsdGeom.Xformable(place) for place in ancestors(prim) if place.IsA(UsdGeom.Xformable))
+    return {time for xform in xforms for time in xform.GetTimeSamples()}
 
 
 def radiance_color_space(prim: Usd.Prim) -> tuple[str | None, str]:
-    """Return the colour space of a prim's radiance and the word that says so.
+    """Return the colour space of a prim's radiance, and the token that states it.
 
-    The first of ``beam:radianceColorSpace``, then ``colorSpace:name`` of the prim or an ancestor, counts. None if
-    nothing is stated (the word is then empty) or the word is unknown.
+    ``beam:radianceColorSpace`` goes first, then ``colorSpace:name`` of the prim and of its ancestors. The colour space
+    is None if nothing is stated (the token is then empty) or the token is unknown.
     """
+    words = (authored(place, "colorSpace:name") for place in ancestors(prim))
     word = authored(prim, "beam:radianceColorSpace")
-    ancestor = prim
-    while word is None and ancestor and not ancestor.IsPseudoRoot():
-        word = authored(ancestor, "colorSpace:name")
-        ancestor = ancestor.GetParent()
+    word = next((found for found in words if found is not None), None) if word is None else word
     return _COLOR_SPACES.get(str(word)), str(word or "")
 
 
 def has_whole_clips(prim: Usd.Prim) -> bool:
-    """Say whether all clip layers of a prim open; where one does not, every question about samples raises."""
+    """Return True if all clip layers of a prim can be opened; otherwise, OpenUSD raises on every query of samples."""
     return not any(clips.missing_layers() for clips in clip_sets(prim))
 
 
@@ -128,11 +155,11 @@ class ClipSet:
     """One set of explicit value clips of a prim.
 
     Attributes:
-        prim_path: Where the data is inside each clip layer.
-        manifest: Absolute path of the manifest, empty if none is stated.
+        prim_path: Path of the prim inside each clip layer.
+        manifest: Absolute path of the manifest; empty if none is stated.
         paths: Absolute paths of the clip layers.
-        active: Pairs (stage time from which on, index of the clip).
-        times: Pairs (stage time, time inside the clip).
+        active: Pairs of the stage time at which a clip becomes active and its index.
+        times: Pairs of stage time and time inside the clip.
     """
 
     prim_path: str
@@ -142,7 +169,7 @@ class ClipSet:
     times: tuple[tuple[float, float], ...]
 
     def missing_layers(self) -> list[str]:
-        """Return the layers that do not open."""
+        """Return the layers that cannot be opened."""
         return [path or "no manifest" for path in (self.manifest, *self.paths) if _open_layer(path) is None]
 
     def declared(self) -> set[str]:
@@ -152,7 +179,7 @@ class ClipSet:
         return set(prim.attributes.keys()) if prim else set()
 
     def sampled(self, index: int) -> set[str]:
-        """Return the attributes that one clip layer has samples of."""
+        """Return the attributes that have samples in one clip layer."""
         layer = _open_layer(self.paths[index])
         prim = layer.GetPrimAtPath(self.prim_path) if layer else None
         if layer is None or not prim:
@@ -161,7 +188,7 @@ class ClipSet:
         return {name for name in names if layer.GetNumTimeSamplesForPath(f"{self.prim_path}.{name}")}
 
     def has_sample(self, name: str, time: float) -> bool:
-        """Say whether the clip that is active at a stage time has a sample there."""
+        """Return True if the clip that is active at a stage time has a sample at that time."""
         index = next((index for start, index in reversed(self.active) if start <= time), None)
         layer = _open_layer(self.paths[index]) if index is not None and 0 <= index < len(self.paths) else None
         if layer is None or not self.times:
@@ -171,7 +198,7 @@ class ClipSet:
 
 
 def clip_sets(prim: Usd.Prim) -> list[ClipSet]:
-    """Return the explicit value clips of a prim, their layers' paths made absolute."""
+    """Return the explicit value clips of a prim, with absolute paths."""
     clips = prim.GetMetadata("clips") or {}
     found = []
     for name in clips:
@@ -193,7 +220,7 @@ def clip_sets(prim: Usd.Prim) -> list[ClipSet]:
 
 
 def _absolute(prim: Usd.Prim, path: Sdf.AssetPath | None) -> str:
-    """Anchor a clip's path to the layer that names it; OpenUSD resolves it where the layer is a package too."""
+    """Make a clip's path absolute, relative to the layer that names it; OpenUSD resolves it, in packages too."""
     if path is None or not path.path:
         return ""
     if path.resolvedPath:

@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all: files are built in a hidden folder beside their target and renamed at the end."""
+"""Outputs that appear complete or not at all: files are written into a hidden folder and renamed at the end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beam_warp.errors import OutputError
 
 @contextmanager
 def staged_folder(target: Path) -> Iterator[Path]:
-    """Give a hidden folder on the target's file system; it is gone afterwards, whatever happens.
+    """Make a hidden folder on the target's file system, and remove it at the end in any case.
 
     Raises:
         OutputError: The target's folder cannot be written, or writing inside the block failed.
@@ -44,7 +44,7 @@ def staged_folder(target: Path) -> Iterator[Path]:
 def publish(folder: Path, names: list[str], destination: Path) -> list[Path]:
     """Move staged files into place in the given order (the root layer last) and return their paths.
 
-    A failure removes what this call had put where nothing was before.
+    After a failure, the files that this call has added, not replaced, are removed.
     """
     published, fresh = [], []
     try:
@@ -64,7 +64,7 @@ def publish(folder: Path, names: list[str], destination: Path) -> list[Path]:
 
 
 def _reload_layers(paths: list[Path]) -> None:
-    """Make OpenUSD, which shares open layers within a process, see the new contents of replaced files."""
+    """Reload replaced files in OpenUSD, which shares open layers within a process."""
     replaced = {str(path.resolve()) for path in paths}
     for layer in Sdf.Layer.GetLoadedLayers():
         if not layer.anonymous and layer.realPath.partition("[")[0] in replaced:

@@ -1,12 +1,11 @@
-"""One pass over a sequence before anything is written: what is there, what varies, and which precision holds it.
+"""First pass over a sequence, before it is written: which arrays exist, which vary, and which precision is safe.
 
-OpenUSD wants these answers before the first frame: an attribute has one precision, one spherical-harmonics degree and
-is either constant or sampled. The pass holds two frames at a time, so memory does not grow with length.
+OpenUSD needs these answers before the first frame: an attribute has one precision and one spherical-harmonics degree,
+and is either constant or sampled. The pass holds two frames at a time, so memory does not grow with their number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,25 +14,22 @@ from numpy.typing import NDArray
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
-from beam_warp.schema.layout import CHANNELS
+from beam_warp.schema.layout import CHANNELS, UP_AXES
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
-
-UP_AXES = {"rub": "Y", "rfu": "Z"}
-"""Axes that a stage can hold: right-handed, x right, and the up axis that says the rest."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a whole sequence holds.
+    """Properties of a whole sequence.
 
     Attributes:
         axes: Axes code of every frame.
-        counts: Number of Gaussians of each frame.
-        names: Arrays to write, in file order; always with ``radiance``.
-        varying: Those of them that are not the same in every frame.
-        half: Those of them that half precision is safe for.
-        captured: True if ``radiance`` was captured, False if it stands in for viewers that cannot relight.
+        counts: Number of Gaussians in each frame.
+        names: Arrays to write, in file order; ``radiance`` is always among them.
+        varying: Arrays that are not the same in every frame.
+        half: Arrays for which half precision is safe.
+        captured: True if ``radiance`` was captured; False if it is a substitute for viewers that cannot relight.
         color_space: Colour space of ``radiance``.
         sh_degree: Highest degree of ``radiance`` in any frame.
     """
@@ -49,11 +45,11 @@ class Survey:
 
 
 def survey_sequence(sequence: GaussianSequence) -> Survey:
-    """Read every frame once and say what a file must hold.
+    """Read every frame once and return the properties of the sequence.
 
     Raises:
-        InvalidOptionError: The axes are none that a stage can state, or frames differ in axes or colour space, or a
-            sequence of constant topology changes its count.
+        InvalidOptionError: A stage cannot state the axes, frames differ in axes or colour space, or the count changes
+            although the topology is constant.
         InvalidArrayError: Frames differ in which arrays they hold.
     """
     first = sequence[0]
@@ -93,7 +89,7 @@ def survey_sequence(sequence: GaussianSequence) -> Survey:
 
 
 def stored_arrays(cloud: GaussianCloud) -> dict[str, NDArray[Any]]:
-    """Return the arrays that a file holds: those of the cloud, and radiance even where none was captured."""
+    """Return the arrays of a cloud as a file holds them, with a substitute for radiance if none was captured."""
     arrays = cloud.arrays()
     if cloud.radiance is None:
         arrays["radiance"] = _fallback_radiance(cloud)
@@ -101,7 +97,7 @@ def stored_arrays(cloud: GaussianCloud) -> dict[str, NDArray[Any]]:
 
 
 def display_color(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return the mean colour of a cloud, scene-linear Rec.709 ``(3,)``, weighted by opacity."""
+    """Return the mean colour of a cloud weighted by opacity, scene-linear Rec.709, ``(3,)``."""
     if not len(cloud) or cloud.opacities.sum() <= 0.0:
         return np.full(3, 0.5, np.float32)
     if cloud.base_color is not None:
@@ -114,7 +110,7 @@ def display_color(cloud: GaussianCloud) -> NDArray[np.float32]:
 
 
 def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Degree 0 that shows base colour times ambient occlusion, display-encoded; mid grey without a base colour."""
+    """Return radiance of degree 0 that shows base colour times ambient occlusion, or mid grey without base colour."""
     if cloud.base_color is None:
         return np.zeros((len(cloud), 1, 3), np.float32)
     color = cloud.base_color.astype(np.float64)
@@ -124,14 +120,15 @@ def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
 
 
 def _require_same_kind(sequence: GaussianSequence, frame: int, cloud: GaussianCloud, first: GaussianCloud) -> None:
-    """Refuse a frame that one prim cannot hold together with frame 0."""
+    """Refuse a frame that cannot be stored in the same prim as frame 0."""
     names, wanted_names = set(cloud.arrays()), set(first.arrays())
     if names != wanted_names:
         raise InvalidArrayError(
             f"frames must hold the same arrays, got a difference in {', '.join(sorted(names ^ wanted_names))} "
             f"at frame {frame}. Fill or drop these arrays everywhere."
         )
-    for label, got, wanted in _kinds(cloud, first):
+    for label in ("axes", "radiance_color_space"):
+        got, wanted = getattr(cloud, label), getattr(first, label)
         if got != wanted:
             raise InvalidOptionError(
                 f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
@@ -142,9 +139,3 @@ def _require_same_kind(sequence: GaussianSequence, frame: int, cloud: GaussianCl
             f"topology must be perFrame where counts change, got {len(cloud)} Gaussians after {len(first)} at frame "
             f"{frame}. Build the sequence with topology='perFrame' and no constant arrays."
         )
-
-
-def _kinds(cloud: GaussianCloud, first: GaussianCloud) -> Iterator[tuple[str, object, object]]:
-    """What one prim states once for all frames."""
-    yield "axes", cloud.axes, first.axes
-    yield "radiance_color_space", cloud.radiance_color_space, first.radiance_color_space

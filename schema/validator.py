@@ -1,6 +1,6 @@
-"""Runs every rule, and OpenUSD's own validators beside them, on an asset or on an open stage.
+"""Validation of an asset or an open stage by every rule of ours and by OpenUSD's own validators.
 
-``python -m beam_warp.schema.validator ASSET`` is the child process of `validate`: a corrupt file may end it.
+`validate` runs ``python -m beam_warp.schema.validator ASSET`` as a child process, which a corrupt file may end.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +17,24 @@ from pxr import Tf, Usd, UsdValidation
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
 from beam_warp.schema.files import require_asset_file, run_child
-from beam_warp.schema.frame_rules import FRAME_RULES, Frame
+from beam_warp.schema.frame_rules import FRAME_RULES, FrameArrays
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
 from beam_warp.schema.probe import said_by_usd
-from beam_warp.schema.report import Finding, Report, Severity
+from beam_warp.schema.report import BrokenRule, Report, Severity
 from beam_warp.schema.rules import FIRST_RULES, PRIM_RULES, STAGE_RULES, Rule
 from beam_warp.schema.stage_queries import array_attribute, authored, sample_times, sequence_prim, splat_prims
 
 SECONDS = 120.0
-"""How long a validation may take, beside what the size of the asset allows."""
+"""Time limit of a validation, to which the time for reading the asset is added [s]."""
 
 BYTES_PER_SECOND = 20e6
-"""The slowest reading and checking that is still waited for."""
+"""Lowest rate of reading and checking that the time limit allows [byte/s]."""
 
 HOST_VALIDATOR = "beam_warp.schema.host_validator:AssetRules"
-"""Our rules as OpenUSD knows them; not run again beside our rules."""
-
+"""Name of our rules among OpenUSD's validators, where they are skipped because they run directly."""
 
 ALL_RULES = tuple(sorted([*STAGE_RULES, *FIRST_RULES, *PRIM_RULES, *FRAME_RULES], key=lambda rule: rule.id))
-"""Every rule of ours, by id."""
+"""All rules of ours, sorted by id."""
 
 
 def validate(path: str | Path) -> Report:
@@ -66,7 +66,7 @@ def validate_stage(stage: Usd.Stage) -> Report:
 
 
 def check_rules(stage: Usd.Stage) -> Report:
-    """Check a stage against our own rules only, holding two frames at a time."""
+    """Check a stage against our own rules only; at most two frames are in memory at a time."""
     findings = [finding for rule in STAGE_RULES for finding in _ask(rule, stage, "/")]
     frames = gaussians = 0
     for prim in splat_prims(stage):
@@ -76,33 +76,27 @@ def check_rules(stage: Usd.Stage) -> Report:
             findings += broken
             continue
         findings += [finding for rule in PRIM_RULES for finding in _ask(rule, prim, path)]
-        seen: dict[tuple[str, str], Finding] = {}
+        seen: dict[tuple[str, str], BrokenRule] = {}
         for index, (time, frame) in enumerate(_frames(prim)):
             frames = max(frames, index + 1)
             gaussians += frame.count if index == 0 else 0
             for rule in FRAME_RULES:
                 for found in _ask(rule, frame, path):
                     first = seen.get((found.rule, found.attribute))
-                    seen[found.rule, found.attribute] = Finding(
-                        found.rule,
-                        found.severity,
-                        first.message if first else found.message,
-                        path,
-                        found.attribute,
-                        first.time if first else time,
-                        first.frames + 1 if first else 1,
+                    seen[found.rule, found.attribute] = (
+                        replace(first, frames=first.frames + 1) if first else replace(found, time=time, frames=1)
                     )
         findings += seen.values()
     return Report(stage.GetRootLayer().identifier, tuple(findings), frames, gaussians)
 
 
-def _ask(rule: Rule, subject: object, path: str) -> Iterator[Finding]:
+def _ask(rule: Rule, subject: object, path: str) -> Iterator[BrokenRule]:
     for fault in rule.check(subject):
-        yield Finding(rule.id, rule.severity, fault.message, path, fault.attribute)
+        yield BrokenRule(rule.id, rule.severity, fault.message, path, fault.attribute)
 
 
-def _frames(prim: Usd.Prim) -> Iterator[tuple[float, Frame]]:
-    """Read a prim frame by frame; arrays that do not vary are read and checked once."""
+def _frames(prim: Usd.Prim) -> Iterator[tuple[float, FrameArrays]]:
+    """Read a prim frame by frame; arrays that do not vary are read once."""
     attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items()}
     attributes = {name: attribute for name, attribute in attributes.items() if attribute is not None}
     varying = frozenset(name for name, attribute in attributes.items() if attribute.ValueMightBeTimeVarying())
@@ -125,7 +119,7 @@ def _frames(prim: Usd.Prim) -> Iterator[tuple[float, Frame]]:
         extent = _value(prim.GetAttribute("extent"), time)
         yield (
             time,
-            Frame(
+            FrameArrays(
                 arrays={name: arrays[name] for name in CHANNELS if name in arrays},
                 changed=changed,
                 attributes={name: attribute.GetName() for name, attribute in attributes.items()},
@@ -139,15 +133,15 @@ def _frames(prim: Usd.Prim) -> Iterator[tuple[float, Frame]]:
 
 
 def _value(attribute: Usd.Attribute, time: float) -> object | None:
-    """Read a value; what a broken clip layer cannot give is None, and a rule about clips says so."""
+    """Read a value; None if a clip layer is broken, which a rule about clips reports."""
     try:
         return attribute.Get(time)
     except Tf.ErrorException:
         return None
 
 
-def _usd_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """Run every validator of OpenUSD and its plug-ins except our own."""
+def _usd_findings(stage: Usd.Stage) -> Iterator[BrokenRule]:
+    """Run all validators of OpenUSD and its plug-ins except our own."""
     registry = UsdValidation.ValidationRegistry()
     names = [
         data.name for data in registry.GetAllValidatorMetadata() if not data.isSuite and data.name != HOST_VALIDATOR
@@ -159,11 +153,11 @@ def _usd_findings(stage: Usd.Stage) -> Iterator[Finding]:
         site = next(iter(error.GetSites()), None)
         prim = site.GetPrim() if site is not None and site.IsPrim() else None
         path = str(prim.GetPath()) if prim else "/"
-        yield Finding(f"USD-{error.GetName()}", severity, " ".join(error.GetMessage().split()), path)
+        yield BrokenRule(f"USD-{error.GetName()}", severity, " ".join(error.GetMessage().split()), path)
 
 
 def main() -> None:
-    """Validate the asset named on the command line and print the report, or why it cannot be opened."""
+    """Validate the asset named on the command line; print the report, or why the asset cannot be opened."""
     register()
     try:
         stage = Usd.Stage.Open(sys.argv[1], Usd.Stage.LoadAll)

@@ -1,6 +1,6 @@
-"""Writes a sequence as a USD asset: decides which files there are and puts them in place.
+"""Writer of USD assets: decides on the files and puts them in place.
 
-The layout of the files is in SPEC.md; what a layer says is in `beam_warp.schema.authoring`.
+SPEC.md describes the files; `beam_warp.schema.authoring` makes the contents of each layer.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from beam_warp.world.gaussians import GaussianSequence
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
 MAX_FRAMES_IN_ONE_LAYER = 60
-"""Above this many frames a ``.usda`` or ``.usdz`` asset is cut into value clips."""
+"""Most frames of a ``.usda`` or ``.usdz`` asset without value clips."""
 
 USDZ_LIMIT = 2**32
-"""OpenUSD reads no ZIP64: an archive must stay below 4 GiB."""
+"""Size that an archive must stay below [byte], since OpenUSD does not read ZIP64."""
 
 
 def write_asset(
@@ -46,10 +46,10 @@ def write_asset(
 ) -> list[Path]:
     """Write a relightable 4D Gaussian asset.
 
-    Reads every frame twice (first to learn what varies and which precision is safe) and holds one segment at a time.
-    Arrays that are the same in every frame are written once. Arrays are written in half precision where that is safe
-    (see `beam_warp.schema.layout`); positions always in float. Layers of an earlier asset of the same name are
-    replaced where names meet; its further segments stay, unused.
+    Every frame is read twice, first to find what varies and which precision is safe; one segment is in memory at once.
+    Arrays that are the same in every frame are written once. Arrays are written in half precision if that is safe
+    (see `beam_warp.schema.layout`); positions are always in float. Files of an earlier asset with the same names are
+    replaced; its other segments stay, unused.
 
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
@@ -92,7 +92,7 @@ def write_asset(
 
 
 def _write_single(contents: AssetContents, folder: Path, name: str, save_every: int) -> list[str]:
-    """Write one binary layer with everything; saving as we go keeps memory flat, since USD maps what is on disk."""
+    """Write one binary layer with everything, saved repeatedly so that USD keeps frames on disk and not in memory."""
     layer = Sdf.Layer.CreateNew(str(folder / name))
     author_stage(layer, contents)
     author_asset_prim(layer, contents)
@@ -114,7 +114,7 @@ def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, save_
 
 
 def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
-    """Write a text root layer, a binary layer of what is constant, a manifest, and a binary layer per segment."""
+    """Write a text root layer, a binary layer of constant arrays, a manifest, and a binary layer for each segment."""
     static = Sdf.Layer.CreateNew(str(folder / f"{stem}.static.usdc"))
     author_stage(static, contents)
     author_asset_prim(static, contents)
@@ -140,7 +140,7 @@ def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
 
 
 def _clip_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
-    """Create a layer that declares exactly what varies: USD takes everything else from the static layer."""
+    """Create a layer that declares exactly the varying attributes; USD reads all others from the static layer."""
     layer = Sdf.Layer.CreateNew(str(path))
     author_stage(layer, contents)
     author_declarations(Sdf.CreatePrimInLayer(layer, SPLATS_PATH), contents, tuple(sorted(contents.varying)))
@@ -148,7 +148,7 @@ def _clip_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
 
 
 def _write_root(contents: AssetContents, folder: Path, stem: str, data: str, segments: list[tuple[int, str]]) -> str:
-    """Write the text layer that is opened: stage metadata, a reference to the data, and clips if there are any."""
+    """Write the text layer to open: stage metadata, a reference to the data, and clips if there are any."""
     name = f"{stem}.usda"
     layer = Sdf.Layer.CreateNew(str(folder / name))
     author_stage(layer, contents)
@@ -173,7 +173,7 @@ def _save(layer: Sdf.Layer) -> None:
 
 
 def _pack(folder: Path, names: list[str], target: Path) -> str:
-    """Pack staged layers into a package, the one to open first, as USDZ wants."""
+    """Pack staged layers into a package with the layer to open first, as USDZ requires."""
     _require_below_limit(target, sum((folder / name).stat().st_size for name in names))
     archive = Sdf.ZipFileWriter.CreateNew(str(folder / target.name))
     for name in reversed(names):
@@ -192,7 +192,7 @@ def _require_below_limit(target: Path, size: int) -> None:
 
 
 def _require_target(path: str | Path) -> Path:
-    """Refuse names that USD's asset paths cannot spell."""
+    """Refuse names that USD's asset paths cannot express."""
     target = Path(path)
     if target.suffix not in SUFFIXES:
         raise InvalidOptionError(

@@ -1,6 +1,6 @@
-"""A multi-view capture on disk: its cameras, frames and images, read lazily, in whichever layout it comes.
+"""Multi-view captures on disk, read lazily in any of three layouts: cameras, frames and images.
 
-Photographs that a lens has bent are undistorted as they are read, and their cameras are pinholes like all others.
+Distorted photographs are undistorted as they are read, so that every camera is a pinhole.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from beam_warp.errors import MissingFileError
 
 
 class Capture(CaptureContents):
-    """Images of a scene from many places and times; see `CaptureContents` for what it holds."""
+    """Images of a scene from many places and times; `CaptureContents` lists what it holds."""
 
     @classmethod
     def read(cls, folder: str | os.PathLike[str], *, keep: float = 0.0) -> Capture:
@@ -25,17 +25,17 @@ class Capture(CaptureContents):
 
         Three layouts are told apart by their files, in this order: nerfstudio's ``transforms.json``; a COLMAP model,
         ``cameras`` and ``images`` as ``.bin`` or ``.txt`` in the folder, in ``sparse`` or in ``sparse/0``; and 3 x 4
-        matrices, ``<image>_P.txt`` (see `projection_captures`). Where a file has no frames or cameras, every record is
-        of frame 0 at time 0, and its camera is named after its image. Nerfstudio's split is ``train`` unless
-        ``test_filenames`` or ``val_filenames`` lists the image.
+        matrices, ``<image>_P.txt`` (see `beam_warp.capture.projections`). Where a file states no frames or cameras,
+        every record is of frame 0 at time 0, and its camera is named after its image. Nerfstudio's split is ``train``
+        unless ``test_filenames`` or ``val_filenames`` lists the image.
 
         Args:
             folder: The folder of the capture, or its ``transforms.json``.
-            keep: Of photographs that a lens has bent: 0 for the part that fills an undistorted image, 1 for all of
-                it with void at the borders (see `CaptureRecord.mask`), or anything between.
+            keep: How much of a distorted photograph to keep: 0 for the part that fills an undistorted image, 1 for
+                all of it with void at the borders (see `CaptureRecord.mask`), or a value between.
 
         Raises:
-            MissingFileError: It is no such folder, or a file that it names is not there.
+            MissingFileError: The folder has none of these layouts, or a file that it names does not exist.
             AssetFormatError: A file is damaged, a field is missing or out of range, a pose is not rigid, or a lens
                 cannot be inverted over its photograph; the message names the record.
             InvalidOptionError: ``keep`` is out of range.

@@ -1,7 +1,7 @@
-"""Captures whose cameras COLMAP found: ``cameras``, ``images`` and ``points3D``, as text or binary.
+"""Loader of COLMAP models: ``cameras``, ``images`` and ``points3D``, as text or binary.
 
-Poses are world-to-camera in `Camera`'s axes, and pixel (0, 0) has its centre at (0.5, 0.5), as here. COLMAP's world
-has no unit and no up of its own: both are kept as they are.
+COLMAP's poses are world-to-camera in `Camera`'s axes, and its pixel (0, 0) has its centre at (0.5, 0.5), as ours has.
+COLMAP's world states no unit and no up direction: coordinates are kept as they are.
 
 Source: COLMAP's documentation, "Output Format", and its camera models; binary files are little-endian.
 """
@@ -33,12 +33,13 @@ from beam_warp.capture.records import (
 from beam_warp.capture.undistort import Intrinsics
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
+from beam_warp.world.quaternions import matrix_of
 
 FOLDERS = ("", "sparse", "sparse/0")
-"""Where below a capture its model is looked for, in this order."""
+"""Folders below a capture in which its model is looked for, in this order."""
 
 SUFFIXES = (".bin", ".txt")
-"""Forms of a model; where both are there, the first is read, which has all digits."""
+"""Forms of a model; if both exist, the binary one is read, which has all digits."""
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
@@ -50,7 +51,7 @@ MODELS = {
     "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
     "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
 }
-"""Camera models that `Lens` expresses: COLMAP's number of each, and its parameters."""
+"""Camera models that `Lens` can express: COLMAP's number and parameters of each."""
 
 OTHER_MODELS = {
     6: "FULL_OPENCV",
@@ -58,10 +59,10 @@ OTHER_MODELS = {
     10: "THIN_PRISM_FISHEYE",
     11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }
-"""Models that are refused by name."""
+"""Camera models that are refused by name."""
 
 MAX_NAME_BYTES = 4096
-"""Longest image name."""
+"""Longest image name that is read [byte]."""
 
 _POINT_2D_BYTES = 24
 _TRACK_BYTES = 8
@@ -71,7 +72,7 @@ _NAMES_BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """A row of ``images``."""
+    """One row of ``images``: a world-to-camera pose (quaternion with w first), its camera and its image."""
 
     quaternion: NDArray[np.float64]
     translation: NDArray[np.float64]
@@ -81,7 +82,7 @@ class _Pose:
 
 
 def find(folder: Path) -> Path | None:
-    """Return the folder that holds a capture's model, or None."""
+    """Return the folder of a capture's model, or None if there is none."""
     for inner in FOLDERS:
         if any(
             (folder / inner / f"cameras{s}").is_file() and (folder / inner / f"images{s}").is_file() for s in SUFFIXES
@@ -95,13 +96,13 @@ def read(folder: Path, model: Path, keep: float) -> CaptureContents:
 
     Args:
         folder: The capture.
-        model: What `find` found.
-        keep: See `captures.Capture.read`.
+        model: Folder that `find` returned.
+        keep: See `Capture.read`.
 
     Raises:
         MissingFileError: A file cannot be read.
-        AssetFormatError: A file is truncated or damaged, a camera model is not one of `MODELS`, a camera that an image
-            names is not there, a pose is none, or a lens cannot be inverted; the message names file and row.
+        AssetFormatError: A file is truncated or damaged, a camera model is not one of `MODELS`, an image names a camera
+            that does not exist, a pose is not rigid, or a lens cannot be inverted; the message names file and row.
     """
     suffix = next(s for s in SUFFIXES if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
     binary = suffix == ".bin"
@@ -159,15 +160,8 @@ def _record(
 
 
 def _camera_to_world(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn a world-to-camera quaternion (w first) and translation around."""
-    w, x, y, z = quaternion
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Invert a world-to-camera pose, given as a unit quaternion (w first) and a translation."""
+    rotation = matrix_of(quaternion[[1, 2, 3, 0]])
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ translation
@@ -175,7 +169,7 @@ def _camera_to_world(quaternion: NDArray[np.float64], translation: NDArray[np.fl
 
 
 def _photograph(model: str, width: int, height: int, parameters: list[float], where: str) -> Photograph:
-    """Read the parameters of a model by their names."""
+    """Make a camera of a model's parameters, which are told apart by their names."""
     if not (0 < width <= 2**16 and 0 < height <= 2**16):
         raise AssetFormatError(
             f"size of a camera must be in [1, {2**16}] px, got {width} x {height} at {where}. Correct the file."
@@ -220,7 +214,7 @@ def _content(path: Path) -> bytes:
 
 
 class _Bytes:
-    """A binary file, read front to back; nothing is allocated that its length does not bear out."""
+    """A binary file, read from front to back; no count is believed that the file's length does not allow."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -236,14 +230,14 @@ class _Bytes:
         return values
 
     def count(self, least: int, most: int = 2**63) -> int:
-        """Return a count of things of at least so many bytes each."""
+        """Return a count of items that take at least ``least`` bytes each."""
         (count,) = self.take(_COUNT)
         if count > most or count * least > len(self.data) - self.place:
             raise _cut(self.path)
         return count
 
     def skip(self, size: int) -> None:
-        """Pass over bytes."""
+        """Skip bytes."""
         if self.place + size > len(self.data):
             raise _cut(self.path)
         self.place += size
@@ -329,7 +323,7 @@ class _Line:
         return int(word)
 
     def numbers(self, start: int, end: int | None = None) -> list[float]:
-        """Return some words as numbers, finite or not."""
+        """Return some words as numbers, which may be infinite or NaN."""
         if end is not None:
             self._word(end - 1)
         try:
@@ -347,7 +341,7 @@ class _Line:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Return the numbered lines of a text file that are no comments, the empty ones too."""
+    """Return the lines of a text file with their numbers, without comments; empty lines are kept."""
     try:
         text = _content(path).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -378,7 +372,7 @@ def _text_cameras(path: Path) -> dict[int, Photograph]:
 
 
 def _text_poses(path: Path) -> Iterator[_Pose]:
-    """Every image is two lines, the second of which, its points, may be empty; empty lines before the first are not."""
+    """Yield the poses of a text file: two lines for each image, of which the second lists points and may be empty."""
     lines = _lines(path)
     for number, text in lines:
         line = _Line(text, f"{path}, line {number}")

@@ -1,8 +1,8 @@
-"""What a frame of a capture is made of, as one digest: two frames with the same digest reconstruct to the same bytes.
+"""Digests of a capture's frames: two frames with the same digest reconstruct to the same bytes.
 
 A digest covers everything that a record states (camera, lens, names) and the *content* of its files, so a capture may
-be moved or copied. Reading gigabytes again to learn that nothing has changed would be slow; so, as version control
-does, the content is read again only when a file's path, size, times or inode are others than when it was last read.
+be moved or copied. Content is read again only if a file's path, size, times or inode have changed since it was last
+read, as in version control: reading gigabytes to learn that nothing has changed would be slow.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ UNREAD_FIELDS = frozenset({"truth_path", "relit_paths"})
 
 
 class CaptureDigests:
-    """Digests of frames; what they were found from is kept in a folder, one small file for each frame."""
+    """Digests of frames, with a memory: one small file a frame that lists the digests of the images."""
 
     def __init__(self, folder: Path) -> None:
-        """Keep what is learnt in a folder that exists."""
+        """Keep the memory in a folder, which must exist."""
         self._folder = folder
 
     def of(self, frame: int, records: Sequence[CaptureRecord], pool: Executor) -> str:
-        """Return the digest of the records of one frame, in their order; files are read by the pool.
+        """Return the digest of one frame's records, in their order; the pool reads the files.
 
         Raises:
             MissingFileError: A file is not there or cannot be read.
@@ -63,7 +63,7 @@ def require_files(records: Iterable[CaptureRecord]) -> None:
     """Refuse records whose files are not there, before any work starts.
 
     Raises:
-        MissingFileError: Names the first one and says how many there are.
+        MissingFileError: A file does not exist; the message names the first one and their number.
     """
     missing = [path for record in records for path in files_of(record) if not path.is_file()]
     if missing:
@@ -74,7 +74,7 @@ def require_files(records: Iterable[CaptureRecord]) -> None:
 
 
 def _remembered(path: Path) -> dict[str, list[Any]]:
-    """Read what is known of a frame's files; whatever is wrong with the memory, the files are read instead."""
+    """Read what is known of a frame's files; nothing is known if the memory is absent or damaged."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {str(name): list(entry) for name, entry in content.items()}
@@ -83,7 +83,7 @@ def _remembered(path: Path) -> dict[str, list[Any]]:
 
 
 def _remember(path: Path, content: Mapping[str, Any]) -> None:
-    """Keep what is known; that it cannot be kept costs time and nothing else."""
+    """Keep what is known; a failure to do so only costs time later."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with contextlib.suppress(OSError):
         temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -1,53 +1,54 @@
-"""What is wrong with a capture's images, as far as glimpses of them tell: black ones, coverage, exposure."""
+"""Faults of a capture's images, as far as small copies of them show: black images, coverage, exposure."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.findings import Finding, are, count_of, names_of
+from beam_warp.capture.findings import Findings, are, count_of, names_of
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.image.files import display_image
 
 GLIMPSE_SIDE = 160
-"""Sides of images are judged at this many pixels or a little more, by whole factors."""
+"""Images are reduced by whole factors until their longer side is this long or a little longer [pixel]."""
 
 EXPOSURE_STOPS = 0.7
-"""Exposures further than this from those expected are reported, in powers of two. Light from one side makes views of a
-subject differ by 1.2 stops between front and back; what is left once that is fitted is 0.32 at most in our captures."""
+"""Exposures that differ from those expected by more than this are reported [stops]. Light from one side makes views of
+a subject differ by 1.2 stops between front and back; the rest, once that is fitted, is 0.32 at most in our captures."""
 
 FIT_CAMERAS = 10
-"""Cameras from which on exposure is expected to vary linearly with the direction of view; with fewer, not at all."""
+"""Fewest cameras for which exposure is expected to vary linearly with the direction of view; with fewer, it is expected
+to be the same."""
 
 PLAIN_STOPS = 1.5
-"""Takes the place of `EXPOSURE_STOPS` with fewer cameras, where light from one side cannot be told from exposure."""
+"""Replaces `EXPOSURE_STOPS` with fewer cameras, where light from one side and exposure cannot be told apart [stops]."""
 
 BLACK = 1e-4
-"""Brightest pixel of an image that is called black, over the median of those of all."""
+"""An image is black if its brightest pixel is at most this share of the median image's brightest pixel."""
 
 SOLID = 0.5
-"""Alpha from which on a pixel is the subject's."""
+"""A pixel belongs to the subject if its alpha is above this."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 @dataclass(frozen=True, eq=False)
 class Glimpse:
-    """What one image shows, at a fraction of its resolution.
+    """One image at a fraction of its resolution.
 
     Attributes:
-        record: Its record.
+        record: The record of the image.
         pixels: Display sRGB, not premultiplied, ``(H, W, 3)`` uint8.
-        alpha: Coverage, ``(H, W)`` float32; None where it is not known.
+        alpha: Coverage, ``(H, W)`` float32; None if it is unknown.
         brightest: Largest value of a colour channel.
         exposure: Median luminance of the subject, or of all where coverage is not known, as a power of two; None for
             an image without a subject, or a black one.
-        coverage: Mean alpha; None where it is not known.
+        coverage: Mean alpha; None if it is unknown.
     """
 
     record: CaptureRecord
@@ -83,29 +84,53 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
     )
 
 
-def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse], findings: list[Finding]) -> set[str]:
-    """Find what images tell; return the names of those that show nothing."""
+def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse], findings: Findings) -> set[str]:
+    """Check the contents of images.
+
+    Args:
+        training: The records that are reconstructed from.
+        glimpses: Images that were looked at, of training records and others.
+        findings: List to which findings are added.
+
+    Returns:
+        Names of records whose images show nothing.
+    """
     if not glimpses:
         return set()
-    names = {record.name for record in training}
     level = float(np.median([glimpse.brightest for glimpse in glimpses]))
     empty = [glimpse for glimpse in glimpses if _is_empty(glimpse)]
     black = [glimpse for glimpse in glimpses if not glimpse.brightest > BLACK * level and glimpse not in empty]
-    left_out = _judge_void(training, glimpses, black, "black-image", "black", "Check the cameras.", findings)
-    left_out |= _judge_void(
-        training,
-        glimpses,
-        empty,
-        "empty-mask",
-        "of nothing, by mask or alpha,",
-        "Right if the subject is out of the image; else make the masks again.",
-        findings,
-    )
+    left_out: set[str] = set()
+    for void, code, what, remedy in (
+        (black, "black-image", "black", "Check the cameras."),
+        (
+            empty,
+            "empty-mask",
+            "of nothing, by mask or alpha,",
+            "Right if the subject is out of the image; else make the masks again.",
+        ),
+    ):
+        if not void:
+            continue
+        dead = _dead_cameras(glimpses, void)
+        findings.add(
+            "error" if len(void) == len(glimpses) else "warning",
+            code,
+            f"{count_of(len(void), 'image')} {are(void)} {what} and left out"
+            + (f", with all others of {names_of(sorted(dead))}" if dead else ""),
+            _names(void),
+            remedy,
+        )
+        left_out |= {*_names(void), *(record.name for record in training if record.camera_name in dead)}
     shown = [glimpse for glimpse in glimpses if glimpse not in black and glimpse not in empty]
     _judge_coverage(shown, findings)
-    used = [glimpse for glimpse in shown if glimpse.record.name in names and glimpse.exposure is not None]
-    _judge_exposure(used, findings)
+    names = {record.name for record in training}
+    _judge_exposure([glimpse for glimpse in shown if glimpse.record.name in names], findings)
     return left_out
+
+
+def _names(glimpses: Iterable[Glimpse]) -> list[str]:
+    return [glimpse.record.name for glimpse in glimpses]
 
 
 def _is_dim(alpha: NDArray[np.float32]) -> bool:
@@ -117,101 +142,62 @@ def _is_empty(glimpse: Glimpse) -> bool:
     return glimpse.alpha is not None and not glimpse.alpha.max() > SOLID and not _is_dim(glimpse.alpha)
 
 
-def _judge_void(
-    training: Sequence[CaptureRecord],
-    glimpses: Sequence[Glimpse],
-    void: Sequence[Glimpse],
-    code: str,
-    what: str,
-    remedy: str,
-    findings: list[Finding],
-) -> set[str]:
-    """Say which images show nothing; a camera none of whose images showed more is left out as a whole.
+def _dead_cameras(glimpses: Sequence[Glimpse], void: Sequence[Glimpse]) -> set[str]:
+    """Return the cameras all of whose glimpses are void; they are left out as a whole.
 
-    Those with empty masks too: one of them would carve away all of the subject.
+    This holds for empty masks too: a single one would carve away all of the subject.
     """
-    if not void:
-        return set()
-    looked: dict[str, int] = defaultdict(int)
-    for glimpse in glimpses:
-        looked[glimpse.record.camera_name] += 1
-    for glimpse in void:
-        looked[glimpse.record.camera_name] -= 1
-    dead = {name for name, left in looked.items() if not left}
-    findings.append(
-        Finding(
-            "error" if len(void) == len(glimpses) else "warning",
-            code,
-            f"{count_of(len(void), 'image')} {are(void)} {what} and left out"
-            + (f", with all others of {names_of(sorted(dead))}" if dead else ""),
-            names_of(glimpse.record.name for glimpse in void),
-            remedy,
-        )
-    )
-    return {g.record.name for g in void} | {record.name for record in training if record.camera_name in dead}
+    alive = {glimpse.record.camera_name for glimpse in glimpses if glimpse not in void}
+    return {glimpse.record.camera_name for glimpse in void} - alive
 
 
-def _judge_coverage(glimpses: Sequence[Glimpse], findings: list[Finding]) -> None:
-    """Find masks that say nothing."""
+def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
+    """Find masks that do not tell the subject from the background."""
     if not glimpses:
         return
-    unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
-    if len(unknown) == len(glimpses):
-        findings.append(
-            Finding(
-                "warning",
-                "no-coverage",
-                "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
-                remedy="Write masks (masks/<image>.png, white on the subject) for a subject by itself.",
-            )
+    known = [(glimpse, glimpse.alpha) for glimpse in glimpses if glimpse.alpha is not None]
+    if not known:
+        findings.warn(
+            "no-coverage",
+            "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
+            remedy="Write masks (masks/<image>.png, white on the subject) for a subject by itself.",
         )
         return
+    unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
     if unknown:
-        findings.append(
-            Finding(
-                "warning",
-                "some-coverage",
-                f"{count_of(len(unknown), 'image')} of {len(glimpses)} {are(unknown)} without alpha and mask: "
-                "all that they show counts",
-                names_of(glimpse.record.name for glimpse in unknown),
-                "Write their masks.",
-            )
+        findings.warn(
+            "some-coverage",
+            f"{count_of(len(unknown), 'image')} of {len(glimpses)} {are(unknown)} without alpha and mask: "
+            "all that they show counts",
+            _names(unknown),
+            "Write their masks.",
         )
-    known = [(glimpse, glimpse.alpha) for glimpse in glimpses if glimpse.alpha is not None]
     low = [glimpse for glimpse, alpha in known if _is_dim(alpha)]
     if low:
-        findings.append(
-            Finding(
-                "error",
-                "mask-range",
-                f"{count_of(len(low), 'mask')} {are(low)} never brighter than 2 of 255: written as 0 and 1, it seems",
-                names_of(glimpse.record.name for glimpse in low),
-                "Write masks with white as 255.",
-            )
+        findings.add(
+            "error",
+            "mask-range",
+            f"{count_of(len(low), 'mask')} {are(low)} never brighter than 2 of 255: written as 0 and 1, it seems",
+            _names(low),
+            "Write masks with white as 255.",
         )
     full = [glimpse for glimpse, alpha in known if float(alpha.min()) > 0.99]
     if full:
-        findings.append(
-            Finding(
-                "warning",
-                "full-mask",
-                f"mask or alpha of {count_of(len(full), 'image')} of {len(known)} is white everywhere: background "
-                "counts as the subject does",
-                names_of(glimpse.record.name for glimpse in full),
-                "Make the masks again, or drop alpha.",
-            )
+        findings.warn(
+            "full-mask",
+            f"mask or alpha of {count_of(len(full), 'image')} of {len(known)} is white everywhere: background "
+            "counts as the subject does",
+            _names(full),
+            "Make the masks again, or drop alpha.",
         )
     inverted = [glimpse for glimpse, alpha in known if glimpse not in full and _is_inverted(alpha)]
     if inverted:
-        findings.append(
-            Finding(
-                "warning",
-                "inverted-mask",
-                f"{count_of(len(inverted), 'mask')} {are(inverted)} white all along the border and not within: "
-                "perhaps inverted",
-                names_of(glimpse.record.name for glimpse in inverted),
-                "White is the subject.",
-            )
+        findings.warn(
+            "inverted-mask",
+            f"{count_of(len(inverted), 'mask')} {are(inverted)} white all along the border and not within: "
+            "perhaps inverted",
+            _names(inverted),
+            "White is the subject.",
         )
 
 
@@ -220,7 +206,7 @@ def _is_inverted(alpha: NDArray[np.float32]) -> bool:
     return bool(border.mean() > 0.95 and alpha.mean() < 0.95 * border.mean())
 
 
-def _judge_exposure(glimpses: Sequence[Glimpse], findings: list[Finding]) -> None:
+def _judge_exposure(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     """Find cameras and frames that are brighter or darker than the others."""
     by_camera: dict[str, dict[int, float]] = defaultdict(dict)
     forward = {}
@@ -237,47 +223,36 @@ def _judge_exposure(glimpses: Sequence[Glimpse], findings: list[Finding]) -> Non
     limit = EXPOSURE_STOPS if fits else PLAIN_STOPS
     wrong = {name: value for name, value in zip(names, off, strict=True) if abs(value) > limit}
     if wrong:
-        findings.append(
-            Finding(
-                "warning",
-                "camera-exposure",
-                f"{count_of(len(wrong), 'camera')} {are(wrong)} more than {limit:g} stops from what the others "
-                "lead to expect",
-                names_of(f"{name} {value:+.1f}" for name, value in wrong.items()),
-                "Match their exposure and white balance; a wrong camera pulls colours of all views.",
-            )
+        findings.warn(
+            "camera-exposure",
+            f"{count_of(len(wrong), 'camera')} {are(wrong)} more than {limit:g} stops from what the others "
+            "lead to expect",
+            (f"{name} {value:+.1f}" for name, value in wrong.items()),
+            "Match their exposure and white balance; a wrong camera pulls colours of all views.",
         )
     frames = sorted({frame for row in by_camera.values() for frame in row})
+    remedy = "Fix exposure while recording, or match the frames."
     for before, after in pairwise(frames):
         steps = {name: row[after] - row[before] for name, row in by_camera.items() if before in row and after in row}
         if not steps:
             continue
         common = float(np.median(list(steps.values())))
         if abs(common) > EXPOSURE_STOPS:
-            findings.append(
-                Finding(
-                    "warning",
-                    "frame-exposure",
-                    f"all cameras change by {common:+.1f} stops between frames {before} and {after}",
-                    remedy="Fix exposure while recording, or match the frames.",
-                )
-            )
+            what = f"all cameras change by {common:+.1f} stops between frames {before} and {after}"
+            findings.warn("frame-exposure", what, remedy=remedy)
         jumps = {name: step for name, step in steps.items() if abs(step - common) > EXPOSURE_STOPS}
         if jumps:
-            findings.append(
-                Finding(
-                    "warning",
-                    "frame-exposure",
-                    f"exposure of {count_of(len(jumps), 'camera')} changes by {EXPOSURE_STOPS:g} stops more than "
-                    f"that of the others between frames {before} and {after}",
-                    names_of(f"{name} {step:+.1f}" for name, step in jumps.items()),
-                    "Fix exposure while recording, or match the frames.",
-                )
+            findings.warn(
+                "frame-exposure",
+                f"exposure of {count_of(len(jumps), 'camera')} changes by {EXPOSURE_STOPS:g} stops more than "
+                f"that of the others between frames {before} and {after}",
+                (f"{name} {step:+.1f}" for name, step in jumps.items()),
+                remedy,
             )
 
 
 def _expected(levels: NDArray[np.float64], directions: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return the exposure expected of each camera: the median, or a plane over directions, of least absolute error."""
+    """Return each camera's expected exposure: the median, or a plane over directions fitted by least absolute error."""
     if directions is None:
         return np.full_like(levels, np.median(levels))
     columns = np.concatenate([np.ones((len(levels), 1)), directions], axis=1)

@@ -1,7 +1,7 @@
-"""What is wrong with a capture, before hours are spent on it: cameras, files, coverage, exposure.
+"""Inspection of a capture before hours are spent on it: cameras, files, coverage, exposure.
 
-Cameras are judged by their poses alone, files by their headers. Images are read from evenly many frames up to a limit,
-each at a fraction of its resolution: how many is in the report.
+Cameras are judged by their poses and intrinsics, files by their headers. Images are read of evenly spaced frames up to
+a limit, each at a fraction of its resolution; the report says how many.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.cameras import MIN_CAMERAS, judge_cameras
+from beam_warp.capture.cameras import MIN_CAMERAS, Volume, judge_cameras
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.findings import Finding, Severity, are, count_of, names_of
+from beam_warp.capture.findings import Finding, Findings, Severity, are, count_of, names_of
 from beam_warp.capture.images import Glimpse, glimpse_of, judge_images
 from beam_warp.capture.rigs import frustum_volume as frustum_volume
 from beam_warp.capture.rigs import up_direction
@@ -29,41 +29,41 @@ from beam_warp.image.files import image_size
 from beam_warp.world.camera import Camera
 
 SPLIT = "train"
-"""The records that are reconstructed from."""
+"""Split of the records that are reconstructed from."""
 
 MAX_IMAGES = 96
-"""Images read by default."""
+"""Most images read by default."""
 
 QUICK_IMAGES = 48
-"""Images read by default where reconstruction waits for it."""
+"""Most images read by default where reconstruction waits for the answer."""
 
 MAX_READERS = 8
 PIXELS_AT_A_TIME = 2**24
-"""Images of so many pixels in all are read at a time, a thread each: a pixel takes up to 100 bytes meanwhile."""
+"""Most pixels in memory at a time, over all images that are being read, one a thread; a pixel takes up to 100 bytes."""
 
 MAX_HEADERS = 8192
-"""Files whose presence and size are looked at; of more, evenly many are."""
+"""Most files whose presence and size are checked; of more files, an even selection is checked."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureReport:
-    """What was found.
+    """Result of an inspection.
 
     Attributes:
-        capture: The capture.
-        findings: Errors first.
-        cameras: One camera of each name, of its first frame.
-        glimpses: Of the images that were read.
-        volume: The box that most training cameras see, low and high; None if there is none.
+        capture: The capture that was inspected.
+        findings: All findings, errors first.
+        cameras: One camera of each name, as in its first frame.
+        glimpses: Small copies of the images that were read.
+        volume: The box that most training cameras see [m]; None if there is none.
         up: Mean upward direction of the cameras.
-        left_out: Names of training records that cannot be used: the fallback is to do without them.
+        left_out: Names of training records that cannot be used; reconstruction does without them.
     """
 
     capture: Capture
     findings: tuple[Finding, ...]
     cameras: dict[str, Camera]
     glimpses: tuple[Glimpse, ...]
-    volume: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    volume: Volume | None
     up: NDArray[np.float64]
     left_out: frozenset[str]
 
@@ -103,25 +103,25 @@ class Readiness:
     """A capture that can be reconstructed.
 
     Attributes:
-        capture: Without the training records that cannot be used.
-        volume: The box that most training cameras see, low and high [m].
-        fallbacks: What is done without, or assumed: to be shown.
+        capture: The capture without the training records that cannot be used.
+        volume: The box that most training cameras see [m].
+        fallbacks: Warnings and notes, which the user should see.
     """
 
     capture: Capture
-    volume: tuple[NDArray[np.float64], NDArray[np.float64]]
+    volume: Volume
     fallbacks: tuple[Finding, ...]
 
 
 def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES) -> Readiness:
-    """Refuse a capture from which nothing can be reconstructed, and say what is done without in one that can be.
+    """Refuse a capture that cannot be reconstructed; for any other, return what is left out or assumed.
 
     Args:
-        capture: To be reconstructed from its training records.
-        max_images: Images read to find out.
+        capture: The capture, whose training records are to be reconstructed from.
+        max_images: Most images read for the inspection.
 
     Raises:
-        MissingFileError: So many images are missing that a frame has fewer than `MIN_CAMERAS`.
+        MissingFileError: So many images are missing that a frame has fewer than `MIN_CAMERAS` cameras.
         AssetFormatError: Anything else of severity ``error``; see `inspect_capture`.
     """
     report = inspect_capture(capture, max_images=max_images)
@@ -142,18 +142,18 @@ def inspect_capture(
     max_images: int = MAX_IMAGES,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> CaptureReport:
-    """Find what is wrong with a capture.
+    """Inspect a capture.
 
     Args:
-        capture: Its training records are judged; the others' files too.
-        max_images: Images read; frames are taken evenly, the first and last among them.
+        capture: The capture. Its training records are judged; of other records, only the files.
+        max_images: Most images read, of evenly spaced frames with the first and the last among them.
         progress: Called with (stage, done, total).
 
     Raises:
         InvalidOptionError: ``max_images`` is out of range.
     """
     require_count("max_images", max_images, 1, 10**6)
-    findings = [Finding("note", "assumed", note) for note in capture.notes]
+    findings = Findings(Finding("note", "assumed", note) for note in capture.notes)
     training = capture.select(split=SPLIT)
     cameras = {record.camera_name: record.camera for record in reversed(capture.records)}
     cameras = {name: cameras[name] for name in sorted(cameras)}
@@ -173,14 +173,11 @@ def inspect_capture(
                 damaged.append((chosen[index], found))
     if damaged:
         left_out |= {record.name for record, _ in damaged}
-        findings.append(
-            Finding(
-                "warning",
-                "damaged-image",
-                f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: "
-                f"{str(damaged[0][1]).removesuffix('.')}",
-                names_of(record.name for record, _ in damaged),
-            )
+        findings.warn(
+            "damaged-image",
+            f"{count_of(len(damaged), 'image')} cannot be read and {are(damaged)} left out: "
+            f"{str(damaged[0][1]).removesuffix('.')}",
+            (record.name for record, _ in damaged),
         )
     left_out |= judge_images(training, glimpses, findings)
     _judge_frames(training, left_out, findings)
@@ -197,7 +194,7 @@ def inspect_capture(
 
 
 def _reader_count(records: Sequence[CaptureRecord]) -> int:
-    """Return how many images to read at a time: as there are processors, while they fit into memory."""
+    """Return how many images to read at a time: one a processor, as far as they fit into memory."""
     largest = max((record.camera.width * record.camera.height for record in records), default=1)
     return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_A_TIME // largest))
 
@@ -214,83 +211,64 @@ def _below(folder: Path, path: Path | None) -> str:
     return str(path.relative_to(folder) if path is not None and path.is_relative_to(folder) else path)
 
 
-def _judge_files(capture: Capture, findings: list[Finding]) -> set[str]:
+def _judge_files(capture: Capture, findings: Findings) -> set[str]:
     """Find files that are missing or of another size; return the names of records that cannot be read."""
     step = -(-len(capture.records) // MAX_HEADERS)
-    missing, masks, sizes, damaged = [], [], [], []
+    missing: dict[str, list[CaptureRecord]] = {"image": [], "mask": []}
+    sizes: dict[str, list[tuple[CaptureRecord, str]]] = {"image": [], "mask": []}
+    damaged: list[tuple[CaptureRecord, BeamError]] = []
     for record in capture.records[::step]:
         expected = (record.camera.width, record.camera.height)
-        try:
-            size = image_size(record.image_path)
-            if size != expected:
-                sizes.append((record.name, f"{size[0]} x {size[1]} for {expected[0]} x {expected[1]}", "image"))
-        except MissingFileError:
-            missing.append(record)
-            continue
-        except BeamError as error:
-            damaged.append((record, error))
-            continue
-        if record.mask_path is not None:
+        for what, path in (("image", record.image_path), ("mask", record.mask_path)):
+            if path is None:
+                continue
             try:
-                size = image_size(record.mask_path)
+                size = image_size(path)
                 if size != expected:
-                    sizes.append((record.name, f"{size[0]} x {size[1]} for {expected[0]} x {expected[1]}", "mask"))
-            except MissingFileError:
-                masks.append(record)
+                    sizes[what].append((record, f"{size[0]} x {size[1]} for {expected[0]} x {expected[1]}"))
             except BeamError as error:
-                damaged.append((record, error))
-    if missing:
-        findings.append(
-            Finding(
-                "error" if len(missing) * step >= len(capture.records) else "warning",
-                "missing-image",
-                f"{count_of(len(missing), 'image')} of {len(capture.records)} {are(missing)} missing and left out: "
-                f"{_below(capture.folder, missing[0].image_path)}",
-                names_of(record.name for record in missing),
-                "Copy them there, or take the records out.",
-            )
+                if isinstance(error, MissingFileError):
+                    missing[what].append(record)
+                else:
+                    damaged.append((record, error))
+                if what == "image":
+                    break
+    images, masks = missing["image"], missing["mask"]
+    if images:
+        findings.add(
+            "error" if len(images) * step >= len(capture.records) else "warning",
+            "missing-image",
+            f"{count_of(len(images), 'image')} of {len(capture.records)} {are(images)} missing and left out: "
+            f"{_below(capture.folder, images[0].image_path)}",
+            (record.name for record in images),
+            "Copy them there, or take the records out.",
         )
     if masks:
-        findings.append(
-            Finding(
-                "warning",
-                "missing-mask",
-                f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: "
-                f"{_below(capture.folder, masks[0].mask_path)}",
-                names_of(record.name for record in masks),
-                "Copy them there.",
-            )
+        findings.warn(
+            "missing-mask",
+            f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: "
+            f"{_below(capture.folder, masks[0].mask_path)}",
+            (record.name for record in masks),
+            "Copy them there.",
         )
     if damaged:
-        findings.append(
-            Finding(
-                "warning",
-                "damaged-image",
-                f"{count_of(len(damaged), 'file')} cannot be read, and the images are left out: {damaged[0][1]}".rstrip(
-                    "."
-                ),
-                names_of(record.name for record, _ in damaged),
-            )
-        )
-    for what in ("image", "mask"):
-        wrong = [(name, text) for name, text, kind in sizes if kind == what]
+        what = f"{count_of(len(damaged), 'file')} cannot be read, and the images are left out: {damaged[0][1]}"
+        findings.warn("damaged-image", what.rstrip("."), (record.name for record, _ in damaged))
+    for what, wrong in sizes.items():
         if wrong:
-            findings.append(
-                Finding(
-                    "error",
-                    f"{what}-size",
-                    f"{count_of(len(wrong), what)} {are(wrong)} not of the camera's size: {wrong[0][1]}",
-                    names_of(name for name, _ in wrong),
-                    "Scale the intrinsics with the images, or export the images at the size of the calibration.",
-                )
+            findings.add(
+                "error",
+                f"{what}-size",
+                f"{count_of(len(wrong), what)} {are(wrong)} not of the camera's size: {wrong[0][1]}",
+                (record.name for record, _ in wrong),
+                "Scale the intrinsics with the images, or export the images at the size of the calibration.",
             )
-    return {record.name for record in (*missing, *masks, *(record for record, _ in damaged))} | {
-        name for name, _, _ in sizes
-    }
+    unusable = [*images, *masks, *(record for record, _ in (*damaged, *sizes["image"], *sizes["mask"]))]
+    return {record.name for record in unusable}
 
 
 def _sample(capture: Capture, most: int) -> list[CaptureRecord]:
-    """Return the records to look at: of evenly many frames, the first and last among them, all that there are."""
+    """Return the records to look at: all those of evenly spaced frames, the first and the last among them."""
     by_frame: dict[int, list[CaptureRecord]] = defaultdict(list)
     for record in capture.records:
         by_frame[record.frame].append(record)
@@ -301,8 +279,8 @@ def _sample(capture: Capture, most: int) -> list[CaptureRecord]:
     return rows if len(rows) <= most else [rows[round(place)] for place in np.linspace(0, len(rows) - 1, most)]
 
 
-def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], findings: list[Finding]) -> None:
-    """Find frames that lack cameras, before and after leaving out."""
+def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], findings: Findings) -> None:
+    """Find frames that lack cameras, before and after records are left out."""
     by_frame: dict[int, set[str]] = defaultdict(set)
     usable: dict[int, int] = defaultdict(int)
     for record in training:
@@ -312,15 +290,12 @@ def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], finding
     lacking = {frame: cameras - names for frame, names in by_frame.items() if names != cameras}
     if lacking:
         frame = min(lacking)
-        findings.append(
-            Finding(
-                "warning",
-                "frame-lacks-cameras",
-                f"{count_of(len(lacking), 'frame')} of {len(by_frame)} {are(lacking)} without some cameras: frame "
-                f"{frame} without {names_of(sorted(lacking[frame]), 3)}",
-                f"frames {names_of(sorted(lacking))}",
-                "They are reconstructed from the cameras that there are.",
-            )
+        findings.warn(
+            "frame-lacks-cameras",
+            f"{count_of(len(lacking), 'frame')} of {len(by_frame)} {are(lacking)} without some cameras: frame "
+            f"{frame} without {names_of(sorted(lacking[frame]), 3)}",
+            f"frames {names_of(sorted(lacking))}",
+            "They are reconstructed from the cameras that there are.",
         )
     numbers = np.array(sorted(by_frame))
     if len(numbers) > 2:
@@ -328,23 +303,18 @@ def _judge_frames(training: Sequence[CaptureRecord], left_out: set[str], finding
         count = int(((np.diff(numbers) - 1) // step).sum())
         gaps = [int(number) for number in numbers[:-1][np.diff(numbers) > step]]
         if gaps:
-            findings.append(
-                Finding(
-                    "warning",
-                    "missing-frames",
-                    f"{count_of(count, 'frame')} between {numbers[0]} and {numbers[-1]} {are(range(count))} not there",
-                    f"after {names_of(gaps)}",
-                    "Motion is tracked over the gap.",
-                )
+            findings.warn(
+                "missing-frames",
+                f"{count_of(count, 'frame')} between {numbers[0]} and {numbers[-1]} {are(range(count))} not there",
+                f"after {names_of(gaps)}",
+                "Motion is tracked over the gap.",
             )
     bare = sorted(frame for frame, count in usable.items() if count < MIN_CAMERAS)
     if bare and len(cameras) >= MIN_CAMERAS:
-        findings.append(
-            Finding(
-                "error",
-                "frame-without-images",
-                f"{count_of(len(bare), 'frame')} of {len(by_frame)} {are(bare)} left with under {MIN_CAMERAS} images",
-                f"frames {names_of(bare)}",
-                "Copy their images, or take the frames out.",
-            )
+        findings.add(
+            "error",
+            "frame-without-images",
+            f"{count_of(len(bare), 'frame')} of {len(by_frame)} {are(bare)} left with under {MIN_CAMERAS} images",
+            f"frames {names_of(bare)}",
+            "Copy their images, or take the frames out.",
         )

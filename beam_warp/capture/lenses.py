@@ -1,8 +1,8 @@
-"""How a lens bends rays, and where a ray came from that a photograph shows.
+"""Lens distortion and its inverse.
 
-Points are in *tangent coordinates*, x / z and y / z in the camera's axes: a pixel less the principal point, over the
-focal length. A lens carries those of a ray to those at which the photograph shows it, both on the same optical axis
-and seen from the same point.
+Points are in *tangent coordinates*, x / z and y / z in the camera's axes: a pixel minus the principal point, over the
+focal length. A lens maps the tangent coordinates of a ray to those at which the photograph shows it; both refer to the
+same optical axis and centre of projection.
 
 Source: D. C. Brown 1966, "Decentering distortion of lenses"; J. Kannala and S. Brandt 2006 (fisheye); coefficients in
 the order and with the meaning of nerfstudio's ``transforms.json``.
@@ -26,15 +26,15 @@ COEFFICIENT_NAMES = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Coefficients in the order of `Lens.coefficients`."""
 
 MAX_COEFFICIENT = 1e6
-"""Largest coefficient: of long lenses, whose tangents are small, they are thousands."""
+"""Largest coefficient; those of long lenses, whose tangents are small, reach thousands."""
 
 MAX_TANGENT = 1e3
-"""Furthest from the axis that a lens is inverted, 3.4 arc minutes short of a right angle."""
+"""Largest tangent for which a lens is inverted, 3.4 arc minutes short of a right angle to the axis."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a lens bends rays.
+    """A lens model with its coefficients.
 
     ``OPENCV``, with r^2 = x^2 + y^2: the radius grows by 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and (x, y) moves by
     (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y). So k4 is the fourth coefficient of the polynomial, as
@@ -43,8 +43,8 @@ class Lens:
     k4 t^8), also where all coefficients are 0.
 
     Attributes:
-        coefficients: In the order of `COEFFICIENT_NAMES`.
-        model: Of `MODELS`.
+        coefficients: Coefficients in the order of `COEFFICIENT_NAMES`.
+        model: One of `MODELS`.
 
     Raises:
         InvalidOptionError: The model is unknown, or a coefficient is out of range or not one of the model.
@@ -75,9 +75,9 @@ class Lens:
 
     @cached_property
     def fold(self) -> float:
-        """The radius (of a fisheye: the angle) at which growing stops, so that nothing beyond has an inverse; or inf.
+        """Radius (of a fisheye: angle) beyond which the polynomial has no inverse; infinity if it always grows.
 
-        Up to there the polynomial grows: its derivative is 1 in the middle, and this is the first place where it is 0.
+        The derivative is 1 in the middle; this is the first place where it is 0.
         """
         derivative = [*(n * k for n, k in zip((9, 7, 5, 3), self.coefficients[3::-1], strict=True)), 1.0]
         roots = np.roots(derivative)
@@ -86,16 +86,16 @@ class Lens:
 
     @cached_property
     def limit(self) -> float:
-        """The radius (of a fisheye: the angle) up to which the lens is inverted: `fold`, or that of `MAX_TANGENT`."""
+        """Radius (of a fisheye: angle) up to which the lens is inverted: `fold`, or that of `MAX_TANGENT`."""
         return min(self.fold, float(np.arctan(MAX_TANGENT)) if self.model == "OPENCV_FISHEYE" else MAX_TANGENT)
 
     @property
     def fold_angle(self) -> float:
-        """The angle to the axis at which growing stops [rad], or infinity."""
+        """Angle to the axis of `fold` [rad], or infinity."""
         return self.fold if self.model == "OPENCV_FISHEYE" or self.fold == np.inf else float(np.arctan(self.fold))
 
     def distort(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return where the photograph shows rays.
+        """Map rays to their places in the photograph.
 
         Args:
             points: Tangent coordinates of the rays, ``(N, 2)``.
@@ -119,7 +119,7 @@ class Lens:
         return np.where(inside[:, None], bent, np.nan)
 
     def undistort(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return the rays that a photograph shows: the inverse of `distort`, to rounding.
+        """Return the rays of places in a photograph, the inverse of `distort` to rounding.
 
         The radius is found by Newton's method kept between bounds, on which the polynomial grows and so has one
         solution; where there are tangential terms, Newton's method in two dimensions goes on from there.
@@ -145,11 +145,11 @@ class Lens:
 
     @cached_property
     def largest_radius(self) -> float:
-        """The distorted radius at `limit`."""
+        """Distorted radius at `limit`."""
         return float(self._radial(np.array(self.limit))[0])
 
     def fault(self, radius: float) -> str:
-        """Say which coefficient has most of the blame that no ray is seen at a distorted radius."""
+        """Name the coefficient that contributes most to the failure of the inverse at a distorted radius."""
         if radius > self.largest_radius:
             terms = [(2 * i + 1) * k * self.fold ** (2 * i) for i, k in enumerate(self.coefficients[:4], start=1)]
             index, turn = int(np.argmin(terms)), f"radii stop growing at {self.fold:.4g}"
@@ -169,7 +169,7 @@ class Lens:
         return value, slope
 
     def _solve_radius(self, target: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the polynomial has a value, up to `limit`."""
+        """Return the argument, up to `limit`, at which the polynomial has a value."""
         low, high = np.zeros_like(target), np.full_like(target, self.limit)
         found = np.minimum(target, self.limit)
         for _ in range(64):  # halving alone reaches rounding in 53 turns

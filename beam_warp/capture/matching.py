@@ -1,4 +1,4 @@
-"""Which frame of an asset shows which frame of a capture."""
+"""Correspondence between the frames of an asset and those of a capture."""
 
 from __future__ import annotations
 
@@ -7,31 +7,21 @@ from collections.abc import Mapping, Sequence
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianSequence
-
-CAPTURE_FRAMES = "capture_frames"
-"""The key of a sequence's metadata that states the capture's number of every frame: ``0 1 2``."""
+from beam_warp.world.metadata import numbers_of_frames
 
 
 def match_frames(sequence: GaussianSequence, numbers: Sequence[int] | None = None) -> dict[int, int]:
-    """Return by the capture's frame number the index of the asset's frame that shows it.
+    """Map the capture's frame numbers to the indices of the asset's frames that show them.
 
     Args:
         sequence: The asset.
         numbers: The capture's number of every frame; None takes what the asset's metadata states, else 0, 1, 2, ….
 
     Raises:
-        InvalidOptionError: The numbers are not one for each frame, or one stands twice.
+        InvalidOptionError: There is not one number for each frame, or one occurs twice.
     """
     if numbers is None:
-        stated = sequence.metadata.get(CAPTURE_FRAMES)
-        if stated is None:
-            return {index: index for index in range(len(sequence))}
-        words = stated.split()
-        numbers = [int(word) for word in words if word.isascii() and word.isdigit()]
-        if len(numbers) != len(words):
-            raise InvalidOptionError(
-                f"{CAPTURE_FRAMES} must be frame numbers, got {stated[:40]!r} in the asset's metadata. State them anew."
-            )
+        numbers = numbers_of_frames(sequence.metadata, len(sequence))
     if len(numbers) != len(sequence):
         raise InvalidOptionError(
             f"capture-frames must be one number for each of {len(sequence)} frames of the asset, got {len(numbers)}. "
@@ -39,14 +29,14 @@ def match_frames(sequence: GaussianSequence, numbers: Sequence[int] | None = Non
         )
     if len(set(numbers)) < len(numbers):
         raise InvalidOptionError(
-            f"capture-frames must be other numbers for other frames, got {' '.join(map(str, numbers[:20]))}. "
-            "Name each frame once."
+            f"capture-frames must name each frame of the capture once, got {' '.join(map(str, numbers[:20]))}. "
+            "Give each frame of the asset another number."
         )
     return {number: index for index, number in enumerate(numbers)}
 
 
 def scored_frames(capture: Capture, matched: Mapping[int, int], *, split: str = "test") -> tuple[int, ...]:
-    """Return the capture's frames that have exact channels and that the asset shows, ascending.
+    """Return the capture's frames that the asset shows and whose exact channels are known, ascending.
 
     Raises:
         InvalidOptionError: The capture has no exact channels, or the asset shows none of those frames.
@@ -67,6 +57,6 @@ def scored_frames(capture: Capture, matched: Mapping[int, int], *, split: str = 
 
 
 def _listed(frames: Sequence[int]) -> str:
-    """Name frames, of many the first and the last."""
+    """List frame numbers; of many, only the first four and the last."""
     words = [str(frame) for frame in frames]
     return ", ".join(words) if len(words) <= 6 else f"{', '.join(words[:4])}, …, {words[-1]}"

@@ -1,9 +1,9 @@
-"""Captures in nerfstudio's layout: a ``transforms.json`` beside the images.
+"""Loader of captures in nerfstudio's layout: a ``transforms.json`` beside the images.
 
-Intrinsics for all records or for each one, and a camera-to-world pose in OpenGL axes (x right, y up, looking down
--z), turned here into `Camera`'s OpenCV axes. What nerfstudio does not have and a performance needs is read from
-further fields of a record: ``time``, ``frame``, ``camera``, ``split``, ``color_space``, and, for measuring errors,
-``truth`` and ``relit``.
+The file states intrinsics for all records or for each one, and for each record a camera-to-world pose in OpenGL axes
+(x right, y up, looking down -z), which is turned into `Camera`'s OpenCV axes. Further fields of a record, which
+nerfstudio does not have, describe a performance: ``time``, ``frame``, ``camera``, ``split`` and ``color_space``; and,
+for measuring errors, ``truth`` and ``relit``.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
 
 FILE_NAME = "transforms.json"
-"""The file that makes a folder a capture."""
+"""Name of the file that describes the capture."""
 
 MAX_FILE_BYTES = 2**30
-"""Largest file read: a million records take about half of it."""
+"""Largest file that is read; a million records take about half of it."""
 
 MAX_FRAME = 10**9
-"""Largest frame number."""
+"""Largest frame number that is read."""
 
 LENS_MODELS = {
     **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
     "OPENCV_FISHEYE": "OPENCV_FISHEYE",
 }
-"""Camera models of nerfstudio that are read, and what undistorts them: all but the last one are the same to it too."""
+"""Lens model for each of nerfstudio's camera models; nerfstudio too treats all but the last one alike."""
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read(path: Path, keep: float) -> CaptureContents:
-    """Read a ``transforms.json``; see `captures.Capture.read`."""
+    """Read a ``transforms.json``; see `Capture.read` for ``keep`` and errors."""
     content = _read_json(path)
     root = path.parent
     listed = content.get("frames")
@@ -96,11 +96,11 @@ def read(path: Path, keep: float) -> CaptureContents:
 
 
 def read_points(path: Path) -> SparsePoints:
-    """Read the points of a PLY file; colours, if any, are bytes of sRGB.
+    """Read the points of a PLY file, with colours if it has any, which are bytes of sRGB.
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is damaged, or has no positions, or some that are not finite.
+        AssetFormatError: It is damaged, has no positions, or has some that are not finite.
     """
     header = read_header(path)
     table = read_table(header, "vertex")
@@ -121,7 +121,7 @@ def read_points(path: Path) -> SparsePoints:
 
 
 class _Fields:
-    """One JSON object, read field by field; errors name the field and the place."""
+    """One JSON object, read field by field; errors name the field and where the object is."""
 
     def __init__(self, values: Mapping[str, Any], where: str) -> None:
         self.values = values
@@ -135,7 +135,7 @@ class _Fields:
         return float(value)
 
     def integer(self, name: str, default: int | None = None, *, low: int, high: int) -> int:
-        """Return an integer in range, also where a writer made it ``320.0``."""
+        """Return an integer in range; ``320.0`` counts as one."""
         value = self.number(name, default, low=low, high=high)
         if value != math.floor(value):
             raise self.error(name, "an integer", value)
@@ -149,7 +149,7 @@ class _Fields:
         return value
 
     def texts(self, name: str) -> list[str]:
-        """Return a list of texts, empty if it is not there."""
+        """Return a list of texts; an empty one if the field is absent."""
         value = self.values.get(name, [])
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
             raise self.error(name, "a list of texts", value)
@@ -163,7 +163,7 @@ class _Fields:
         return value
 
     def paths(self, name: str, root: Path) -> dict[str, Path]:
-        """Return named files, none if the field is not there."""
+        """Return named files; none if the field is absent."""
         value = self.values.get(name, {})
         if not isinstance(value, dict) or not all(isinstance(item, str) and item for item in value.values()):
             raise self.error(name, "an object of file names", value)
@@ -183,7 +183,7 @@ class _Fields:
         return matrix
 
     def error(self, name: str, contract: str, value: Any) -> AssetFormatError:
-        """Say what a field must be."""
+        """Make the error of a field that breaks its contract."""
         found = _shown(value) if value is not None else "nothing"
         return AssetFormatError(f"{name} must be {contract}, got {found} at {self.where}. Correct the file.")
 
@@ -196,7 +196,7 @@ _SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "came
 
 
 def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields that hold for every record unless the record says otherwise."""
+    """Return the fields that apply to every record that does not state them itself."""
     return {name: content[name] for name in _SHARED_NAMES if name in content}
 
 

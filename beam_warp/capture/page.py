@@ -1,4 +1,4 @@
-"""A capture's report as one self-contained HTML page: the rig to turn, images in their frustums, findings."""
+"""HTML page of a capture's report, in one file: the rig to turn, images in their frustums, findings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from beam_warp.checks import require_package
 from beam_warp.converters.staging import staged_outputs
 
 IMAGE_SIDE = 56
-"""Longer side of the images that stand in the frustums: each pixel is two triangles."""
+"""Longer side of the images in the frustums [pixel]; each pixel is drawn as two triangles."""
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 1.2em auto; max-width: 1400px; padding: 0 1em; color: #222; }
@@ -94,7 +94,7 @@ def _findings(report: CaptureReport) -> str:
 
 
 def _figure(glimpse: Glimpse, rig: Rig) -> str:
-    """Return an image with its outline, its name and its exposure."""
+    """Return the HTML of an image with its mask's outline, its name and its exposure."""
     name = html.escape(glimpse.record.camera_name, quote=True)
     exposure = "" if glimpse.exposure is None else f"{glimpse.exposure:+.1f} EV"
     color = COLORS[rig.kinds[glimpse.record.camera_name]]
@@ -107,7 +107,7 @@ def _figure(glimpse: Glimpse, rig: Rig) -> str:
 
 
 def _outlined(glimpse: Glimpse) -> NDArray[np.uint8]:
-    """Return an image with the outline of its mask drawn in, of one pixel at twice the size."""
+    """Return an image at twice its size, with its mask's outline drawn one pixel wide."""
     pixels = np.repeat(np.repeat(display_pixels(glimpse), 2, axis=0), 2, axis=1)
     if glimpse.alpha is not None:
         inside = np.asarray(ndimage.zoom(glimpse.alpha, 2, order=1, grid_mode=True, mode="nearest")) > 0.5
@@ -117,7 +117,7 @@ def _outlined(glimpse: Glimpse) -> NDArray[np.uint8]:
 
 
 def _data(rig: Rig, glimpses: list[Glimpse]) -> dict[str, Any]:
-    """Return a rig as the page's script reads it."""
+    """Return a rig in the form that the page's script reads."""
     by_camera = {glimpse.record.camera_name: glimpse for glimpse in glimpses}
     positions, colors = rig.points
     kinds = [kind for kind in COLORS if kind in rig.kinds.values()]
@@ -148,7 +148,7 @@ def _data(rig: Rig, glimpses: list[Glimpse]) -> dict[str, Any]:
 
 
 def _small(glimpse: Glimpse) -> dict[str, Any]:
-    """Return an image in few pixels: rows, columns and colours as hexadecimal digits, dashes where nothing is."""
+    """Return a small image: rows, columns, and six hexadecimal digits a pixel, or dashes outside the mask."""
     picture = PillowImage.fromarray(display_pixels(glimpse))
     scale = IMAGE_SIDE / max(picture.size)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))

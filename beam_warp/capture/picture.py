@@ -1,4 +1,4 @@
-"""A capture's report as one picture: the rig from two sides, what most cameras see, images with masks, findings."""
+"""Drawing of a capture's report: the rig from two sides, what most cameras see, images with masks, findings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.findings import Finding
+from beam_warp.capture.findings import Finding, count_of
 from beam_warp.capture.images import Glimpse
 from beam_warp.capture.inspect import SPLIT, CaptureReport
 from beam_warp.capture.records import SparsePoints
@@ -30,16 +30,16 @@ SHOWN_POINTS = 3000
 COLUMNS = 8
 
 COLORS = {"train": "#0072B2", "other": "#E08214", "left out": "#C51B1B"}
-"""Of cameras: those that are trained from, the others, and those that are left out."""
+"""Colour of a camera by its kind: used for training, not used for training, left out."""
 
 SEVERITY_COLORS = {"error": "#C51B1B", "warning": "#B36B00", "note": "#555555"}
 OUTLINE = "#00E5FF"
 VOLUME = "#2E8B57"
 BACKGROUND = 0.2
-"""Display grey behind subjects: dark ones stay visible, and white ones too."""
+"""Display grey behind subjects, on which dark and white ones are both visible."""
 
 DEPTH_SHARE = 0.16
-"""Depth at which frustums are drawn, in distances to what the cameras look at."""
+"""Depth of the drawn frustums, as a share of the cameras' distance to what they look at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +47,9 @@ class Rig:
     """A capture's cameras, as they are drawn.
 
     Attributes:
-        cameras: By name.
-        kinds: By name, of `COLORS`.
-        depth: Of the drawn frustums [m].
+        cameras: Cameras by name.
+        kinds: Kind of each camera by name, a key of `COLORS`.
+        depth: Depth of the drawn frustums [m].
         volume: Corners of the common volume, ``(8, 3)``, or None.
         points: Sparse points and their display colours, ``(P, 3)`` each.
     """
@@ -62,7 +62,7 @@ class Rig:
 
     @classmethod
     def of(cls, report: CaptureReport) -> Rig:
-        """Gather what is drawn."""
+        """Make the rig of a report."""
         poses = np.array([camera.camera_to_world for camera in report.cameras.values()])
         point = meeting_point(poses)
         if point is None:
@@ -81,7 +81,7 @@ class Rig:
         return cls(report.cameras, kinds, DEPTH_SHARE * (distance or 1.0), volume, _shown_points(report))
 
     def labels(self) -> dict[str, str]:
-        """Return the names of cameras without what those of one kind have in common at their start."""
+        """Return a label for each camera by name: the name without the start that all cameras of its kind share."""
         found = {}
         for kind in COLORS:
             names = [name for name, own in self.kinds.items() if own == kind]
@@ -91,7 +91,7 @@ class Rig:
 
 
 BOX = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
-"""Corners of a box: which of low and high each coordinate is."""
+"""Corners of a box: 0 or 1 for each coordinate, the low or the high bound."""
 
 BOX_EDGES = tuple(
     (a, b) for a in range(8) for b in range(a + 1, 8) if sum(x != y for x, y in zip(BOX[a], BOX[b], strict=True)) == 1
@@ -99,7 +99,7 @@ BOX_EDGES = tuple(
 
 
 def _common_start(names: Sequence[str]) -> int:
-    """Return how many leading characters names share, up to the last sign that parts words."""
+    """Return how many leading characters names share, up to the last separator of words."""
     if len(names) < 2:
         return 0
     same = 0
@@ -110,7 +110,7 @@ def _common_start(names: Sequence[str]) -> int:
 
 
 def _shown_points(report: CaptureReport) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return evenly many of a capture's points within reach, and their display colours."""
+    """Return an even selection of a capture's points near the common volume, and their display colours."""
     try:
         found: SparsePoints | None = report.capture.points()
     except BeamError:  # inspection reports it
@@ -128,7 +128,7 @@ def _shown_points(report: CaptureReport) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def shown_glimpses(report: CaptureReport) -> list[Glimpse]:
-    """Return the images to show, of the first frame that was looked at: what is left out, and evenly many others."""
+    """Return the images to show, of the first frame that was read: those left out, and an even selection of others."""
     if not report.glimpses:
         return []
     first = min(glimpse.record.frame for glimpse in report.glimpses)
@@ -143,7 +143,7 @@ def shown_glimpses(report: CaptureReport) -> list[Glimpse]:
 
 
 def display_pixels(glimpse: Glimpse) -> NDArray[np.uint8]:
-    """Return an image over the background, ``(H, W, 3)``."""
+    """Return an image over the background as 8-bit sRGB, ``(H, W, 3)``."""
     if glimpse.alpha is None:
         return glimpse.pixels
     alpha = glimpse.alpha[..., None]
@@ -155,17 +155,17 @@ def headline(report: CaptureReport) -> str:
     capture = report.capture
     splits = ", ".join(f"{len(capture.select(split=split)):,} {split}" for split in capture.splits)
     return (
-        f"{len(report.cameras)} cameras, {len(capture.frames)} frame{'s' if len(capture.frames) != 1 else ''}, "
+        f"{len(report.cameras)} cameras, {count_of(len(capture.frames), 'frame')}, "
         f"{len(capture.records):,} images ({splits}); {len(report.glimpses)} looked at"
     )
 
 
 def verdict(report: CaptureReport) -> str:
-    """Return what the findings come to."""
+    """Say whether a capture can be reconstructed."""
     errors, warnings = len(report.of("error")), len(report.of("warning"))
     if errors:
-        return f"cannot be reconstructed: {errors} error{'s' if errors != 1 else ''}, {warnings} warnings"
-    return "ready" if not warnings else f"ready, with {warnings} warning{'s' if warnings != 1 else ''}"
+        return f"cannot be reconstructed: {count_of(errors, 'error')}, {count_of(warnings, 'warning')}"
+    return f"ready, with {count_of(warnings, 'warning')}" if warnings else "ready"
 
 
 def write_picture(report: CaptureReport, path: Path) -> None:
@@ -202,7 +202,7 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     figure.text(1 - 0.3 / WIDTH, 1 - 0.36 / total, verdict(report), size=12, color=color, ha="right", va="center")
     rig = Rig.of(report)
     _legend(figure, rig, total)
-    _draw_rig(place(0.1, 0.8, 6.9, 4.9), rig, _outside_view(rig, report.up))
+    _draw_rig(place(0.1, 0.8, 6.9, 4.9), rig, _outside_view(rig))
     _draw_plan(place(7.55, 1.05, 4.2, 4.2), rig)
     top = heights["title"] + heights["rig"]
     for number, glimpse in enumerate(glimpses):
@@ -226,7 +226,7 @@ def _finding_lines(findings: Iterable[Finding]) -> list[tuple[str, str]]:
 
 
 def _legend(figure: Any, rig: Rig, total: float) -> None:
-    """Say what colours mean, once."""
+    """Draw the legend of colours."""
     from matplotlib.patches import Patch
 
     handles = [Patch(color=color, label=text) for text, color in legend_entries(rig)]
@@ -246,14 +246,14 @@ def _legend(figure: Any, rig: Rig, total: float) -> None:
 
 
 def legend_entries(rig: Rig) -> list[tuple[str, str]]:
-    """Return what is drawn in which colour."""
+    """Return the legend: each entry's text and colour."""
     names = {"train": "trained from", "other": "other cameras", "left out": "left out"}
     entries = [(names[kind], COLORS[kind]) for kind in COLORS if kind in rig.kinds.values()]
     return entries + ([("what most see", VOLUME)] if rig.volume is not None else [])
 
 
-def _outside_view(rig: Rig, up: NDArray[np.float64]) -> Camera:
-    """Return a camera that sees all cameras, from a little above."""
+def _outside_view(rig: Rig) -> Camera:
+    """Return a camera that sees the whole rig from a little above."""
     points = [camera.position for camera in rig.cameras.values()]
     points += [corner for camera in rig.cameras.values() for corner in frustum_corners(camera, rig.depth)]
     points += [] if rig.volume is None else list(rig.volume)
@@ -263,7 +263,7 @@ def _outside_view(rig: Rig, up: NDArray[np.float64]) -> Camera:
 
 
 def _draw_rig(axes: Any, rig: Rig, view: Camera) -> None:
-    """Draw frustums in perspective, far ones first and paler."""
+    """Draw the frustums in perspective, far ones first and paler."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.patheffects import withStroke
 
@@ -310,7 +310,7 @@ def _rgb(color: str) -> tuple[float, float, float]:
 
 
 def _draw_plan(axes: Any, rig: Rig) -> None:
-    """Draw the rig from above: z towards the eye."""
+    """Draw the rig from above, with z towards the viewer."""
     from matplotlib.patches import Polygon, Rectangle
 
     positions, colors = rig.points

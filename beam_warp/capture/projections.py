@@ -1,15 +1,14 @@
-"""Captures whose cameras are 3 x 4 projection matrices, a text file each, beside or below a folder of images.
+"""Loader of captures whose cameras are 3 x 4 projection matrices, one text file each.
 
-``<image>_P.txt`` holds the twelve numbers of P, row after row, which takes a world point (x, y, z, 1) to a multiple
-of its pixel (u, v, 1). P and every multiple of it, -P too, are the same camera: P = K [R | t] up to scale, with K
-upper triangular and of positive diagonal, and R a rotation, has one solution for each P whose left 3 x 3 is not
-singular.
+``<image>_P.txt`` holds the twelve numbers of P, row after row; images are in the same folder or in ``images``. P maps a
+world point (x, y, z, 1) to a multiple of its pixel (u, v, 1). P and every multiple of it, -P too, are the same camera:
+up to scale P = K [R | t] with K upper triangular with a positive diagonal and R a rotation, and K, R and t are unique
+if the left 3 x 3 of P is not singular.
 
-Matrices often belong to a larger grid than the images, which were made smaller afterwards. ``capture.json`` may state
-``scale``, the matrices' pixels per pixel of the images, and ``pixel_centers``: ``half`` (the default, as in `Camera`)
-or ``integer`` if the centre of the first pixel is (0, 0) in the matrices; and ``color_space``. Where the scale is not
-stated, it is the whole number from 1 to `MAX_SCALE` that brings the principal points nearest to the middle of the
-images: one for all.
+Images are often smaller than the grid that the matrices belong to. ``capture.json`` may state ``scale``, the matrices'
+pixels per pixel of the images; ``pixel_centers``: ``half`` (the default, as in `Camera`), or ``integer`` if the centre
+of the first pixel is (0, 0) in the matrices; and ``color_space``. If the scale is not stated, one scale is inferred for
+all images: the whole number from 1 to `MAX_SCALE` that brings the principal points nearest to the images' middle.
 """
 
 from __future__ import annotations
@@ -36,29 +35,29 @@ from beam_warp.image.files import SUFFIXES, image_size
 from beam_warp.world.camera import Camera
 
 SUFFIX = "_P.txt"
-"""What follows the image's name in that of its matrix."""
+"""Ending of a matrix file's name, after the name of its image."""
 
 OPTIONS_NAME = "capture.json"
 
 MAX_FILE_BYTES = 65536
-"""Largest file of a matrix or of options."""
+"""Largest file of a matrix or of options [byte]."""
 
 MAX_SCALE = 8
-"""Largest scale that is inferred; larger ones must be stated."""
+"""Largest scale that is inferred; a larger one must be stated."""
 
 MAX_OFF_CENTER = 0.1
-"""Furthest that a principal point may be from the middle, in sides of the image, for a scale to be inferred by it."""
+"""Largest distance of the principal point from the middle at which a scale is inferred, as a share of the side."""
 
 MAX_SKEW_SHIFT = 0.05
-"""Furthest that skew may move a pixel within the image for a camera to be taken as one without [pixel]."""
+"""Largest displacement of a pixel by skew that is ignored [pixel]."""
 
 SINGULAR = 1e-12
-"""Ratio of singular values below which a matrix, scaled to like rows, has no centre of projection."""
+"""Ratio of singular values below which a matrix with rows of equal length counts as singular."""
 
 
 @dataclass(frozen=True)
 class _Options:
-    """What ``capture.json`` says."""
+    """Contents of ``capture.json``."""
 
     scale: float | None = None
     pixel_centers: str = "half"
@@ -67,7 +66,7 @@ class _Options:
 
 @dataclass(frozen=True, eq=False)
 class Decomposition:
-    """A projection matrix taken apart: P = s K [R | t] with t = -R C.
+    """Factors of a projection matrix P = s K [R | t] with t = -R C.
 
     Attributes:
         intrinsics: K, upper triangular, K[2, 2] = 1 [pixel], ``(3, 3)``.
@@ -83,15 +82,15 @@ class Decomposition:
 
 
 def find(folder: Path) -> tuple[Path, ...]:
-    """Return a capture's matrices, by name."""
+    """Return the files of a capture's matrices, sorted by name."""
     return tuple(sorted(folder.glob(f"*{SUFFIX}"))) if folder.is_dir() else ()
 
 
 def decompose(matrix: NDArray[np.float64]) -> Decomposition:
-    """Take a projection matrix apart, ``(3, 4)``.
+    """Decompose a projection matrix ``(3, 4)``.
 
     Raises:
-        AssetFormatError: Its left 3 x 3 is singular: it has no centre of projection, or none at a finite place.
+        AssetFormatError: The left 3 x 3 is singular, so that there is no finite centre of projection.
     """
     left = matrix[:, :3]
     sizes = np.linalg.norm(left, axis=1, keepdims=True)
@@ -114,12 +113,12 @@ def decompose(matrix: NDArray[np.float64]) -> Decomposition:
 
 
 def read(folder: Path, matrices: Sequence[Path]) -> CaptureContents:
-    """Read a capture; see the head of this file. Matrices without an image are left out, which a note says.
+    """Read a capture; see the head of this file. Matrices without an image are left out, with a note.
 
     Raises:
         MissingFileError: No matrix has an image.
-        AssetFormatError: A file is damaged, a matrix is singular, skewed or left-handed, or the scale can neither be
-            inferred nor is stated.
+        AssetFormatError: A file is damaged, a matrix is singular, skewed or left-handed, or the scale is not stated
+            and cannot be inferred.
     """
     options = _read_options(folder / OPTIONS_NAME)
     found = {path.name.removesuffix(SUFFIX): path for path in matrices}
@@ -230,7 +229,7 @@ def _decompose_file(path: Path) -> Decomposition:
 
 
 def _off_center(part: Decomposition, size: tuple[int, int], scale: float) -> float:
-    """Return how far the principal point is from the middle, in sides of the image."""
+    """Return the principal point's distance from the image's middle, as a share of the side."""
     middle = part.intrinsics[:2, 2] / scale / size
     return float(np.abs(middle - 0.5).max())
 
@@ -252,10 +251,11 @@ def _infer_scale(parts: dict[str, Decomposition], sizes: dict[str, tuple[int, in
 
 
 def _require_facing(parts: dict[str, Decomposition], folder: Path) -> None:
-    """Refuse mirrored matrices: right-handed ones by sign only, whose cameras then have what they show behind them.
+    """Refuse mirrored matrices.
 
-    One matrix cannot tell: a mirrored camera and the negative of a camera that looks the other way are the same. Where
-    signs had to be changed, the place nearest to all optical axes tells: photographs show it.
+    If the sign of a mirrored matrix is changed, the camera has the scene behind it. A single matrix does not tell:
+    a mirrored camera and the negative of a camera that looks the other way are the same. Where signs were changed, the
+    point nearest to all optical axes is examined: it must lie in front of the cameras, since photographs show it.
     """
     if len(parts) < 2 or not any(part.negated for part in parts.values()):
         return
@@ -277,7 +277,7 @@ def _require_facing(parts: dict[str, Decomposition], folder: Path) -> None:
 
 
 def _camera(part: Decomposition, size: tuple[int, int], scale: float, shift: float, path: Path) -> Camera:
-    """Return the camera of the images' grid."""
+    """Return the camera of an image, whose grid is ``scale`` times coarser than the matrix'."""
     width, height = size
     k = part.intrinsics
     moved = abs(k[0, 1]) / k[1, 1] * max(k[1, 2], height * scale - k[1, 2]) / scale

@@ -1,6 +1,6 @@
-"""One image of a capture, and what the files of a capture hold together; loaders make them, `captures` gives them out.
+"""Records of a capture: its images, its sparse points and what its files state; the loaders make them.
 
-Images are read when they are asked for and never kept: a capture of any length costs the memory of its records.
+Images are read when they are asked for and never kept, so that memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from beam_warp.image.files import Image, read_image
 from beam_warp.world.camera import Camera
 
 MAX_RECORDS = 2**22
-"""Most images of one capture."""
+"""Most images that one capture may have."""
 
 ALPHA_ROUNDING = 2.0**-10
-"""Alpha this far outside [0, 1] is the rounding of a half float, two of which are added by a renderer's filter."""
+"""Largest distance of alpha from [0, 1] that is rounding: a renderer's filter adds two half floats."""
 
 COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
-"""What ``color_space`` may say of image files, for all records or one; without it each format's custom holds."""
+"""Values of ``color_space`` in a capture's files; without one, the convention of each image format holds."""
 
 IMAGE_FOLDER = "images"
 MASK_FOLDER = "masks"
-"""Where a capture names no masks, ``images/a/0.jpg`` has ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``."""
+"""Folder of masks that are not named: ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``, for ``images/a/0.jpg``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +52,17 @@ class CaptureRecord:
     """One image of a capture.
 
     Attributes:
-        camera_name: Which camera took it; fit for a file name.
-        frame: Which frame of the performance it shows, from 0.
-        time: When it was taken [s].
-        split: What it is for: ``train``, ``test``, ….
-        camera: The pinhole that `image` was taken by.
+        camera_name: Name of the camera that took the image; fit for a file name.
+        frame: Number of the frame of the performance, from 0.
+        time: When the image was taken [s].
+        split: Purpose of the image: ``train``, ``test``, ….
+        camera: Pinhole camera of `image`.
         image_path: The image file, as photographed.
-        mask_path: An image file, as photographed, that is white where the subject is; None if there is none.
-        color_space: Of the image file, `assets.LINEAR_REC709` or `DISPLAY_SRGB`; None for the custom of its format.
-        truth_path: An EXR of exact channels, where the capture is synthetic.
-        relit_paths: By name of the light, the exact image under it.
-        undistortion: What straightens the files, all of them, as they are read; None where a pinhole took them.
+        mask_path: An image file, as photographed, that is white on the subject; None if there is none.
+        color_space: Colour space of the file, `LINEAR_REC709` or `DISPLAY_SRGB`; None for the format's convention.
+        truth_path: An EXR of exact channels, if the capture is synthetic.
+        relit_paths: Exact images under other lights, by the name of the light.
+        undistortion: Undistortion of all files as they are read; None if a pinhole took them.
     """
 
     camera_name: str
@@ -79,12 +79,12 @@ class CaptureRecord:
 
     @property
     def name(self) -> str:
-        """``CAMERA_FRAME``, which names the record's files and no other's."""
+        """Unique name of the record, ``CAMERA_FRAME``, for files."""
         return f"{self.camera_name}_{self.frame:04d}"
 
     @property
     def is_distorted(self) -> bool:
-        """True if the file must be undistorted before a pinhole fits it, as `image` does."""
+        """True if the files are distorted; `image` and `view` undistort them."""
         return self.undistortion is not None
 
     def mask(self) -> NDArray[np.bool_]:
@@ -103,15 +103,15 @@ class CaptureRecord:
         return self._undistorted(self._photograph())
 
     def view(self) -> CapturedView:
-        """Read what reconstruction sees: scene-linear colour, undistorted, and the coverage of the subject.
+        """Read the image for reconstruction: scene-linear colour, undistorted, and coverage of the subject.
 
-        Coverage is the image's alpha; a mask file multiplies it, or stands for it where the image has none. The mask
-        is applied to the photograph before that is undistorted, so that edges of both are filtered alike. Without
-        either, coverage is not known: alpha is None. Nothing is kept: each call reads the files again.
+        Coverage is the image's alpha times the mask, or the one of them that exists; without either it is unknown, and
+        alpha is None. The mask is applied to the photograph before that is undistorted, so that edges of both are
+        filtered alike. Nothing is kept: each call reads the files again.
 
         Raises:
-            MissingFileError: The image or the mask that the capture names is not there.
-            AssetFormatError: One is damaged, not of the camera's size, or holds values that no image has.
+            MissingFileError: The image, or the mask that the capture names, does not exist.
+            AssetFormatError: A file is damaged, not of the camera's size, or holds values that no image has.
         """
         image = self._photograph()
         if self.mask_path is not None:
@@ -174,7 +174,7 @@ class CaptureRecord:
 
 
 def _masked(image: Image, mask: Image) -> Image:
-    """Return an image whose alpha is multiplied by a mask's brightness, as the file has it: coverage has no curve."""
+    """Return an image whose alpha is multiplied by a mask's brightness; coverage has no sRGB curve to decode."""
     rgb = mask.rgb()
     coverage = rgb[..., 0] if (rgb == rgb[..., :1]).all() else rgb.mean(axis=-1, dtype=np.float32)
     channels = dict(image.channels)
@@ -191,15 +191,15 @@ def _masked(image: Image, mask: Image) -> Image:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaptureContents:
-    """Images of a scene from many places and times, as a loader found them.
+    """Images of a scene from many places and times, as a loader found them, with what the files state.
 
     Attributes:
-        folder: Where it is.
+        folder: Folder of the capture.
         records: One for each image, in file order.
-        frames_per_second: Rate of the performance [1/s]; None if the file does not say.
-        environment_path: The light of the capture as a lat-long image; None if there is none.
-        read_points: Reads its sparse points; None if it has none.
-        notes: What had to be assumed or was left out, each a sentence.
+        frames_per_second: Rate of the performance [1/s]; None if it is not stated.
+        environment_path: Lat-long image of the light during the capture; None if there is none.
+        read_points: Function that reads the sparse points; None if there are none.
+        notes: Assumptions and omissions, a sentence each.
     """
 
     folder: Path
@@ -211,12 +211,12 @@ class CaptureContents:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The frames there are images of, ascending."""
+        """Numbers of all frames, ascending."""
         return tuple(sorted({record.frame for record in self.records}))
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """The splits there are, ascending."""
+        """Names of all splits, ascending."""
         return tuple(sorted({record.split for record in self.records}))
 
     def select(self, *, split: str | None = None, frames: Collection[int] | None = None) -> tuple[CaptureRecord, ...]:
@@ -231,21 +231,21 @@ class CaptureContents:
         """Read the sparse points of the scene; None if the capture has none.
 
         Raises:
-            MissingFileError: The file that it names is not there.
-            AssetFormatError: It is damaged.
+            MissingFileError: The file that it names does not exist.
+            AssetFormatError: The file is damaged.
         """
         return None if self.read_points is None else self.read_points()
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """How a lens bent what the photographs of a camera show.
+    """Intrinsics and lens of a camera's photographs.
 
     Attributes:
-        intrinsics: Those that go with the lens.
-        lens: What bent them.
-        model: The file's name of the lens, for messages.
-        where: The file's place that says so, for messages.
+        intrinsics: Intrinsics that go with the lens.
+        lens: Distortion of the photographs.
+        model: Name of the lens model in the capture's file, for messages.
+        where: Place in the capture's file that states them, for messages.
     """
 
     intrinsics: Intrinsics
@@ -254,12 +254,12 @@ class Photograph:
     where: str
 
     def undistort(self, pose: ArrayLike, pose_name: str, keep: float) -> tuple[Camera, Undistortion | None]:
-        """Return the pinhole that stands for a photograph, and what straightens it: None where it is straight.
+        """Return the pinhole camera of the undistorted image, and the undistortion, None if the lens has none.
 
         Args:
             pose: Camera to world in `Camera`'s axes, ``(4, 4)``.
-            pose_name: What the file calls it, for messages.
-            keep: See `captures.Capture.read`.
+            pose_name: Name of the pose in the file, for messages.
+            keep: See `Capture.read`.
 
         Raises:
             AssetFormatError: The lens cannot be inverted, or the pose is not rigid; the message names the place.
@@ -276,13 +276,13 @@ class Photograph:
 
 
 def camera_name_of(file_path: str) -> str:
-    """Name a camera after its image, where a capture does not: folders and stem, joined."""
+    """Return the name of a camera that the capture does not name: the folders and stem of its image, joined."""
     image = PurePosixPath(file_path.replace("\\", "/"))
     return "_".join([*(part for part in image.parts[:-1] if part not in ("/", "..")), image.stem])
 
 
 def mask_beside(root: Path, file_path: str) -> Path | None:
-    """Return the mask that lies in a capture's folder of masks where the image lies in that of images, if it does."""
+    """Return the mask that has the image's place, but below `MASK_FOLDER`; None if there is no such file."""
     image = PurePosixPath(file_path.replace("\\", "/"))
     parts = image.parts[1:] if image.parts[:1] == (IMAGE_FOLDER,) else image.parts
     inner = PurePosixPath(*parts)

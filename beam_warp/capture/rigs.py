@@ -1,6 +1,6 @@
-"""What cameras have in common: the place they look at, the volume that most of them see, and which way is up.
+"""Properties of a group of cameras: the point they look at, the volume that most of them see, and the up direction.
 
-All answers are robust: a minority of wrong cameras does not move them far.
+All estimates are robust: a minority of wrong cameras changes them little.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.world.camera import Camera
 
 MIN_SPREAD = 1e-4
-"""Least eigenvalue of the mean of I - a a^T over unit axes a for them to meet: within 0.6 degrees they do not."""
+"""Least eigenvalue of the mean of I - a a^T over unit axes a that meet; axes within 0.6 degrees are below it."""
 
 GRID = 32
-"""Points along each side of the grid on which the common volume is found, twice: the second within the first's box."""
+"""Points along each side of the grid on which the common volume is found; a second grid refines the first box."""
 
 MAX_CAMERAS = 64
-"""Most cameras that are asked what they see; of more, evenly many are."""
+"""Most cameras that are tested for what they see; of more cameras, an even selection is tested."""
 
 LEAST_SHARE = 1.0 / 3.0
-"""Where no point is seen by this share of the cameras, they have no volume in common."""
+"""Least share of the cameras that must see a point in common."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def meeting_point(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the point of least summed distance to the optical axes, ``(3,)``; None where these are nearly parallel.
+    """Return the point of least summed distance to the optical axes, ``(3,)``; None if they are nearly parallel.
 
-    Found by least squares with weights of one over the distance, so that stray cameras count little.
+    It is found by least squares with weights of one over the distance, so that stray cameras count little.
 
     Args:
         poses: Camera to world in `Camera`'s axes, ``(N, 4, 4)``.
@@ -75,20 +75,21 @@ def frustum_corners(camera: Camera, depth: float) -> NDArray[np.float64]:
 def frustum_volume(
     cameras: Sequence[Camera], *, share: float = 0.75
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the box that holds what most cameras see.
+    """Return the box around the points that most cameras see.
 
-    Looked for up to twice as far as from the cameras to the place they look at; of cameras that are nearly parallel,
-    up to four times as far as they are apart.
+    The search reaches from the point that the cameras look at as far as their distance to it; for nearly parallel
+    cameras, it reaches four times their extent ahead of them.
 
     Args:
-        cameras: At least two.
-        share: Of the cameras that must see a point; where none is seen by so many, 0.8 of the most that see any.
+        cameras: At least two cameras.
+        share: Share of the cameras that must see a point. If no point is seen by so many, it is 0.8 of the largest
+            number that see one point.
 
     Returns:
-        The lower and upper corner [m], ``(3,)`` each.
+        The lower and the upper corner [m], ``(3,)`` each.
 
     Raises:
-        InvalidOptionError: There are fewer than two cameras, no point is seen by two and by `LEAST_SHARE` of them, or
+        InvalidOptionError: There are fewer than two cameras, no point is seen by two of them and by `LEAST_SHARE`, or
             ``share`` is out of range.
     """
     require_number("share", share, 0.0, 1.0)
@@ -127,7 +128,7 @@ def _grid(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[
 
 
 def _region(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
-    """Return where to look for what cameras have in common: a centre, and how far from it."""
+    """Return the centre and the half-size of the box in which common points are searched."""
     poses = np.array([camera.camera_to_world for camera in cameras])
     positions = poses[:, :3, 3]
     point = meeting_point(poses)
@@ -142,14 +143,14 @@ def _region(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
 
 
 def facing_share(cameras: Sequence[Camera], poses: NDArray[np.float64] | None = None) -> float | None:
-    """Return the share of cameras that have the place where their axes meet in front of them and in the image.
+    """Return the share of cameras that show the point where the optical axes meet.
 
     Args:
-        cameras: Whose sides and focal lengths count.
-        poses: Others to judge them by than their own, ``(N, 4, 4)``.
+        cameras: Cameras with their intrinsics.
+        poses: Poses to use instead of the cameras' own, ``(N, 4, 4)``.
 
     Returns:
-        From 0 to 1; None where the axes are nearly parallel.
+        A share from 0 to 1; None if the axes are nearly parallel.
     """
     own = np.array([camera.camera_to_world for camera in cameras]) if poses is None else poses
     point = meeting_point(own)
@@ -165,10 +166,10 @@ def facing_share(cameras: Sequence[Camera], poses: NDArray[np.float64] | None = 
 
 
 NO_UP, ONE_UP = 0.3, 0.7
-"""Length of the mean upward direction below which cameras have no up in common, and above which they do."""
+"""Lengths of the mean upward direction: below the first, cameras have no common up; above the second, they do."""
 
 UP_MARGIN = 0.2
-"""Mistakes whose cameras agree on up, and on z as up, within this are not told apart."""
+"""Largest difference in agreement on up, and on z as up, at which two mistakes are not told apart."""
 
 POSE_MISTAKES = {
     "OpenCV poses were given as OpenGL's, or the other way round: negate the second and third column": lambda q: (
@@ -180,23 +181,24 @@ POSE_MISTAKES = {
     "world-to-camera poses in OpenGL axes were given: invert them": lambda q: np.linalg.inv(q @ _FLIP) @ _FLIP,
     "world-to-camera poses were given: invert them": np.linalg.inv,
 }
-"""How poses go wrong that were written as nerfstudio's, and what undoes it from what was then read."""
+"""Usual mistakes in poses written for nerfstudio, each with the function that undoes it in the poses as read."""
 
 
 def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: float = 0.8) -> tuple[str, ...]:
-    """Return which mistakes in writing the poses, if undone, make the cameras look at a common place.
+    """Return the mistakes in writing the poses that, once undone, make the cameras look at a common point.
 
-    Poses are doubted whose cameras do not face one, or do with no up in common where those of a mistake undone have
-    one: the inverses of poses around a subject look at a common place too, rolled in all ways.
+    Poses are doubted in two cases: their cameras do not look at a common point, or they do and have no common up
+    direction, but would have one with a mistake undone. The second case is that of inverted poses around a subject,
+    which look at a common point too, but are rolled in all ways.
 
     Args:
-        cameras: At least three, or nothing can be said.
-        doubt: Cameras of which this share or more face a common place are right as they are.
-        trust: Share that must face one once the mistake is undone.
+        cameras: Cameras; with fewer than three, nothing can be said.
+        doubt: Poses are right if this share of the cameras or more looks at a common point with a common up.
+        trust: Share of the cameras that must look at a common point once the mistake is undone.
 
     Returns:
-        The likeliest first, by how far the cameras agree on up; others follow if they agree nearly as well. Empty if
-        the poses are not doubted, or no mistake is known that explains them.
+        The likeliest mistake first, by the cameras' agreement on up; others follow if they agree nearly as well. Empty
+        if the poses are not doubted, or if no known mistake explains them.
     """
     if len(cameras) < 3:
         return ()
@@ -210,7 +212,7 @@ def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: flo
         if _up_length(poses) >= NO_UP:
             return ()
         agreed = {name: length for name, length in agreed.items() if length >= ONE_UP}
-    # Turning the world changes nothing that cameras tell of each other: of such twins, the one with z up is meant.
+    # Two mistakes may differ only by a rotation of the world, which cameras do not tell: the one with z up is likelier.
     likely = {name: length - 0.5 * float(undone[name][:, 2, 1].mean()) for name, length in agreed.items()}
     best = max(likely.values(), default=0.0)
     return tuple(sorted((name for name in likely if likely[name] >= best - UP_MARGIN), key=lambda name: -likely[name]))

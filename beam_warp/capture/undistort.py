@@ -1,7 +1,7 @@
-"""From a photograph, which a lens has bent, to the image that a pinhole would have taken.
+"""Undistortion: from a photograph with lens distortion to the image that a pinhole would have taken.
 
-Undistorting moves pixels within the image and nothing else: lens and pinhole stand at the same point and look along the
-same axis. `lenses` has what bends rays, and its tangent coordinates.
+Undistorting only moves pixels within the image: lens and pinhole share centre of projection and optical axis. Lens
+models and tangent coordinates are defined in `beam_warp.capture.lenses`.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from beam_warp.image.files import Image
 from beam_warp.world.camera import Camera
 
 MAX_ANGLE = float(np.radians(70.0))
-"""Furthest from the axis that the sides of an undistorted image are placed [rad]: there a pinhole stretches pixels
+"""Largest angle between the axis and the sides of an undistorted image [rad]; there a pinhole stretches pixels by
 1 / cos^2, nearly 9 times."""
 
 GRID = 129
-"""Points along each side of the photograph at which the lens is inverted to find what it sees: between them its edges
-bow by less than 1e-4 of what they bow in all."""
+"""Points along each side of the photograph at which the lens is inverted to find its field of view; between two of them
+an edge bows by less than 1e-4 of its total bow."""
 
 Coverage = NDArray[np.float32] | np.float32
-"""Alpha of a plane, or 1 where there is none."""
+"""Alpha of an image, or 1 if it has none."""
 
 COLORS = ("R", "G", "B", "Y")
-"""Channels of an image that are colour."""
+"""Names of colour channels."""
 
 MAX_MAPS = 16
-"""Maps kept, 8 bytes a pixel: records of a capture that were taken by as many cameras share them."""
+"""Most maps kept in memory, one for each camera and lens, at 8 bytes a pixel."""
 
 MAX_SAMPLES = 4
-"""Most samples per pixel and axis where the photograph is made smaller."""
+"""Most samples per pixel and axis where the image is smaller than the photograph."""
 
 BLOCK_PIXELS = 2**17
-"""Pixels resampled at a time: their arrays fit into a processor's cache."""
+"""Pixels resampled at a time, so that their arrays fit into a processor's cache."""
 
 
 class Intrinsics(NamedTuple):
@@ -66,12 +66,12 @@ class Intrinsics(NamedTuple):
 
 @dataclass(frozen=True)
 class Undistortion:
-    """How photographs of one camera become images of a pinhole at the same place.
+    """Map from the photographs of one camera to images of a pinhole at the same place.
 
     Attributes:
-        lens: What bent them.
+        lens: Distortion of the photographs.
         photograph: Intrinsics that go with the lens.
-        pinhole: Intrinsics of the undistorted image, which has as many pixels and the same shape of pixels.
+        pinhole: Intrinsics of the undistorted image, with the same size and shape of pixels.
     """
 
     lens: Lens
@@ -80,14 +80,14 @@ class Undistortion:
 
     @classmethod
     def fit(cls, lens: Lens, photograph: Intrinsics, keep: float = 0.0) -> Undistortion:
-        """Choose the pinhole whose image shows what a photograph does.
+        """Choose a pinhole for a photograph.
 
         Args:
-            lens: What bent it.
-            photograph: Intrinsics that go with it.
-            keep: 0 for the largest image all of whose pixels the photograph shows, 1 for the one that shows all of
-                the photograph and is void where it ends, or anything between; OpenCV calls it ``alpha``. What is more
-                than `MAX_ANGLE` from the axis is left out either way.
+            lens: Distortion of the photograph.
+            photograph: Intrinsics that go with the lens.
+            keep: 0 for the largest image that the photograph fills, 1 for the smallest image that shows all of the
+                photograph and is void beyond it, or a value between; OpenCV calls it ``alpha``. Nothing beyond
+                `MAX_ANGLE` from the axis is shown either way.
 
         Raises:
             InvalidOptionError: The lens folds over within the photograph, or ``keep`` is out of range.
@@ -114,7 +114,7 @@ class Undistortion:
         NaN and infinity stay with their neighbours.
 
         Args:
-            image: The photograph, of the size that `photograph` says.
+            image: The photograph, with the size of `photograph`.
 
         Returns:
             The image in the same channels, colour space and association with alpha; itself through a straight lens.
@@ -199,7 +199,7 @@ def _seen_rays(lens: Lens, photograph: Intrinsics) -> NDArray[np.float64]:
 
 
 class _Resampling:
-    """Where in the photograph each pixel of the undistorted image is, and the filters that read it there."""
+    """Position in the photograph of each pixel of the undistorted image, and the filters that sample it there."""
 
     def __init__(self, undistortion: Undistortion) -> None:
         shape = (undistortion.pinhole.height, undistortion.pinhole.width)
@@ -234,7 +234,7 @@ class _Resampling:
     def sample(
         self, plane: NDArray[np.float32], weigh: Callable[[NDArray[np.float32]], list[NDArray[Any]]]
     ) -> NDArray[np.float32]:
-        """Filter a plane ``(H, W)``, whose outermost pixels go on beyond the edge; 0 outside the mask."""
+        """Filter a plane ``(H, W)``, extended beyond its edges by its outermost pixels; 0 outside the mask."""
         rows, columns = plane.shape
         padded = np.pad(plane.astype(np.float32, copy=False), 2, mode="edge")
         n, (height, width) = self.samples, (self.mask.shape[0], self.mask.shape[1])
@@ -264,7 +264,7 @@ class _Resampling:
         return np.where(self.mask, result, np.float32(0.0))
 
     def nearest(self, plane: NDArray[Any]) -> NDArray[Any]:
-        """Return the pixel of ``(H, W)`` that each pixel's centre falls in."""
+        """Sample a plane ``(H, W)`` at the pixel that holds each centre."""
         middle = self.positions[self.samples // 2 :: self.samples, self.samples // 2 :: self.samples]
         column, row = (np.clip(middle[..., axis].astype(np.int64), 0, plane.shape[1 - axis] - 1) for axis in (0, 1))
         return np.where(self.mask, plane[row, column], plane.dtype.type(0))
@@ -291,7 +291,7 @@ def _catmull_rom(t: NDArray[np.float32]) -> list[NDArray[Any]]:
 
 
 def _divided(product: NDArray[np.float32], weight: Coverage) -> NDArray[np.float32]:
-    """Return a product over its weight, 0 where that is 0."""
+    """Divide a product by its weight; 0 where the weight is 0."""
     return np.divide(product, weight, out=np.zeros_like(product), where=weight > 0.0)
 
 

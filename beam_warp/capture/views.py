@@ -1,4 +1,4 @@
-"""What one camera saw at one moment, as every step of reconstruction reads it: scene-linear colour and coverage."""
+"""Scene-linear colour and coverage of one image, the form in which all steps of reconstruction read a capture."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class CapturedView:
     """An image, its camera and its coverage.
 
     Attributes:
-        name: Names the view in messages and files.
-        camera: The pinhole that took it.
+        name: Name of the view in messages and files.
+        camera: The pinhole that took the image.
         color: Scene-linear Rec.709, premultiplied by ``alpha`` where there is one, ``(H, W, 3)`` float32.
-        alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None where it is not known.
+        alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None if it is unknown.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
@@ -43,10 +43,10 @@ class CapturedView:
             object.__setattr__(self, "alpha", alpha)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> CapturedView:
-        """Return a part of the view, with the camera that sees just that.
+        """Return a part of the view with its camera.
 
         Raises:
-            InvalidArrayError: The part reaches out of the image.
+            InvalidArrayError: The part is not within the image.
         """
         if not (0 <= left < left + width <= self.camera.width and 0 <= top < top + height <= self.camera.height):
             raise InvalidArrayError(
@@ -62,7 +62,7 @@ class CapturedView:
         )
 
     def reduced(self, factor: int) -> CapturedView:
-        """Return the view at a whole fraction of its resolution, each pixel the mean of ``factor`` x ``factor``.
+        """Return the view at a lower resolution, each pixel the mean of ``factor`` x ``factor`` pixels.
 
         Rows and columns beyond the last whole pixel are left out.
 

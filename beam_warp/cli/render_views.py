@@ -12,7 +12,8 @@ import numpy as np
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.world.camera import MAX_SIDE, Camera, bulk
+from beam_warp.world.camera import MAX_SIDE, Camera
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import GaussianCloud
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Colour spaces by name, and the one home of the sRGB transfer."""
+"""Names of colour spaces, and the sRGB transfer function."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 DISPLAY_SRGB = "srgb_rec709_display"
-"""Colour space of what a usual 3DGS training leaves: display-referred sRGB, composited in gamma space."""
+"""Display-referred sRGB, composited in gamma space: the colour space of usual 3DGS training."""
 
 LINEAR_REC709 = "lin_rec709_scene"
-"""Scene-linear Rec.709: the space of every material channel and of all lighting."""
+"""Scene-linear Rec.709: the colour space of all material channels and of lighting."""
 
 COLOR_SPACES = (DISPLAY_SRGB, LINEAR_REC709)
 
 
 def srgb_to_linear(srgb: ArrayLike) -> NDArray[Any]:
-    """Decode display sRGB to linear light (IEC 61966-2-1), any shape, odd about zero so that any value has an inverse.
+    """Decode display sRGB to linear light (IEC 61966-2-1), any shape, odd about zero so that all values have inverses.
 
     The knee is 12.92 × 0.0031308, the image of `linear_to_srgb`'s, so that each is the exact inverse of the other.
     """

@@ -1,8 +1,8 @@
-"""Image files and the one home of the sRGB transfer: OpenEXR, Radiance HDR, PNG and JPEG.
+"""Reading and writing of image files: OpenEXR, Radiance HDR, PNG and JPEG.
 
-A file's values are never re-interpreted in silence: an `Image` says whether it is scene-linear or display-referred and
-whether its colour is multiplied by alpha. OpenEXR and Pillow are imported where a file is read or written: whoever
-only encodes a colour, such as a PLY converter, does not wait for them.
+An `Image` states whether it is scene-linear or display-referred, and whether its colour is multiplied by alpha; values
+are never reinterpreted silently. OpenEXR and Pillow are imported only when a file is read or written, so that a PLY
+converter, which only encodes colours, does not wait for them.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ MAX_SIDE = 32_768
 """Largest width or height read or written [px]."""
 
 MAX_PIXELS = 512 * 2**20
-"""Largest number of pixels read; checked in the header, before anything is allocated."""
+"""Largest number of pixels read; it is checked in the header, before memory is allocated."""
 
 MAX_CHANNELS = 64
 """Most channels read from one EXR."""
 
 SUFFIXES = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
-"""Files that are read, by the end of their lower-case names."""
+"""Suffixes of files that are read, in lower case."""
 
 HALF_MAX = 65504.0
 """Largest finite half-precision value."""
 
 
 def display_image(linear_rgb: ArrayLike, exposure_stops: float = 0.0) -> NDArray[np.uint8]:
-    """Turn linear radiance into 8-bit sRGB: exposure, clip to [0, 1], sRGB, round to nearest; no tone curve.
+    """Convert linear radiance to 8-bit sRGB: exposure, clip to [0, 1], sRGB, round to nearest; no tone curve.
 
-    View transforms are in `beam_warp.image.tone`; what comes out of them is encoded here.
+    View transforms are in `beam_warp.image.tone`; their results are encoded here.
 
     Args:
         linear_rgb: Linear Rec.709, ``(H, W, 3)``, finite.
@@ -63,7 +63,7 @@ class Image:
     """The channels of one image file.
 
     Attributes:
-        path: Where it came from; named in errors.
+        path: Path of the file, for errors.
         channels: Name → ``(H, W)`` array: float32, or uint32 for integer channels of an EXR. Colour is R, G, B (or
             Y alone), opacity is A in [0, 1]. PNG and JPEG values are scaled to [0, 1].
         color_space: `LINEAR_REC709` or `DISPLAY_SRGB`, for the colour channels.
@@ -105,7 +105,7 @@ class Image:
         return np.stack([self.channels[name] for name in names], axis=-1)
 
     def rgb(self) -> NDArray[np.float32]:
-        """Return the colour as the file has it, ``(H, W, 3)``; a grey image gives its Y three times."""
+        """Return the colour as the file has it, ``(H, W, 3)``; for a grey image, Y three times."""
         return self.stack(*("YYY" if "Y" in self.channels and "R" not in self.channels else "RGB"))
 
     def linear_rgba(self) -> NDArray[np.float32]:
@@ -122,7 +122,7 @@ class Image:
 
 
 SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
-"""Formats whose values are not cut at white, unless their colour space says otherwise."""
+"""Suffixes of formats whose values are not clipped at white, unless their colour space is stated to be another."""
 
 
 def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) -> Image:
@@ -130,15 +130,15 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
 
     Args:
         path: The file.
-        color_space: State it if the file departs from the custom of its format: EXR and HDR scene-linear with
-            premultiplied alpha, PNG and JPEG display sRGB with straight alpha.
+        color_space: Colour space of a file that departs from the convention of its format: EXR and HDR are
+            scene-linear with premultiplied alpha, PNG and JPEG are display sRGB with straight alpha.
 
     Returns:
-        Its channels. An EXR's data window is laid into its display window: zeros outside, overscan cut off.
+        The image. An EXR's data window is placed in its display window, with zeros outside and overscan cut off.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be read.
-        AssetFormatError: It is damaged, larger than `MAX_SIDE`, `MAX_PIXELS` or `MAX_CHANNELS`, or of a kind
+        AssetFormatError: The file is damaged, larger than `MAX_SIDE`, `MAX_PIXELS` or `MAX_CHANNELS`, or of a kind
             (deep, multi-part, subsampled, CMYK, ...) that is not read. NaN and infinity in an EXR are kept.
     """
     path = Path(path)
@@ -156,11 +156,11 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return the width and height of an image file; pixels are decoded of an .hdr only.
+    """Return the width and height of an image file; only an .hdr is decoded for it.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be read.
-        AssetFormatError: It is not an image that `read_image` reads, as far as its header tells.
+        AssetFormatError: The header is not that of an image that `read_image` reads.
     """
     path = Path(path)
     _require_file(path)
@@ -171,24 +171,12 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     if suffix == ".exr":
         import OpenEXR
 
-        try:
+        with _intact(path):
             first, end = _window(path, OpenEXR.File(str(path), header_only=True).header(), "displayWindow")
-        except AssetFormatError:
-            raise
-        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise _damaged(path, error) from error
         width, height = (end - first).tolist()
         return width, height
-    from PIL import Image as PillowImage
-
-    try:
-        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
-            _require_size(path, *picture.size)
-            return picture.size
-    except AssetFormatError:
-        raise
-    except (OSError, SyntaxError, ValueError, EOFError, PillowImage.DecompressionBombError) as error:
-        raise _damaged(path, error) from error
+    with _picture(path) as picture:
+        return picture.size
 
 
 def _require_file(path: Path) -> None:
@@ -216,8 +204,36 @@ def _damaged(path: Path, error: object) -> AssetFormatError:
     )
 
 
+_DAMAGE = (ArithmeticError, AttributeError, EOFError, LookupError, SyntaxError, TypeError, ValueError)
+"""Errors that OpenEXR and Pillow raise about damaged files, beside those of the system."""
+
+
+@contextmanager
+def _intact(path: Path) -> Iterator[None]:
+    """Turn errors that a library raises about a file into `AssetFormatError`."""
+    try:
+        yield
+    except AssetFormatError:
+        raise
+    except (*_DAMAGE, OSError, RuntimeError, MemoryError) as error:
+        raise _damaged(path, error) from error
+
+
+@contextmanager
+def _picture(path: Path) -> Iterator[Any]:
+    """Open a PNG or JPEG file with Pillow, after checking its size."""
+    from PIL import Image as PillowImage
+
+    try:
+        with _intact(path), PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
+            _require_size(path, *picture.size)
+            yield picture
+    except PillowImage.DecompressionBombError as error:
+        raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
+
+
 def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (first, last + 1) of an EXR window as (x, y), after checking its size."""
+    """Return the first and last + 1 corner of an EXR window as (x, y), after checking its size."""
     first, last = (np.asarray(corner, np.int64) for corner in header[name])
     _require_size(path, *(last - first + 1).tolist())
     return first, last + 1
@@ -226,7 +242,7 @@ def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[n
 def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
     import OpenEXR
 
-    try:
+    with _intact(path):
         lead = OpenEXR.File(str(path), header_only=True)
         header = lead.header()
         described = header["channels"]
@@ -246,10 +262,6 @@ def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
         pixels = {name: channel.pixels for name, channel in stored.items()}
         if any(array.shape != tuple(data_end - data_first)[::-1] for array in pixels.values()):
             raise ValueError("a channel is incomplete")
-    except AssetFormatError:
-        raise
-    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError) as error:
-        raise _damaged(path, error) from error
     low, high = np.maximum(data_first, first), np.minimum(data_end, end)
     into = tuple(slice(*pair) for pair in zip((low - first)[::-1], (high - first)[::-1], strict=True))
     part = tuple(slice(*pair) for pair in zip((low - data_first)[::-1], (high - data_first)[::-1], strict=True))
@@ -269,42 +281,31 @@ _PILLOW_CHANNELS = {"L": ("Y",), "LA": ("Y", "A"), "RGB": ("R", "G", "B"), "RGBA
 
 
 def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
-    from PIL import Image as PillowImage
-
-    try:
-        with PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
-            _require_size(path, *picture.size)
-            coding = str(picture.tile[0][3] if picture.tile else "")
-            if picture.mode == "P":
-                picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
-            if picture.mode in ("I;16", "I"):
-                return {"Y": np.asarray(picture).astype(np.float32) / np.float32(65535)}
-            names = _PILLOW_CHANNELS.get(picture.mode)
-            if names is None or coding == "LA;16B":
-                raise AssetFormatError(
-                    f"image must be grey, RGB or RGBA, of 8 or 16 bits (grey with alpha: 8), got mode {picture.mode} "
-                    f"in {path}. Convert it."
-                )
-            values = np.asarray(picture)
-        full = 255
-        if coding.endswith(";16B"):  # Pillow keeps the high bytes only: decode the low ones as a second picture
-            with PillowImage.open(path, formats=("PNG",)) as picture:
-                codec, extents, offset, _ = picture.tile[0]
-                picture.tile = [(codec, extents, offset, f"{picture.mode};16L")]
-                values, full = values * np.uint16(256) + np.asarray(picture), 65535
-    except AssetFormatError:
-        raise
-    except PillowImage.DecompressionBombError as error:
-        raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise _damaged(path, error) from error
+    with _picture(path) as picture:
+        coding = str(picture.tile[0][3] if picture.tile else "")
+        if picture.mode == "P":
+            picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
+        if picture.mode in ("I;16", "I"):
+            return {"Y": np.asarray(picture).astype(np.float32) / np.float32(65535)}
+        names = _PILLOW_CHANNELS.get(picture.mode)
+        if names is None or coding == "LA;16B":
+            raise AssetFormatError(
+                f"image must be grey, RGB or RGBA, of 8 or 16 bits (grey with alpha: 8), got mode {picture.mode} "
+                f"in {path}. Convert it."
+            )
+        values, full = np.asarray(picture), 255
+    if coding.endswith(";16B"):  # Pillow keeps the high bytes only: decode the low ones as a second picture
+        with _picture(path) as picture:
+            codec, extents, offset, _ = picture.tile[0]
+            picture.tile = [(codec, extents, offset, f"{picture.mode};16L")]
+            values, full = values * np.uint16(256) + np.asarray(picture), 65535
     values = values.reshape(*values.shape[:2], -1)
     return {name: values[..., index].astype(np.float32) / np.float32(full) for index, name in enumerate(names)}
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside ``path`` that takes its place on success and vanishes on failure."""
+    """Yield a temporary name beside ``path``; the file replaces ``path`` on success and is removed on failure."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp{path.suffix}")
     try:
         yield temporary
@@ -321,11 +322,11 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *, half: bool = False) -> None:
-    """Write an EXR of named channels, ZIP-compressed, in one step: readers see the old file or the whole new one.
+    """Write an EXR of named channels, ZIP-compressed; readers see the old file or the complete new one.
 
     Args:
         path: The file, replaced if it exists.
-        channels: Name → ``(H, W)`` array of one common shape, linear; colour premultiplied by A by custom.
+        channels: Name → ``(H, W)`` array, all of one shape, linear; by convention colour is premultiplied by A.
         half: Store 16-bit floats, |x| ≤ 65504, instead of 32-bit ones.
 
     Raises:
@@ -357,7 +358,9 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *
 
 
 def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
-    """Write 8-bit display sRGB as PNG, in one step. For linear values see `display_image`.
+    """Write 8-bit display sRGB as PNG; readers see the old file or the complete new one.
+
+    Linear values are to be encoded by `display_image` first.
 
     Args:
         path: The file, replaced if it exists.

@@ -1,4 +1,4 @@
-"""Reading Radiance pictures (.hdr, RGBE): flat, old and new run-length encodings.
+"""Reader of Radiance pictures (.hdr, RGBE), flat or in the old or new run-length encoding.
 
 Source: Ward 1991, "Real Pixels" (Graphics Gems II), and the Radiance file-format notes. Differences: a mantissa m
 decodes to m · 2^(e − 136) without Ward's half step, as in Blender, OpenImageIO and stb, so that every renderer sees
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 MAX_HEADER_BYTES = 65536
-"""A header is a few lines of text; the limit bounds the search for its end in a file that is none."""
+"""Most bytes that are searched for the end of a header, which is a few lines of text."""
 
 MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 32767
-"""Widths for which the new run-length encoding is defined."""
+"""Range of widths for which the new run-length encoding is defined."""
 
 _RESOLUTION = re.compile(rb"([+-])Y (\d{1,9}) ([+-])X (\d{1,9})\n")
 
@@ -37,7 +37,7 @@ def read_radiance_hdr(path: Path, *, max_side: int, max_pixels: int) -> NDArray[
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is no Radiance picture, is truncated or corrupt, or is larger than the limits.
+        AssetFormatError: The file is not a Radiance picture, is truncated or corrupt, or exceeds the limits.
     """
     try:
         data = path.read_bytes()
@@ -97,7 +97,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[bool, bool, int, int, float,
 
 
 def _decode(path: Path, data: bytes, start: int, height: int, width: int) -> NDArray[np.uint8]:
-    """Return the RGBE bytes, ``(H, W, 4)``; each scanline says by its first bytes how it is encoded."""
+    """Return the RGBE bytes, ``(H, W, 4)``; the first bytes of each scanline state its encoding."""
     marker = bytes((2, 2, width >> 8, width & 255)) if MIN_RUN_WIDTH <= width <= MAX_RUN_WIDTH else None
     rows = []
     position = start
@@ -113,7 +113,7 @@ def _decode(path: Path, data: bytes, start: int, height: int, width: int) -> NDA
 
 
 def _decode_new(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint8] | None, int]:
-    """Decode one scanline of the new encoding: the four components one after the other, each in runs."""
+    """Decode one scanline of the new encoding, in which the four components follow each other, each in runs."""
     out = bytearray()
     size = len(data)
     for end in (width, 2 * width, 3 * width, 4 * width):
@@ -135,9 +135,9 @@ def _decode_new(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint
 
 
 def _decode_old(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint8] | None, int]:
-    """Decode one scanline of the old encoding, or a flat one: RGBE entries, where (1, 1, 1, n) repeats the last.
+    """Decode one scanline of the old encoding, or a flat one: RGBE entries, of which (1, 1, 1, n) repeats the last.
 
-    Repeats that follow one another are the bytes of one count, the lowest first.
+    Successive repeats are the bytes of one count, the lowest first.
     """
     available = min((len(data) - position) // 4, width)
     entries = np.frombuffer(data, np.uint8, 4 * available, position).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""How close a render is to its truth, by the paper's protocol and on solid pixels alone."""
+"""Scores of a render against its truth, by the paper's protocol and on solid pixels alone."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import linear_to_srgb
 
 SOLID_ALPHA = 0.999
+"""Pixels are solid if the truth's alpha is above this."""
+
 SUBJECT_ALPHA = 0.5
+"""Pixels belong to the subject if alpha is above this."""
+
 SMALLEST_ERROR = 1e-12
 """Mean squared error below which images count as equal: 120 dB."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """One channel of one view.
+    """Scores of one channel of one view, composited on black.
 
     Attributes:
-        psnr: Inside the subject's bounding box, composited on black [dB].
-        ssim: There, Gaussian window of sigma 1.5, data range 1.
-        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA`, composited on black too: holes count [dB].
+        psnr: Peak signal-to-noise ratio inside the subject's bounding box [dB].
+        ssim: Structural similarity there, with a Gaussian window of sigma 1.5 and data range 1.
+        solid_psnr: Peak signal-to-noise ratio where the truth's alpha is above `SOLID_ALPHA`; holes lower it [dB].
     """
 
     psnr: float
@@ -34,7 +38,11 @@ class Score:
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the peak signal-to-noise ratio for a peak of 1 [dB], over all pixels or those of a mask ``(H, W)``."""
+    """Return the peak signal-to-noise ratio for a peak of 1 [dB], over all pixels or those of a mask ``(H, W)``.
+
+    Raises:
+        InvalidArrayError: There is no pixel.
+    """
     difference = np.asarray(image, np.float64) - np.asarray(truth, np.float64)
     if mask is not None:
         difference = difference[mask]
@@ -60,7 +68,7 @@ def ssim(image: ArrayLike, truth: ArrayLike) -> float:
 
 
 def bounding_box(alpha: ArrayLike) -> tuple[slice, slice]:
-    """Return rows and columns of the subject: where alpha is above `SUBJECT_ALPHA`."""
+    """Return the rows and columns of the box around the pixels whose alpha is above `SUBJECT_ALPHA`."""
     rows, columns = np.nonzero(np.asarray(alpha) > SUBJECT_ALPHA)
     if len(rows) == 0:
         raise InvalidArrayError("alpha must show a subject, got none above 0.5. Check the camera.")
@@ -69,12 +77,12 @@ def bounding_box(alpha: ArrayLike) -> tuple[slice, slice]:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One channel of one view, as it is compared.
+    """One channel of one view in the form in which it is compared.
 
     Attributes:
-        image: Inside the subject's bounding box, composited on black, colours encoded as sRGB; float64.
-        truth: Likewise.
-        solid_psnr: Where the truth's alpha is above `SOLID_ALPHA`, anywhere in the image [dB].
+        image: Pixels inside the subject's bounding box, composited on black, colours encoded as sRGB; float64.
+        truth: The same pixels of the truth.
+        solid_psnr: Peak signal-to-noise ratio over the whole image where the truth's alpha is above `SOLID_ALPHA` [dB].
     """
 
     image: NDArray[np.float64]
@@ -92,12 +100,13 @@ def as_compared(
     """Bring one channel of one view to the form in which it is compared.
 
     Args:
-        image: ``(H, W)`` or ``(H, W, 3)``; colours linear, they are encoded here.
-        truth: Of the same shape.
+        image: Channel, ``(H, W)`` or ``(H, W, 3)``; colours are linear, and encoded here.
+        truth: Channel of the truth, in the same shape.
         alpha: Coverage of the image, ``(H, W)``.
         truth_alpha: Coverage of the truth.
-        is_color: Encode both as sRGB before comparing, after cutting them to [0, 1].
-        premultiplied: The channels are multiplied by alpha already (radiance); others are composited on black here.
+        is_color: True clips both to [0, 1] and encodes them as sRGB.
+        premultiplied: True if the channels are multiplied by alpha already (radiance); otherwise they are composited
+            on black here.
 
     Raises:
         InvalidArrayError: The truth shows no subject.
@@ -125,19 +134,19 @@ def compare(
 
 
 def least_squares_scale(image: ArrayLike, truth: ArrayLike, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the factor per channel that best carries an image ``(H, W, 3)`` to its truth on a mask."""
+    """Return the factor of each channel that brings an image ``(H, W, 3)`` closest to its truth on a mask, ``(3,)``."""
     a, b = np.asarray(image, np.float64)[mask], np.asarray(truth, np.float64)[mask]
     return (a * b).sum(axis=0) / np.maximum((a * a).sum(axis=0), 1e-12)
 
 
 def angles_between(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return angles between vectors ``(N, 3)`` [degree]; a vector of length 0 is at a right angle to all."""
+    """Return angles between vectors ``(N, 3)`` [degree]; a vector of length 0 is at a right angle to all others."""
     one, two = (v.astype(np.float64) / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (a, b))
     return np.degrees(np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)))
 
 
 def mean_scores(scores: Mapping[str, list[Score]]) -> dict[str, dict[str, float]]:
-    """Return the mean over views of every channel's scores, JSON-able."""
+    """Return the mean scores of every channel over its views, JSON-able."""
     return {
         name: {
             field: float(np.mean([getattr(score, field) for score in views]))
@@ -148,6 +157,6 @@ def mean_scores(scores: Mapping[str, list[Score]]) -> dict[str, dict[str, float]
 
 
 def block_means(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
-    """Return the means of squares of ``side`` x ``side`` samples, ``(H, W, ...)`` of ``(H side, W side, ...)``."""
+    """Return the means of blocks of ``side`` x ``side`` samples, ``(H side, W side, ...)`` to ``(H, W, ...)``."""
     height, width = image.shape[0] // side, image.shape[1] // side
     return image.reshape(height, side, width, side, *image.shape[2:]).mean(axis=(1, 3)) if side > 1 else image

@@ -1,4 +1,4 @@
-"""Panels with titles, laid out as one picture."""
+"""Layout of panels with titles as one picture."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 BACKGROUND = 0.13
-"""Display grey behind the subject: dark subjects stay visible, and white ones too."""
+"""Display grey behind subjects, on which dark and white ones are both visible."""
 
 MARGIN = 8
 TITLE_HEIGHT = 30
 TITLE_SIZE = 16
 Panel = tuple[str, NDArray[np.uint8]]
-"""A title and 8-bit sRGB pixels."""
+"""A title and 8-bit sRGB pixels ``(H, W, 3)``."""
 
 
 def over_background(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:

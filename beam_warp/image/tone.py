@@ -1,21 +1,21 @@
-"""How scene-linear light is shown: exposure, a view transform, and the 8 bits of an sRGB display.
+"""Display of scene-linear light: exposure, a view transform, and 8-bit sRGB.
 
-Every view transform maps scene-linear Rec.709 to display-linear Rec.709 in [0, 1]; `images.display_image` encodes what
-comes out, so that there is one sRGB curve and one rounding:
+Every view transform maps scene-linear Rec.709 to display-linear Rec.709 in [0, 1]; `files.display_image` encodes the
+result, so that there is one sRGB curve and one rounding:
 
-- ``standard``: no curve, clipped at white. What was in [0, 1] is shown as it is.
+- ``standard``: no curve; values are clipped at white and otherwise shown as they are.
 - ``aces``: Narkowicz 2015 (ACES Filmic Tone Mapping Curve), a rational fit of ACES' RRT and sRGB ODT, per channel; as
   published, without the factor 0.6 on the light that he gives to match ACES' exposure.
 - ``agx``: AgX-like, after Sobotka's published description: every primary is mixed with a little of the others (the
   inset), 2^-10 to 2^6.5 of middle grey are encoded by their logarithm and bent by a sigmoid, the mix is undone, and the
   display's power of 2.2. The inset's numbers are those of Wrensch 2023 (Minimal AgX Implementation), its rows made to
   sum to 1 so that grey stays grey; the sigmoid is the closed form behind the polynomial there. No look is applied.
-- ``neutral``: Khronos PBR Neutral (specification of 2024): what reflects white light keeps its colour up to 0.76, and
-  what is brighter is compressed and fades to white.
+- ``neutral``: Khronos PBR Neutral (specification of 2024): surfaces under white light keep their colour up to 0.76;
+  brighter light is compressed and fades to white.
 
-Alpha: a view transform is no linear map, so light is divided by alpha, shown, and only then laid over what is behind:
-the edge of a highlight has the highlight's colour, and a picture over a colour is the picture with alpha over that
-colour. Only an environment behind the subject is light of the same scene, and is added before
+Alpha: a view transform is not linear. So light is divided by alpha, transformed, and then composited over the
+background: the edge of a highlight has the highlight's colour, and a picture over a colour equals the picture with
+alpha over that colour. Only an environment behind the subject is light of the same scene, and is added before
 (`beam_warp.stage.backdrops`).
 """
 
@@ -34,17 +34,17 @@ from beam_warp.image.files import display_image
 ViewTransform: TypeAlias = Literal["standard", "aces", "agx", "neutral"]
 
 EXPOSURE_RANGE = (-64.0, 64.0)
-"""Exposures that are taken [stops]."""
+"""Range of the exposure [stops]."""
 
 WHITEST = np.float32(2.0**24)
-"""Light above which every curve has ended, and whose square float32 holds."""
+"""Light is clipped to this, at which every curve has reached white and whose square is finite in float32."""
 
 MIDDLE_GREY = 0.18
 AGX_STOPS = (-10.0, 6.5)
-"""What AgX shows of the scene, in stops around middle grey."""
+"""Range of light that AgX shows [stops from middle grey]."""
 
 AGX_SLOPE, AGX_TOE, AGX_SHOULDER = 2.0, 3.0, 3.25
-"""Slope of the sigmoid at middle grey, and the powers by which it runs out to black and to white."""
+"""Slope of the sigmoid at middle grey, and the powers of its ends towards black and white."""
 
 AGX_DISPLAY_POWER = 2.2
 
@@ -53,10 +53,10 @@ AGX_INSET = (
     (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
     (0.0423756549057051, 0.0784336, 0.879142973793104),
 )
-"""Rows: what each channel takes of red, green and blue, before rows are made to sum to 1."""
+"""Mix of red, green and blue in each channel, one row a channel, before the rows are scaled to sum to 1."""
 
 NEUTRAL_START, NEUTRAL_DESATURATION, FRESNEL = 0.8 - 0.04, 0.15, 0.04
-"""Where compression begins, how fast colour fades, and the reflectance of white highlights that is taken away."""
+"""Start of compression, rate at which colours fade to white, and reflectance of white highlights that is removed."""
 
 
 def display(
@@ -84,7 +84,7 @@ def display(
 def display_linear(
     linear_rgb: ArrayLike, transform: ViewTransform = "standard", exposure_stops: float = 0.0
 ) -> NDArray[np.float32]:
-    """Return what the display is to emit, before its sRGB curve: ``(H, W, 3)`` float32 in [0, 1]; see `display`."""
+    """Return the light that the display is to emit, ``(H, W, 3)`` float32 in [0, 1]; see `display`."""
     linear = require_array("linear_rgb", linear_rgb, (None, None, 3))
     require_finite("linear_rgb", linear)
     require_choice("transform", transform, TRANSFORMS)
@@ -106,10 +106,10 @@ def display_over(
     Args:
         premultiplied_rgb: Scene-linear Rec.709 multiplied by alpha, ``(H, W, 3)``, finite.
         alpha: Coverage in [0, 1], ``(H, W)``.
-        transform: One of `TRANSFORMS`; of the colour, not of its product with alpha.
+        transform: One of `TRANSFORMS`; it is applied to the colour, not to its product with alpha.
         exposure_stops: Gain in powers of two, before the transform.
-        background: Display colour in [0, 1], ``(3,)``: shown as it is whatever the transform and the exposure; what
-            is shown is laid over it in the display's linear light. None keeps alpha.
+        background: Display colour in [0, 1], ``(3,)``, to which transform and exposure do not apply; the image is
+            composited over it in the display's linear light. None keeps alpha.
 
     Returns:
         sRGB: ``(H, W, 3)`` over a background or where alpha is 1 everywhere, else ``(H, W, 4)``, alpha straight.
@@ -135,7 +135,7 @@ def display_over(
 
 
 def agx_sigmoid(encoded: ArrayLike) -> NDArray[Any]:
-    """Return the display value in [0, 1] of light that was encoded by its logarithm to [0, 1].
+    """Return the display value in [0, 1] of light whose logarithm was mapped to [0, 1].
 
     Each half is s u (1 + u^p)^(-1/p) about middle grey, u = slope (x - pivot) / s: the slope is that asked for at the
     pivot, and the scale s is such that the curve ends at exactly 0 and 1.
@@ -148,7 +148,7 @@ def agx_sigmoid(encoded: ArrayLike) -> NDArray[Any]:
 
 
 def _agx_half(distance: NDArray[Any], reach: float, power: float) -> NDArray[Any]:
-    """Return how far from 0.5 the sigmoid is at a distance from its pivot: 0.5 at the reach."""
+    """Return the sigmoid's difference from 0.5 at a distance from its pivot; it is 0.5 at the reach."""
     end = AGX_SLOPE * reach
     scale = (0.5**-power - end**-power) ** (-1.0 / power)  # solves scale u (1 + u^p)^(-1/p) = 0.5 at the end
     u = AGX_SLOPE * distance / scale

@@ -1,8 +1,8 @@
-"""Images into an H.264 film, by ffmpeg.
+"""Encoding of images as an H.264 video by ffmpeg.
 
-ffmpeg is a program of its own: the one on PATH, else the one that the package imageio-ffmpeg brings (the extra
-``video``). Frames go to it as raw pixels. sRGB is converted to BT.709 YUV of the narrow range, chroma at half
-resolution, and tagged as such, which every player takes; BT.709's transfer is the tag that players show as sRGB.
+ffmpeg is a separate program: the one on PATH, or else that of the package imageio-ffmpeg (the extra ``video``). It
+receives frames as raw pixels. sRGB is converted to BT.709 YUV of the narrow range with chroma at half resolution, and
+tagged as such, which every player supports; players show BT.709's transfer tag as sRGB.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ from beam_warp.image.files import replacing
 INSTALL = (
     "install ffmpeg (apt install ffmpeg, brew install ffmpeg, winget install ffmpeg) or pip install 'beam-warp[video]'"
 )
-"""What to tell whoever has no ffmpeg."""
+"""Remedy for a missing ffmpeg, for messages."""
 
 ENCODER = "libx264"
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """How a film is encoded.
+    """Options of the encoder.
 
     Attributes:
-        frames_per_second: Kept as the nearest fraction with a denominator of at most 1001, such as 30000 / 1001.
+        frames_per_second: Playback rate [1/s], stored as the nearest fraction with a denominator of at most 1001, such
+            as 30000 / 1001.
         crf: Constant rate factor of x264, 0 (lossless) to 51; 18 is visually lossless for most.
 
     Raises:
-        InvalidOptionError: One of them is out of range.
+        InvalidOptionError: A value is out of range.
     """
 
     frames_per_second: float = 30.0
@@ -67,10 +68,10 @@ def find_ffmpeg() -> str | None:
 
 
 def require_encoder(ffmpeg: str) -> None:
-    """Refuse an ffmpeg that cannot write H.264, before hours are spent on its frames.
+    """Refuse an ffmpeg that cannot write H.264, before hours are spent on frames.
 
     Raises:
-        OutputError: It does not run, or was built without libx264.
+        OutputError: ffmpeg does not run, or was built without libx264.
     """
     try:
         asked = subprocess.run(
@@ -93,12 +94,12 @@ def require_encoder(ffmpeg: str) -> None:
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOptions, *, ffmpeg: str) -> int:
-    """Encode a film in one step: it appears whole or not at all.
+    """Encode a video, which appears complete or not at all.
 
     Args:
         path: The .mp4, replaced if it exists.
-        frames: sRGB, ``(H, W, 3)`` uint8, all of one size, at least one. Sides of an odd length get their last row or
-            column twice, since chroma is kept for pairs.
+        frames: At least one image, sRGB, ``(H, W, 3)`` uint8, all of one size. The last row or column of an odd side
+            is repeated, since chroma is stored for pairs.
         options: Rate and quality.
         ffmpeg: The program: see `find_ffmpeg`.
 
@@ -106,8 +107,8 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOpt
         Number of frames.
 
     Raises:
-        InvalidArrayError: There is no frame, or one has another type or shape than the first.
-        OutputError: ffmpeg cannot be run or fails: says its last line.
+        InvalidArrayError: There is no frame, or one differs in type or shape from the first.
+        OutputError: ffmpeg cannot be run or fails; the message quotes its last line.
     """
     images = iter(frames)
     first = next(images, None)
@@ -143,7 +144,7 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOpt
 
 
 def _feed(pipe: IO[bytes], first: NDArray[np.uint8], images: Iterable[NDArray[np.uint8]]) -> int:
-    """Write every frame and return their number; 0 if ffmpeg ended before: its exit code explains."""
+    """Write every frame and return their number; 0 if ffmpeg ended early, which its exit code explains."""
     try:
         pipe.write(_even(first).tobytes())
         count = 1
@@ -160,7 +161,7 @@ def _feed(pipe: IO[bytes], first: NDArray[np.uint8], images: Iterable[NDArray[np
 
 
 def _command(ffmpeg: str, rows: int, columns: int, options: VideoOptions, path: Path) -> list[str]:
-    """Return the words that run ffmpeg."""
+    """Return the command line of ffmpeg."""
     rate = Fraction(options.frames_per_second).limit_denominator(1001)
     tags = ["-color_primaries", "bt709", "-color_trc", "bt709", "-colorspace", "bt709", "-color_range", "tv"]
     convert = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+full_chroma_int+bicubic"
@@ -187,7 +188,7 @@ def _require_frame(image: NDArray[np.uint8], shape: tuple[int, ...]) -> None:
 
 
 def _failed(ffmpeg: str, said: bytes, code: int) -> OutputError:
-    """Return the error of an ffmpeg that ended badly, with the last line it said."""
+    """Return the error of an ffmpeg that failed, with the last line of its output."""
     lines = [line for line in said.decode(errors="replace").splitlines() if line.strip()]
     last = lines[-1].strip() if lines else f"exit code {code}, and not a word"
     return OutputError(

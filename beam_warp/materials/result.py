@@ -19,7 +19,8 @@ from beam_warp.materials.source import Source
 from beam_warp.materials.tally import warnings_about
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 

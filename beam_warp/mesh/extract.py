@@ -17,7 +17,8 @@ from beam_warp.mesh.fusion import SMALLEST_PART, fuse_depths
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import GaussianCloud
 
 DEPTHS = ("median", "mean")

@@ -28,7 +28,8 @@ from beam_warp.kernels.render.shadow_maps import ShadowMaps, launch_cast_mesh, l
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, light_entry
 

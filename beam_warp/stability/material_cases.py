@@ -25,7 +25,7 @@ from beam_warp.world.environment import EnvironmentMap, texel_directions
 from beam_warp.world.gaussians import GaussianCloud, Observability
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.mesh import MaterialMesh, vertex_normals
-from beam_warp.world.shapes import Surface, tile
+from beam_warp.world.shapes import TiledSurface, tile
 
 RADIUS = 0.5
 """Of the ball that most cases are about [m]."""
@@ -425,7 +425,7 @@ def _gaussians(mesh: MaterialMesh, flatness: float) -> GaussianCloud:
     for corner in range(3):
         share += np.bincount(mesh.faces[:, corner], area / 3.0, len(share))
     spacing = float(np.sqrt(share.mean()))
-    cloud = tile((Surface(mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64), spacing),))
+    cloud = tile((TiledSurface(mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64), spacing),))
     relative = (np.sqrt(share) / spacing)[:, None]
     scales = cloud.scales * relative
     scales[:, 2] = flatness * scales[:, 0]

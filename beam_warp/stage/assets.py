@@ -18,7 +18,7 @@ from beam_warp.schema.placement import Placement
 from beam_warp.stage.camera_paths import outline
 from beam_warp.stage.time_sampling import Blend, Moment, TimeSampler
 from beam_warp.world.axes import axes_matrix, change_axes
-from beam_warp.world.camera import bulk
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 
 BOUNDING_FRAMES = 3

@@ -33,8 +33,9 @@ from beam_warp.view.state import (
     channels_of,
 )
 from beam_warp.world.axes import change_axes
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh

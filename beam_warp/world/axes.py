@@ -1,4 +1,4 @@
-"""Which way x, y and z point, and how to carry a cloud from one set of axes to another.
+"""Axis codes, which state where x, y and z point, and the conversion of clouds between them.
 
 An axis code names, in turn, where x, y and z point: ``r``/``l`` right or left, ``u``/``d`` up or down, ``f``/``b``
 forward or back. Thus ``rdf`` is COLMAP and the usual 3DGS PLY, ``rub`` USD and glTF with y up, ``rfu`` our own world
@@ -34,14 +34,14 @@ AXIS_CODES = tuple("".join(code) for pairs in permutations(("rl", "ud", "fb")) f
 """All 48 codes."""
 
 TARGETS = {"usd": ("rub", 1.0), "unity": ("ruf", 1.0), "unreal": ("fru", 100.0)}
-"""What a consumer expects: its axes, and how many of its units make a metre."""
+"""Axes and units per metre that each consumer expects."""
 
 
 def require_axes(name: str, code: str) -> str:
     """Return an axis code after checking it.
 
     Raises:
-        InvalidOptionError: It is not one letter of each pair r/l, u/d, f/b.
+        InvalidOptionError: The code is not one letter of each pair r/l, u/d, f/b.
     """
     if code not in AXIS_CODES:
         raise InvalidOptionError(

@@ -1,4 +1,4 @@
-"""What sees the scene: a pinhole camera, and the ways to place one.
+"""Pinhole cameras, and constructors that place them.
 
 Camera axes are OpenCV's: x right, y down, z forward. Pixel (0, 0) is the top left one and its centre is at (0.5, 0.5).
 """
@@ -10,20 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import require_array, require_count, require_finite, require_number, require_range
+from beam_warp.checks import require_array, require_count, require_finite, require_number
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.world.framing import bulk, orbit_directions, pose_looking_at, require_point, require_points
 
 MAX_SIDE = 65_536
-"""Largest image side in pixels: beyond it a size is a mistake, not a picture."""
+"""Largest image side [pixel]; a larger one is taken for a mistake."""
 
 MAX_PIXELS = 2**28
-"""Most pixels of one image, 16,384 x 16,384: a G-buffer of it takes 12 GB."""
+"""Most pixels of one image, 16,384 x 16,384; a G-buffer of this size takes 12 GB."""
 
 RIGID_TOLERANCE = 1e-4
 """Largest entry of |R^T R - I| accepted as a rotation: single-precision poses printed with six digits are within it."""
-
-PARALLEL_SINE = 1e-6
-"""Below this sine between the viewing direction and up, the roll of a camera is undefined in double precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ class Camera:
         focal_y: Focal length along y [pixel].
         center_x: Principal point from the left edge of the image [pixel].
         center_y: Principal point from the top edge of the image [pixel].
-        camera_to_world: Rigid pose, ``(4, 4)`` float64: its columns are right, down, forward and the position [m].
+        camera_to_world: Rigid pose, ``(4, 4)`` float64; its columns are right, down, forward and the position [m].
 
     Raises:
         InvalidOptionError: A size, focal length or principal point is not a number in range.
@@ -82,12 +80,12 @@ class Camera:
 
     @property
     def world_to_camera(self) -> NDArray[np.float64]:
-        """The inverse pose, ``(4, 4)`` float64."""
+        """Inverse of the pose, ``(4, 4)`` float64."""
         return np.linalg.inv(self.camera_to_world).astype(np.float64)
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """Where the camera is in the world [m], ``(3,)`` float64."""
+        """Position of the camera in the world [m], ``(3,)`` float64."""
         return self.camera_to_world[:3, 3]
 
     @property
@@ -96,7 +94,7 @@ class Camera:
         return self.camera_to_world[:3, 2]
 
     def supersampled(self, factor: int) -> Camera:
-        """Return the camera that takes ``factor`` x ``factor`` samples where this one has a pixel.
+        """Return the camera with ``factor`` x ``factor`` pixels in place of each pixel.
 
         Raises:
             InvalidOptionError: ``factor`` is below 1, or the images would be too large.
@@ -113,7 +111,7 @@ class Camera:
         )
 
     def reduced(self, factor: int) -> Camera:
-        """Return the camera that has one pixel for ``factor`` x ``factor`` of this one.
+        """Return the camera with one pixel in place of ``factor`` x ``factor`` pixels.
 
         Rows and columns beyond the last whole pixel are left out.
 
@@ -183,9 +181,9 @@ class Camera:
         """Place a camera at ``eye`` that looks at ``target``, with square pixels and a centred principal point.
 
         Args:
-            eye: Where the camera is [m], ``(3,)``.
-            target: What it looks at [m], ``(3,)``.
-            up: World direction that is up in the image, ``(3,)``, not parallel to the viewing direction.
+            eye: Position of the camera [m], ``(3,)``.
+            target: Point that it looks at [m], ``(3,)``.
+            up: World direction that points up in the image, ``(3,)``; not parallel to the viewing direction.
             width: Image width [pixel].
             height: Image height [pixel].
             vertical_fov: Angle between the top and bottom edges of the image [degree].
@@ -194,23 +192,7 @@ class Camera:
             InvalidArrayError: ``eye``, ``target`` or ``up`` is not three finite numbers.
             InvalidOptionError: They coincide or are parallel, or the angle or a size is out of range.
         """
-        start, end, above = (_point(n, v) for n, v in (("eye", eye), ("target", target), ("up", up)))
-        axis = end - start
-        distance = float(np.linalg.norm(axis))
-        if not distance > 0.0:
-            raise InvalidOptionError(f"target must differ from eye, got {end.tolist()} for both. Move one of them.")
-        forward = axis / distance
-        right = np.cross(forward, above)
-        sine = float(np.linalg.norm(right) / max(float(np.linalg.norm(above)), np.finfo(float).tiny))
-        if not sine > PARALLEL_SINE:
-            raise InvalidOptionError(
-                f"up must not be parallel to the viewing direction {forward.round(6).tolist()}, got {above.tolist()}. "
-                "Choose another up."
-            )
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        pose[:3, 3] = start
+        pose = pose_looking_at(eye, target, up)
         rows = require_count("height", height, 1, MAX_SIDE)
         columns = require_count("width", width, 1, MAX_SIDE)
         focal = focal_length(rows, vertical_fov)
@@ -231,11 +213,11 @@ class Camera:
         """Place a camera on a sphere around ``center``, looking at it.
 
         Args:
-            center: What it looks at [m], ``(3,)``.
-            distance: How far away it is [m].
-            azimuth: 0 looks along +y (the world's forward); grows counter-clockwise seen from above, so that 90 sees
-                the scene from +x [degree].
-            elevation: Height above the horizon, -90 to 90 [degree]; at the poles up continues along the meridian.
+            center: Point that the camera looks at [m], ``(3,)``.
+            distance: Distance from that point [m].
+            azimuth: Angle around the vertical [degree]. At 0 the camera looks along +y, the world's forward; it grows
+                counter-clockwise as seen from above, so that 90 sees the scene from +x.
+            elevation: Angle above the horizon, -90 to 90 [degree]; at the poles, up continues along the meridian.
             width: Image width [pixel].
             height: Image height [pixel].
             vertical_fov: Angle between the top and bottom edges of the image [degree].
@@ -244,8 +226,8 @@ class Camera:
             InvalidArrayError: ``center`` is not three finite numbers.
             InvalidOptionError: The distance, an angle or a size is out of range.
         """
-        middle = _point("center", center)
-        away, above = _orbit_directions(azimuth, elevation)
+        middle = require_point("center", center)
+        away, above = orbit_directions(azimuth, elevation)
         reach = require_number("distance", distance, 1e-6, 1e9)
         return cls.look_at(
             middle + reach * away, middle, up=above, width=width, height=height, vertical_fov=vertical_fov
@@ -266,17 +248,17 @@ class Camera:
     ) -> Camera:
         """Place an orbit camera so near that a cloud just fills the image.
 
-        Trained clouds carry stray Gaussians far off: `bulk` says which positions count.
+        Trained clouds have stray Gaussians far off, so only the positions that `bulk` returns are framed.
 
         Args:
             positions: Centres [m], ``(N, 3)`` with N at least 1.
-            opacities: How much each one counts, ``(N,)`` in [0, 1]; all the same without.
+            opacities: Weight of each position, ``(N,)`` in [0, 1]; None weighs all the same.
             azimuth: See `orbit` [degree].
             elevation: See `orbit` [degree].
             width: Image width [pixel].
             height: Image height [pixel].
             vertical_fov: Angle between the top and bottom edges of the image [degree].
-            margin: Half the image over the half that the cloud may fill, at least 1.
+            margin: Size of the image over that of the part that the cloud may fill, at least 1.
 
         Raises:
             InvalidArrayError: An array breaks its contract, or there is no Gaussian.
@@ -304,7 +286,7 @@ class Camera:
         vertical_fov: float = 35.0,
         margin: float = 1.1,
     ) -> Camera:
-        """Place an orbit camera so near that points just fill the image; all of them count.
+        """Place an orbit camera so near that points just fill the image; all of them are inside.
 
         Args:
             points: World positions [m], ``(N, 3)`` with N at least 1.
@@ -313,13 +295,13 @@ class Camera:
             width: Image width [pixel].
             height: Image height [pixel].
             vertical_fov: Angle between the top and bottom edges of the image [degree].
-            margin: Half the image over the half that the points may fill, at least 1.
+            margin: Size of the image over that of the part that the points may fill, at least 1.
 
         Raises:
             InvalidArrayError: ``points`` breaks its contract, or is empty.
             InvalidOptionError: An angle, the margin or a size is out of range.
         """
-        kept = _require_points("points", points)
+        kept = require_points("points", points)
         center = 0.5 * (kept.min(axis=0) + kept.max(axis=0))
         room = require_number("margin", margin, 1.0, 100.0)
         trial = cls.orbit(
@@ -338,67 +320,7 @@ class Camera:
         return cls.orbit(center, distance, azimuth, elevation, width=width, height=height, vertical_fov=vertical_fov)
 
 
-def bulk(positions: ArrayLike, opacities: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Return the positions that belong to the subject, without strays.
-
-    Per axis, the box between the 1 % and 99 % quantiles by opacity is robust against any 1 % of strays but cuts off
-    feet and fingers; grown by a quarter of its size to each side it holds them again.
-
-    Args:
-        positions: Centres [m], ``(N, 3)`` with N at least 1.
-        opacities: How much each one counts, ``(N,)`` in [0, 1]; all the same without.
-
-    Returns:
-        ``(M, 3)`` float64 with M at least 1.
-
-    Raises:
-        InvalidArrayError: An array breaks its contract, or there is no Gaussian.
-    """
-    points = _require_points("positions", positions)
-    if opacities is None:
-        weights = np.ones(len(points))
-    else:
-        weights = require_array("opacities", opacities, (len(points),), np.float64)
-        require_range("opacities", weights, 0.0, 1.0)
-    if not weights.sum() > 0.0:
-        weights = np.ones(len(points))
-    inside = np.ones(len(points), dtype=bool)
-    for axis in range(3):
-        order = np.argsort(points[:, axis], kind="stable")
-        share = np.cumsum(weights[order])
-        sorted_points = points[order, axis]
-        low, high = sorted_points[np.searchsorted(share, np.array([0.01, 0.99]) * share[-1])]
-        grown = 0.25 * (high - low)
-        inside &= (points[:, axis] >= low - grown) & (points[:, axis] <= high + grown)
-    return points[inside] if inside.any() else points
-
-
 def focal_length(height: int, vertical_fov: float) -> float:
     """Return the focal length [pixel] at which ``height`` pixels span ``vertical_fov`` degrees."""
     angle = require_number("vertical_fov", vertical_fov, 0.01, 179.0)
     return 0.5 * height / float(np.tan(np.radians(0.5 * angle)))
-
-
-def _orbit_directions(azimuth: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the unit direction from the centre to the camera, and the up of its image, which is perpendicular."""
-    a = np.radians(require_number("azimuth", azimuth, -3600.0, 3600.0))
-    e = np.radians(require_number("elevation", elevation, -90.0, 90.0))
-    ground = np.array([np.sin(a), -np.cos(a), 0.0])
-    zenith = np.array([0.0, 0.0, 1.0])
-    return np.cos(e) * ground + np.sin(e) * zenith, np.cos(e) * zenith - np.sin(e) * ground
-
-
-def _require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return one or more finite points, ``(N, 3)``."""
-    points = require_array(name, value, (None, 3), np.float64)
-    if not len(points):
-        raise InvalidArrayError(f"{name} must hold at least one point, got none. Check that the asset is not empty.")
-    require_finite(name, points)
-    return points
-
-
-def _point(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return three finite numbers."""
-    point = require_array(name, value, (3,), np.float64)
-    require_finite(name, point)
-    return point

@@ -1,4 +1,4 @@
-"""Distant light as a lat-long map: reading, turning, resizing, and integrals over the sphere.
+"""Distant light as a lat-long map: reading, rotation, resizing, and integrals over the sphere.
 
 The mapping, for a unit world direction d (z up): u = 0.5 - atan2(d.y, d.x) / 2π, v = acos(d.z) / π from the top row.
 The centre of the image is +x, its left quarter +y. Radiance is constant inside a texel; all integrals here are of that
@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import require_array, require_count, require_number, require_unit
+from beam_warp.checks import require_array, require_count, require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError
 from beam_warp.image.files import MAX_SIDE, read_image
 
@@ -24,7 +24,7 @@ MIN_HEIGHT = 4
 """Fewest rows of a map: below, a texel spans more than an octant."""
 
 DEFAULT_IRRADIANCE_SIZE = (64, 128)
-"""Rows and columns at which bilinear lookup of irradiance errs by 3e-4."""
+"""Rows and columns of an irradiance map whose bilinear lookup has an error of 3e-4."""
 
 IRRADIANCE_ROWS = 512
 """Rows of the grid behind `EnvironmentMap.irradiance_map`. Texels that straddle the horizon lose at most the fraction
@@ -96,23 +96,6 @@ class EnvironmentMap:
         rows = (2.0 * np.pi / self.width) * -np.diff(np.cos(_row_edges(self.height)))
         return np.broadcast_to(rows[:, None], (self.height, self.width))
 
-    def lookup(self, directions: ArrayLike) -> NDArray[np.float32]:
-        """Return the radiance of the texel that holds each unit direction, ``(..., 3)`` to ``(..., 3)``.
-
-        The float64 twin of ``latlong_nearest``: they differ only for directions within rounding of a texel's edge.
-
-        Raises:
-            InvalidArrayError: A direction is not of unit length.
-        """
-        d = np.asarray(directions, np.float64)
-        flat = require_array("directions", d.reshape(-1, d.shape[-1] if d.ndim else 1), (None, 3), np.float64)
-        require_unit("directions", flat)
-        u = 0.5 - np.arctan2(flat[:, 1], flat[:, 0]) / (2.0 * np.pi)
-        v = np.arccos(np.clip(flat[:, 2], -1.0, 1.0)) / np.pi
-        row = np.minimum((v * self.height).astype(np.int64), self.height - 1)
-        column = (u * self.width).astype(np.int64) % self.width
-        return self.radiance[row, column].reshape(d.shape)
-
     def mean_radiance(self) -> NDArray[np.float64]:
         """Return the mean over the sphere, ``(3,)``: every texel weighted by its solid angle."""
         weights = self.solid_angles()[:, 0] / (4.0 * np.pi)
@@ -162,7 +145,7 @@ class EnvironmentMap:
 
     @cached_property
     def default_irradiance(self) -> NDArray[np.float32]:
-        """`irradiance_map` of the default size, computed once; scaling and turning by whole columns carry it along."""
+        """`irradiance_map` of the default size, computed once; scaling and rotation by whole columns keep it."""
         return self.irradiance_map(*DEFAULT_IRRADIANCE_SIZE)
 
     def irradiance_map(self, height: int = 64, width: int = 128) -> NDArray[np.float32]:
@@ -229,7 +212,7 @@ def _overlap_means(old_edges: NDArray[np.float64], new_edges: NDArray[np.float64
 
 
 def _require_environment(name: str, radiance: NDArray[np.float32], where: str, error: type[BeamError]) -> None:
-    """Refuse what is not 2:1, finite and non-negative, naming the first bad texel."""
+    """Refuse a map that is not 2:1, finite and non-negative; the message names the first bad texel."""
     height, width = radiance.shape[:2]
     if height < MIN_HEIGHT or width != 2 * height:
         raise error(

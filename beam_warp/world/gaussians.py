@@ -1,4 +1,4 @@
-"""What an asset is in memory: frozen NumPy records in canonical units, on no device and in no file format.
+"""Gaussians in memory: frozen NumPy records in canonical units, independent of devices and file formats.
 
 Canonical form: metres, linear scales and opacities, quaternions xyzw, spherical harmonics ``(N, (degree + 1)^2, 3)``.
 Axes are stated by a three-letter code (see `beam_warp.world.axes`), colour state by a colour-space token; neither is
@@ -35,7 +35,7 @@ MAX_SH_DEGREE = 4
 
 
 class Observability(IntFlag):
-    """Why a Gaussian's material is less than measured; 0 is fully observed."""
+    """Reasons why a Gaussian's material was not fully measured; 0 is fully observed."""
 
     OBSERVED = 0
     UNLIT = 1  #: hardly any light of the capture reaches it
@@ -48,7 +48,7 @@ class Observability(IntFlag):
 
 @dataclass(frozen=True)
 class Attribute:
-    """The contract of one per-Gaussian array."""
+    """Contract of one per-Gaussian array."""
 
     name: str
     trailing: tuple[int | None, ...]
@@ -84,13 +84,13 @@ ATTRIBUTES: Mapping[str, Attribute] = {
 
 @dataclass(frozen=True, eq=False)
 class InvalidRows:
-    """Rows that no reading can make a Gaussian of, and why; a row with several faults counts for the first.
+    """Rows that are no valid Gaussian, with counts by fault; a row with several faults counts for the first.
 
     Attributes:
-        rows: Their numbers, ascending, ``(K,)`` int64.
-        not_finite: With NaN or infinity in any array.
-        negative_scales: With a scale below 0.
-        zero_quaternions: With an orientation of length 0.
+        rows: Numbers of these rows, ascending, ``(K,)`` int64.
+        not_finite: Rows with NaN or infinity in any array.
+        negative_scales: Rows with a scale below 0.
+        zero_quaternions: Rows with an orientation of length 0.
     """
 
     rows: NDArray[np.int64]
@@ -99,7 +99,7 @@ class InvalidRows:
     zero_quaternions: int
 
     def __len__(self) -> int:
-        """Return their number."""
+        """Return the number of rows."""
         return len(self.rows)
 
     def __str__(self) -> str:
@@ -193,22 +193,22 @@ class GaussianCloud:
 
     @classmethod
     def leaving_out_invalid(cls, **fields: Any) -> tuple[GaussianCloud, InvalidRows]:
-        """Make a cloud of the rows that are Gaussians, and say which were left out.
+        """Make a cloud of the valid rows, and say which rows were left out.
 
-        The constructor refuses an array with a broken row, since a row that vanishes silently takes its neighbours'
-        numbers along. This one is for data that has them, as trainings leave them: it leaves out rows with NaN or
-        infinity in any array, negative scales and zero quaternions. What is wrong with a whole array (its shape, its
-        range, logits for opacities) is refused as ever.
+        The constructor refuses an array with a broken row, since leaving a row out changes the numbers of those after
+        it. This method is for training results, which have such rows: it leaves out rows with NaN or infinity in any
+        array, negative scales, or zero quaternions. Faults of a whole array (its shape, its range, logits instead of
+        opacities) are refused as by the constructor.
 
         Args:
-            fields: As the constructor's.
+            fields: The constructor's arguments.
 
         Returns:
             The cloud, and the rows that it lacks.
 
         Raises:
-            InvalidArrayError: As the constructor, after broken rows are gone.
-            InvalidOptionError: As the constructor.
+            InvalidArrayError: The constructor refuses the remaining rows.
+            InvalidOptionError: The constructor refuses an option.
         """
         if any(fields.get(name) is None for name, attribute in ATTRIBUTES.items() if attribute.required):
             cls(**fields)  # refuses, in its own words
@@ -276,7 +276,7 @@ Topology = Literal["constant", "perFrame"]
 
 @dataclass(frozen=True, eq=False)
 class GaussianSequence:
-    """Gaussians over time, read frame by frame so that memory does not grow with length.
+    """Gaussians over time, read frame by frame so that memory does not grow with the number of frames.
 
     Attributes:
         frame_count: Number of frames, at least 1.
@@ -284,8 +284,8 @@ class GaussianSequence:
         frames_per_second: Playback rate [1/s].
         constant: Names of the arrays that are the same in every frame; they are stored once.
         topology: ``constant`` if row i is the same Gaussian in every frame, else ``perFrame``.
-        metadata: Provenance as text: producer, roughness source, illuminant, …; and how the Gaussians are to be drawn
-            and which frames of a capture they show (see `beam_warp.world.metadata`).
+        metadata: Provenance as text (producer, roughness source, illuminant, …), how the Gaussians are to be drawn,
+            and which frames of a capture they show; see `beam_warp.world.metadata`.
     """
 
     frame_count: int
@@ -328,7 +328,7 @@ class GaussianSequence:
         frames_per_second: float = 30.0,
         metadata: Mapping[str, str] | None = None,
     ) -> GaussianSequence:
-        """Wrap clouds that are in memory already; finds out what is constant and whether the topology is."""
+        """Make a sequence of clouds in memory; which arrays are constant, and the topology, are found by comparison."""
         held = tuple(clouds)
         require_count("len(clouds)", len(held))
         first = held[0]

@@ -71,27 +71,12 @@ def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
     return np.stack([term for band in bands for term in band], axis=-1)
 
 
-def sh_color(radiance: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
-    """Evaluate captured colour, clamped at 0 like every viewer does.
-
-    Args:
-        radiance: Coefficients, ``(N, K, 3)``.
-        directions: Unit vectors from the camera to each Gaussian, ``(N, 3)``, or one ``(3,)`` for all.
-
-    Returns:
-        ``(N, 3)`` float64 in the colour space of ``radiance``.
-    """
-    coefficients = np.asarray(radiance, dtype=np.float64)
-    basis = sh_basis(directions, round(np.sqrt(coefficients.shape[1])) - 1)
-    return np.maximum(0.5 + np.einsum("...k,nkc->nc" if basis.ndim == 1 else "nk,nkc->nc", basis, coefficients), 0.0)
-
-
 def sh_transform(linear: ArrayLike, degree: int) -> NDArray[np.float64]:
     """Return the matrix that carries coefficients along when the scene is turned or mirrored.
 
     If g(d) = f(M^T d) for an orthogonal M, then ``coefficients(g) = sh_transform(M, degree) @ coefficients(f)``.
-    Found by evaluating the basis on more directions than it has terms and solving the (consistent, well conditioned)
-    linear system, which is exact to rounding for every orthogonal M, flips included: no Wigner recursion to get wrong.
+    The basis is evaluated in more directions than it has terms, and the consistent, well-conditioned linear system is
+    solved. This is exact to rounding for every orthogonal M, flips included, and needs no Wigner recursion.
 
     Args:
         linear: Orthogonal ``(3, 3)``.

@@ -1,4 +1,4 @@
-"""A closed triangle mesh with a material at every vertex: what the path tracer renders and the demo figure is."""
+"""Closed triangle meshes with a material at every vertex, which the path tracer renders."""
 
 from __future__ import annotations
 

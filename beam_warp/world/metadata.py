@@ -1,6 +1,7 @@
-"""How a sequence's metadata, which is text by key, says what programs act on: how it is drawn, which frames it shows.
+"""Keys of a sequence's metadata that programs act on: how it is drawn, and which frames of a capture it shows.
 
-Whoever writes or reads these keys does so here, so that every file format and every viewer means the same by them.
+Metadata are text by key. These keys are written and read here only, so that they mean the same in every file format
+and viewer.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from beam_warp.checks import require_choice, require_number
 from beam_warp.errors import InvalidOptionError
 
 RASTER_ANTIALIASED = "raster_antialiased"
-"""``true`` or ``false``: whether a splat keeps its total opacity when the low-pass widens it."""
+"""Key for ``true`` or ``false``: whether a splat keeps its total opacity when the low-pass widens it."""
 
 RASTER_LOW_PASS = "raster_low_pass"
-"""Variance of the pixel filter that splats are widened by [pixel^2]."""
+"""Key for the variance of the pixel filter that widens splats [pixel^2]."""
 
 CAPTURE_FRAMES = "capture_frames"
-"""The capture's number of every frame: ``0 1 2``."""
+"""Key for the capture's number of every frame: ``0 1 2``."""
 
 UNSTATED_RASTER = (False, 0.3)
-"""What holds where nothing is stated: the rasteriser of 3D Gaussian Splatting (Kerbl et al. 2023)."""
+"""Antialiasing and low-pass if nothing is stated, as in 3D Gaussian Splatting (Kerbl et al. 2023)."""
 
 LOW_PASS_RANGE = (1e-6, 1e6)
-"""Variances that a low-pass may have [pixel^2]."""
+"""Range of the low-pass' variance [pixel^2]."""
 
 
 def raster_metadata(antialiased: bool, low_pass: float) -> dict[str, str]:
-    """Return what states that Gaussians are to be drawn so, as they were when they were fitted.
+    """Return the metadata that state how Gaussians were drawn when they were fitted, and so are to be drawn.
 
     Args:
         antialiased: See `RASTER_ANTIALIASED`.
@@ -43,10 +44,10 @@ def stated_raster(metadata: Mapping[str, str]) -> tuple[bool, float] | None:
     """Return whether Gaussians are to be drawn antialiased, and with which low-pass [pixel^2].
 
     Returns:
-        Both, of `UNSTATED_RASTER` what is not stated; None if neither is.
+        Both, with `UNSTATED_RASTER` for one that is not stated; None if neither is stated.
 
     Raises:
-        InvalidOptionError: What is stated is no such value.
+        InvalidOptionError: A stated value is out of range.
     """
     antialiased, low_pass = metadata.get(RASTER_ANTIALIASED), metadata.get(RASTER_LOW_PASS)
     if antialiased is None and low_pass is None:
@@ -60,7 +61,7 @@ def stated_raster(metadata: Mapping[str, str]) -> tuple[bool, float] | None:
 
 
 def capture_frames_metadata(frames: Sequence[int]) -> dict[str, str]:
-    """Return what states which frames of a capture a sequence shows, in its order."""
+    """Return the metadata that state which frame of a capture each frame of a sequence shows."""
     return {CAPTURE_FRAMES: " ".join(str(frame) for frame in frames)}
 
 
@@ -68,11 +69,11 @@ def stated_capture_frames(metadata: Mapping[str, str], frame_count: int) -> tupl
     """Return the capture's number of every frame of a sequence; None if it is not stated.
 
     Args:
-        metadata: Of the sequence.
-        frame_count: Its length.
+        metadata: Metadata of the sequence.
+        frame_count: Number of frames of the sequence.
 
     Raises:
-        InvalidOptionError: What is stated is not one number, at least 0, for each frame.
+        InvalidOptionError: The text is not one number, at least 0, for each frame.
     """
     text = metadata.get(CAPTURE_FRAMES)
     if text is None:
@@ -88,10 +89,10 @@ def stated_capture_frames(metadata: Mapping[str, str], frame_count: int) -> tupl
 
 
 def numbers_of_frames(metadata: Mapping[str, str], frame_count: int) -> tuple[int, ...]:
-    """Return by which number a capture knows every frame of a sequence: as stated, else counted from 0.
+    """Return the capture's number of every frame of a sequence, as stated, or else 0, 1, 2, ….
 
     Raises:
-        InvalidOptionError: As `stated_capture_frames`.
+        InvalidOptionError: See `stated_capture_frames`.
     """
     stated = stated_capture_frames(metadata, frame_count)
     return tuple(range(frame_count)) if stated is None else stated

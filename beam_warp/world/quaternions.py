@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions xyzw: their product, where they come from, and the shortest way between two."""
+"""Rotations as unit quaternions xyzw: conversion from and to matrices, product, and interpolation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit quaternion of a proper rotation ``(3, 3)``, by its largest component (Shepperd 1978)."""
+    """Return the unit quaternion of a rotation matrix ``(3, 3)``, by its largest component (Shepperd 1978)."""
     trace = np.trace(rotation)
     squares = np.append(1.0 + 2.0 * np.diag(rotation) - trace, 1.0 + trace)  # four times the squared components
     largest = int(np.argmax(squares))
@@ -23,34 +23,33 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def matrix_of(quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Return the rotation matrix ``(3, 3)`` of a unit quaternion ``(4,)``."""
-    x, y, z, w = np.asarray(quaternion, np.float64)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
+    """Return the rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion, np.float64), -1, 0)
+    rows = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
+    return np.stack(rows, axis=-1).reshape(*x.shape, 3, 3)
 
 
 def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Hamilton product of one quaternion ``(4,)`` with many ``(N, 4)``: their rotations, then its."""
+    """Return the Hamilton products of one quaternion ``(4,)`` with many ``(N, 4)``, which rotate first."""
     x, y, z, w = left
     matrix = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
     return right @ matrix.T
 
 
 def slerp(first: ArrayLike, second: ArrayLike, fraction: float) -> NDArray[np.float64]:
-    """Turn from one rotation to another at constant speed, the shorter way round.
+    """Interpolate between rotations at constant angular speed along the shorter arc.
 
-    A quaternion and its negative are the same rotation: of the second ones, the nearer is taken. Half a turn has two
-    ways of the same length; the one that the signs as given point along is taken.
+    A quaternion and its negative are the same rotation: the second quaternion takes the sign that is nearer to the
+    first. Half a turn has two arcs of the same length; the signs as given choose one.
 
     Args:
-        first: Where fraction 0 is, ``(N, 4)``.
-        second: Where fraction 1 is, ``(N, 4)``.
-        fraction: In [0, 1].
+        first: Rotations at fraction 0, ``(N, 4)``.
+        second: Rotations at fraction 1, ``(N, 4)``.
+        fraction: Fraction of the arc, in [0, 1].
 
     Returns:
         Unit quaternions, ``(N, 4)`` float64.

@@ -17,8 +17,8 @@ OPACITY = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Points spread evenly over a surface.
+class TiledSurface:
+    """A surface as evenly spread points, one for each Gaussian that is to tile it.
 
     Attributes:
         points: Positions [m], ``(N, 3)``.
@@ -33,17 +33,17 @@ class Surface:
 
 def rectangle(
     middle: NDArray[np.float64], side: NDArray[np.float64], up: NDArray[np.float64], spacing: float
-) -> Surface:
+) -> TiledSurface:
     """Return a grid over a rectangle whose half-sides are two orthogonal vectors; its normal is side × up."""
     widths = [np.linalg.norm(side), np.linalg.norm(up)]
     counts = [max(1, round(2.0 * width / spacing)) for width in widths]
     u, v = ((np.arange(count) + 0.5) * (2.0 / count) - 1.0 for count in counts)
     grid = u[:, None, None] * side + v[None, :, None] * up
     normal = np.cross(side, up) / (widths[0] * widths[1])
-    return Surface(middle + grid.reshape(-1, 3), np.broadcast_to(normal, (grid.size // 3, 3)), spacing)
+    return TiledSurface(middle + grid.reshape(-1, 3), np.broadcast_to(normal, (grid.size // 3, 3)), spacing)
 
 
-def sphere_zone(middle: NDArray[np.float64], radius: float, low: float, high: float, spacing: float) -> Surface:
+def sphere_zone(middle: NDArray[np.float64], radius: float, low: float, high: float, spacing: float) -> TiledSurface:
     """Return a spherical Fibonacci set between two heights, in radii over the middle; normals point outwards."""
     count = max(1, round(2.0 * np.pi * radius**2 * (high - low) / spacing**2))
     i = np.arange(count) + 0.5
@@ -51,11 +51,11 @@ def sphere_zone(middle: NDArray[np.float64], radius: float, low: float, high: fl
     angle = np.pi * (1.0 + np.sqrt(5.0)) * i
     around = np.sqrt(np.maximum(1.0 - z * z, 0.0))
     normals = np.stack([around * np.cos(angle), around * np.sin(angle), z], axis=1)
-    return Surface(middle + radius * normals, normals, spacing)
+    return TiledSurface(middle + radius * normals, normals, spacing)
 
 
-def tile(surfaces: tuple[Surface, ...]) -> GaussianCloud:
-    """Put one flat Gaussian on every point, its shortest axis along the normal; the cloud keeps the normals."""
+def tile(surfaces: tuple[TiledSurface, ...]) -> GaussianCloud:
+    """Return a cloud with one flat Gaussian on every point, its shortest axis along the normal; it has the normals."""
     normals = np.concatenate([surface.normals for surface in surfaces])
     spacing = np.concatenate([np.full(len(surface.points), surface.spacing) for surface in surfaces])
     # Shortest rotation that carries +z to the normal; straight down, half a turn about x
@@ -74,14 +74,14 @@ def tile(surfaces: tuple[Surface, ...]) -> GaussianCloud:
 def still_life(count: int = 30_000) -> GaussianCloud:
     """Return a wall, a sphere and a bowl on a floor, 2 m wide, of about ``count`` Gaussians, z up."""
 
-    def surfaces(spacing: float) -> tuple[Surface, ...]:
+    def surfaces(spacing: float) -> tuple[TiledSurface, ...]:
         x, y, z = np.eye(3)
         bowl = sphere_zone(-0.4 * x - 0.3 * y + 0.36 * z, 0.36, -1.0, -0.1, spacing)
         return (
             rectangle(np.zeros(3), x, y, spacing),
             rectangle(y + 0.5 * z, x, 0.5 * z, spacing),
             sphere_zone(0.4 * x + 0.2 * y + 0.4 * z, 0.4, -1.0, 1.0, spacing),
-            Surface(bowl.points, -bowl.normals, spacing),
+            TiledSurface(bowl.points, -bowl.normals, spacing),
         )
 
     coarse = 0.05

@@ -103,27 +103,20 @@ def test_images_are_read_when_asked_for(tmp_path):
     ("changes", "message"),
     [
         ({"transform_matrix": None}, "transform_matrix must be a 4 x 4 matrix of finite numbers, got nothing"),
-        ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix must be a 4 x 4 matrix"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "of finite numbers, got"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "transform_matrix is no camera pose"),
-        ({"file_path": None}, "file_path must be a text, got nothing"),
         ({"file_path": 7}, "file_path must be a text, got 7"),
         ({"fl_x": "wide"}, r"fl_x must be a number in \[0.001, 1e\+09\], got 'wide'"),
-        ({"fl_y": 0}, "fl_y must be a number"),
         ({"cx": float("nan")}, "cx must be a number"),
         ({"w": 7.5}, "w must be an integer, got 7.5"),
-        ({"h": 10**30}, "h must be a number"),
         ({"frame": -1}, "frame must be a number"),
         ({"frame": True}, "frame must be a number"),
-        ({"k1": []}, "k1 must be a number"),
         ({"camera": "../../evil"}, "camera must be fit for a file name, got '../../evil'"),
-        ({"camera": ".."}, "camera must be fit for a file name"),
         ({"relit": ["x"]}, "relit must be an object of file names"),
         ({"file_path": ".", "camera": None}, "camera must be a text, got"),
         ({"truth": 3}, "truth must be a text"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of OPENCV, PINHOLE, SIMPLE_PINHOLE"),
         ({"k2": float("nan")}, r"k2 must be a number in \[-1e\+06, 1e\+06\], got nan"),
-        ({"k3": 1e300}, r"k3 must be a number in .*, got 1e\+300"),
         (
             {"k1": -20.0},
             "OPENCV has no pinhole at .* k1 must let the lens be inverted .*got -20, .*at 0.1291, at pixel",
@@ -140,10 +133,7 @@ def test_a_broken_record_is_named(tmp_path, changes, message):
 
 
 def test_a_missing_intrinsic_is_named(tmp_path):
-    path = write_capture(tmp_path, [record()])
-    content = json.loads(path.read_text())
-    del content["fl_y"]
-    path.write_text(json.dumps(content))
+    write_capture(tmp_path, [record()], fl_y=None)
     with pytest.raises(AssetFormatError, match=r"fl_y must be a number in .*, got nothing at .*frames\[0\]"):
         Capture.read(tmp_path)
 
@@ -162,7 +152,6 @@ def test_the_same_camera_and_frame_twice(tmp_path):
         (b"[" * 100_000, "capture must be JSON in UTF-8"),
         (b"[]", r"capture must be a JSON object, got \[\]"),
         (b"{}", "frames must be a list of 1 to 4194304 records, got None"),
-        (b'{"frames": []}', "frames must be a list of 1 to 4194304 records, got 0"),
         (b'{"frames": [3]}', "record must be an object, got 3 at"),
         (b'{"frames": [{}], "test_filenames": 3}', "test_filenames must be a list of texts, got 3"),
     ],
@@ -206,31 +195,6 @@ def test_a_bent_photograph_is_read_undistorted(tmp_path):
     assert whole.camera.focal_x < bent.camera.focal_x
     with pytest.raises(InvalidOptionError, match="keep must be a number in"):
         Capture.read(tmp_path, keep=2.0)
-
-
-def test_straight_photographs_are_untouched(tmp_path):
-    (tmp_path / "images/a").mkdir(parents=True)
-    values = np.random.default_rng(0).normal(size=(6, 8)).astype(np.float32)
-    write_exr(tmp_path / "images/a/0000.exr", dict.fromkeys("RGBA", values))
-    write_capture(tmp_path, [record(k1=0.0, p2=0)])
-    straight = Capture.read(tmp_path, keep=1.0).records[0]
-    assert not straight.is_distorted
-    assert (straight.camera.focal_x, straight.camera.center_y) == (10.0, 3.0)
-    assert straight.mask().all()
-    np.testing.assert_array_equal(straight.image().channels["G"], values)
-
-
-def test_the_walker(data_dir):
-    capture = Capture.read(data_dir / "captures" / "walker")
-    assert len(capture.records) == 152
-    assert capture.frames == (0, 1, 2, 3, 4, 5)
-    test = [r for r in capture.select(split="test") if r.truth_path is not None]
-    assert len(test) == 8
-    for row in test[:2]:
-        coverage = row.image().alpha
-        assert coverage is not None
-        # Two renders of one view with different samples: they differ at the silhouette, a few percent of the pixels.
-        assert np.abs(coverage - row.truth().channels["A"]).mean() < 1e-2
 
 
 def write_pair(folder, name, rgb, alpha=None):

@@ -102,12 +102,12 @@ def colmap_project(model, parameters, local):
     return np.stack([fx * u + cx, fy * v + cy], axis=-1)
 
 
-@pytest.mark.parametrize("place", ["", "sparse", "sparse/0"])
+@pytest.mark.parametrize("place", ["", "sparse/0"])
 def test_points_fall_where_colmap_puts_them(tmp_path, place):
     write_text(tmp_path / place)
     capture = Capture.read(tmp_path)
     assert [r.camera_name for r in capture.records] == [f"cam {n}_a" for n in CAMERAS]
-    local = np.random.default_rng(1).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 3.0), size=(50, 3)) * (1, 1, 1)
+    local = np.random.default_rng(1).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 3.0), size=(50, 3))
     for record, (q, t, number, _) in zip(capture.records, poses(), strict=True):
         model, _, _, parameters = CAMERAS[number]
         expected = colmap_project(model, parameters, local)
@@ -209,13 +209,11 @@ def test_cuts_of_text_are_named_or_lose_nothing_they_have(tmp_path, name):
         ("cameras.txt", "1 FULL_OPENCV 4 3 1 1 1 1", "camera model must be one of SIMPLE_PINHOLE.* got FULL_OPENCV"),
         ("cameras.txt", "1 PINHOLE 4 3 1 1 1", "PINHOLE must have the parameters fx fy cx cy, got 3 numbers"),
         ("cameras.txt", "1 PINHOLE 4 3 0 1 2 1.5", r"fx of a camera must be a number in \[0.001, 1e\+09\], got 0"),
-        ("cameras.txt", "1 PINHOLE 4 3 nan 1 2 1.5", "fx of a camera must be a number in .*, got nan"),
         ("cameras.txt", "1 PINHOLE 0 3 1 1 2 1.5", r"size of a camera must be in \[1, 65536\] px, got 0 x 3"),
         ("cameras.txt", "1 PINHOLE wide 3 1 1 2 1.5", "line must have a whole number as word 3, got 'wide'"),
         ("cameras.txt", "1 RADIAL 4 3 1 2 1.5 -20 0", "RADIAL has no pinhole at .*line 1: k1 must let the lens"),
         ("images.txt", "1 1 0 0 0 0 0 0 9 a.png\n", "camera of an image must be one of cameras, got 9"),
         ("images.txt", "1 2 0 0 0 0 0 0 1 a.png\n", r"pose must be a unit quaternion .*, got \|q\| = 2 "),
-        ("images.txt", "1 1 0 0 0 0 nan 0 1 a.png\n", "pose must be a unit quaternion and a finite translation"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 ../a.png\n", r"image name must be a path below images, got '\.\./a\.png'"),
         ("images.txt", "1 1 0 0 0 0 0 0 1\n", "image must have a name, got none at .*line 1"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "points of an image must be triples, got 2 words"),

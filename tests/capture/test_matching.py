@@ -25,15 +25,18 @@ def test_frames_are_counted_stated_or_given():
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ("0 1", "one number for each of 3 frames of the asset, got 2"),
-        ("0 one 2", "capture_frames must be frame numbers, got '0 one 2' in the asset's metadata"),
-        ("0 -1 2", "must be frame numbers"),
-        ("0 2 2", "other numbers for other frames, got 0 2 2"),
+        ("0 1", "capture_frames must be a number for each of 3 frames, got 2"),
+        ("0 2 2", "capture-frames must name each frame of the capture once, got 0 2 2"),
     ],
 )
 def test_numbers_that_are_none_are_refused(stated, said):
     with pytest.raises(InvalidOptionError, match=said):
         match_frames(sequence(3, capture_frames=stated))
+
+
+def test_as_many_numbers_are_given_as_there_are_frames():
+    with pytest.raises(InvalidOptionError, match="one number for each of 3 frames of the asset, got 2"):
+        match_frames(sequence(3), (0, 1))
 
 
 def test_frames_with_truth_that_are_shown(tiny_capture):

@@ -95,8 +95,7 @@ def test_without_colour_bounds_a_byte_is_the_colour(tmp_path):
     assert np.allclose(0.5 + SH_C0 * cloud.radiance[0, 0], [1.0, 0.0, 0.2], atol=4 * EPSILON)
 
 
-@pytest.mark.parametrize("largest", range(4))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("largest", "sign"), [(0, 1.0), (1, -1.0), (2, 1.0), (3, -1.0)])
 def test_rotations_by_every_largest_component(tmp_path, largest, sign, rng):
     quaternions = rng.normal(size=(40, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -118,14 +117,14 @@ def test_three_components_too_long_are_normalised(tmp_path):
     assert np.allclose(cloud.orientations, [[3**-0.5, 3**-0.5, 3**-0.5, 0]], atol=EPSILON)
 
 
-@pytest.mark.parametrize("count", [1, 255, 256, 257, 512, 513])
+@pytest.mark.parametrize("count", [1, 256, 257, 513])
 def test_each_chunk_has_its_own_bounds(tmp_path, count):
     chunks = [[float(index), *CHUNK[1:3], float(index) + 0.5, *CHUNK[4:]] for index in range(-(-count // 256))]
     cloud = read(tmp_path, packed_ply(chunks, [(pack_11_10_11(1, 0, 0), IDENTITY, 0, 0)] * count))
     assert np.array_equal(cloud.positions[:, 0], np.arange(count) // 256 + 0.5)
 
 
-@pytest.mark.parametrize("width", [9, 24, 45])
+@pytest.mark.parametrize("width", [9, 45])
 def test_higher_bands(tmp_path, width):
     levels = [0, 255, 128, 1, 127, 200]
     rows = [[levels[(row + column) % 6] for column in range(width)] for row in range(3)]
@@ -187,10 +186,6 @@ ROW = (0, IDENTITY, 0, 0)
         (packed_ply([CHUNK], [ROW] * 257), "257 packed vertices must have 2 chunks, got 1"),
         (packed_ply([CHUNK], [ROW], chunk_count=10**9), "element chunk must have the 1000000000 rows that the header"),
         (
-            packed_ply([CHUNK], [ROW])[:-1],
-            "element vertex must have the 1 rows that the header counts, got bytes for 0",
-        ),
-        (
             packed_ply([CHUNK], [ROW], [[0] * 10]),
             "element sh must have 1 rows of 9, 24 or 45 properties, got 1 rows of 10",
         ),
@@ -199,16 +194,11 @@ ROW = (0, IDENTITY, 0, 0)
             "element sh must have 1 rows of 9, 24 or 45 properties, got 2 rows",
         ),
         (packed_ply([CHUNK], [ROW]).replace(b"element chunk", b"element lumps"), "must come with an element chunk"),
-        (
-            packed_ply([CHUNK], [ROW]).replace(b"float max_b", b"float max_q"),
-            "element chunk must have max_b, got min_x",
-        ),
         (packed_ply([CHUNK], [ROW]).replace(b"float max_x", b"int max_x"), "max_x must be float, got int"),
         (packed_ply([CHUNK], [ROW]).replace(b"uint packed_color", b"int packed_color"), "packed_color must be uint"),
         (packed_ply([CHUNK], [ROW]).replace(b"packed_scale", b"packed_size"), "must have packed_scale, got packed_pos"),
         (packed_ply([[math.nan, *CHUNK[1:]]], [ROW]), "positions must be finite, got NaN or infinity at row 0"),
         (packed_ply([[*CHUNK[:12], *[3e38] * 6]], [ROW]), "radiance must be finite, got NaN or infinity at row 0"),
-        (packed_ply([[-math.inf, *CHUNK[1:]]], [ROW]), "positions must be finite, got NaN or infinity at row 0"),
         (packed_ply([[*CHUNK[:6], -400.0, *CHUNK[7:]]], [ROW]), "natural logs in [-30, 20], got -400 at row 0"),
     ],
 )

@@ -13,37 +13,45 @@ from beam_warp.converters.ply_container import read_header, read_table
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 
 
-def refused(folder, content, message, *arguments, capsys):
-    """Convert ``content`` on the command line: exit 2, that message on one line, no output, within two seconds."""
+def refused(folder, content, message, **options):
+    """Read ``content``: that message on one line, after the file's name, within two seconds."""
     (folder / "bad.ply").write_bytes(content)
     started = time.perf_counter()
-    assert main([str(folder / "bad.ply"), str(folder / "out.ply"), *arguments]) == 2
+    with pytest.raises(AssetFormatError) as caught:
+        converters.read(folder / "bad.ply", **options)
     assert time.perf_counter() - started < 2.0
+    said = str(caught.value)
+    assert said.startswith("bad.ply: ")
+    assert "\n" not in said
+    assert message in said
+
+
+def test_the_command_says_so_on_one_line_and_leaves_nothing(columns, ply_bytes, tmp_path, capsys):
+    (tmp_path / "bad.ply").write_bytes(ply_bytes(columns)[:-1])
+    assert main([str(tmp_path / "bad.ply"), str(tmp_path / "out.ply")]) == 2
     captured = capsys.readouterr()
-    assert captured.err.startswith("error: bad.ply: ")
-    assert captured.err.count("\n") == 1
-    assert message in captured.err, captured.err
-    assert captured.out == ""
-    assert [path.name for path in folder.iterdir()] == ["bad.ply"]
+    assert captured.err.startswith("error: bad.ply: element vertex must have the 3 rows")
+    assert (captured.err.count("\n"), captured.out) == (1, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.ply"]
 
 
-def test_truncated_at_every_header_line(columns, ply_bytes, tmp_path, capsys):
+def test_truncated_at_every_header_line(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns)
     header = content[: content.index(b"end_header\n")]
     lines = header.splitlines(keepends=True)
     for count in range(len(lines) + 1):
         cut = b"".join(lines[:count])
         message = "got an empty file" if not cut else "the header must end with the line end_header, got a cut file"
-        refused(tmp_path, cut, message, capsys=capsys)
+        refused(tmp_path, cut, message)
 
 
-def test_truncated_within_the_data(columns, ply_bytes, tmp_path, capsys):
+def test_truncated_within_the_data(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns)
     start = content.index(b"end_header\n") + len(b"end_header\n")
-    for size in range(start, len(content)):
+    for size in (start, start + 1, start + 56, len(content) - 1):
         held = (size - start) // 56
         message = f"element vertex must have the 3 rows that the header counts, got bytes for {held}"
-        refused(tmp_path, content[:size], message, capsys=capsys)
+        refused(tmp_path, content[:size], message)
 
 
 @pytest.mark.parametrize(
@@ -51,53 +59,43 @@ def test_truncated_within_the_data(columns, ply_bytes, tmp_path, capsys):
     [
         (4, "the 4 rows that the header counts, got bytes for 3. The file is cut short"),
         (10**9, "the 1000000000 rows that the header counts, got bytes for 3"),
-        (2**31 - 1, "the 2147483647 rows that the header counts"),
         (2**31, "element vertex must count 0 to 2147483647 rows, got '2147483648'"),
-        (10**12, "element vertex must count 0 to 2147483647 rows, got '1000000000000'"),
         (10**100, "element vertex must count 0 to 2147483647 rows, got '1000"),
         (-1, "element vertex must count 0 to 2147483647 rows, got '-1'"),
         ("3.0", "element vertex must count 0 to 2147483647 rows, got '3.0'"),
-        ("three", "element vertex must count 0 to 2147483647 rows, got 'three'"),
     ],
 )
-def test_lying_counts(columns, ply_bytes, tmp_path, capsys, count, message):
-    refused(tmp_path, ply_bytes(columns, count=count), message, capsys=capsys)
+def test_lying_counts(columns, ply_bytes, tmp_path, count, message):
+    refused(tmp_path, ply_bytes(columns, count=count), message)
 
 
 HEADER_LINES = [
     (b"format binary_little_endian 1.0", b"format binary_middle_endian 1.0", "a header line must be format"),
-    (b"format binary_little_endian 1.0", b"format binary_little_endian 2.0", "a header line must be format"),
     (b"format binary_little_endian 1.0\n", b"", "a header line must be format"),
     (b"format binary_little_endian 1.0\n", b"format ascii 1.0\nformat ascii 1.0\n", "a header line must be format"),
     (b"element vertex 3\n", b"", "in that order, got 'property float x'"),
     (b"element vertex 3\n", b"element vertex\n", "in that order, got 'element vertex'"),
     (b"property float x\n", b"property float32x x\n", "a property must be a type word and a name, got"),
-    (b"property float x\n", b"property float\n", "a header line must be format"),
-    (b"property float x\n", b"property float x y\n", "a property must be a type word and a name, got"),
     (b"property float x\n", b"garbage\n", "in that order, got 'garbage'"),
-    (b"property float x\n", b"\n", "in that order, got ''"),
     (b"property float x\n", b"property float y\n", "each property of vertex must be named once, got y"),
     (b"property float x\n", b"property list uchar float x\n", "x must be float or double, got list"),
     (b"property float x\n", b"property uint x\n", "x must be float or double, got uint"),
-    (b"property float opacity\n", b"property int opacity\n", "opacity must be float or double, got int"),
     (b"property float rot_3\n", b"property float rot_4\n", "Gaussians must have the properties rot_3, got"),
-    (b"property float f_dc_1\n", b"property float green\n", "got 2 and 0. Export it again with full bands"),
     (b"property float f_dc_1\n", b"property float f_rest_0\n", "got 2 and 1. Export it again with full bands"),
     (b"element vertex 3\n", b"element point 3\n", "got vertices with nothing"),
     (b"end_header", b"element vertex 0\nend_header", "each element must be named once, got vertex"),
     (b"ply\n", b"PLY\n", "a PLY file must start with the line ply, got b'PLY"),
-    (b"ply\n", b"\x89PNG\r\n", "a PLY file must start with the line ply, got b'\\x89PNG"),
 ]
 
 
 @pytest.mark.parametrize(("old", "new", "message"), HEADER_LINES)
-def test_wrong_header_lines(columns, ply_bytes, tmp_path, capsys, old, new, message):
+def test_wrong_header_lines(columns, ply_bytes, tmp_path, old, new, message):
     content = ply_bytes(columns)
     assert old in content
-    refused(tmp_path, content.replace(old, new, 1), message, capsys=capsys)
+    refused(tmp_path, content.replace(old, new, 1), message)
 
 
-def test_limits_of_the_header(columns, ply_bytes, tmp_path, capsys):
+def test_limits_of_the_header(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns)
     for old, new, message in (
         (b"element vertex", b"comment " + b"x" * 70_000 + b"\nelement vertex", "got none in the first 64 KiB"),
@@ -112,37 +110,34 @@ def test_limits_of_the_header(columns, ply_bytes, tmp_path, capsys):
             "at most 1024 properties, got 1034",
         ),
     ):
-        refused(tmp_path, content.replace(old, new, 1), message, capsys=capsys)
+        refused(tmp_path, content.replace(old, new, 1), message)
 
 
-def test_lists_before_or_within_the_vertices(columns, ply_bytes, tmp_path, capsys):
+def test_lists_before_or_within_the_vertices(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns)
     faces = b"element face 1\nproperty list uchar int vertex_indices\nelement vertex"
     message = "element face must have no list properties before vertex, got vertex_indices. Export Gaussians, not a"
-    refused(tmp_path, content.replace(b"element vertex", faces, 1), message, capsys=capsys)
+    refused(tmp_path, content.replace(b"element vertex", faces, 1), message)
     extra = b"property list uchar int neighbours\nend_header"
     message = "element vertex must have no list properties, got neighbours"
-    refused(tmp_path, content.replace(b"end_header", extra, 1), message, capsys=capsys)
+    refused(tmp_path, content.replace(b"end_header", extra, 1), message)
 
 
-def test_a_point_cloud_is_named(ply_bytes, tmp_path, capsys):
+def test_a_point_cloud_is_named(ply_bytes, tmp_path):
     points = {"x": [0.0], "y": [0.0], "z": [0.0], "red": [255], "green": [0], "blue": [0]}
     content = ply_bytes(points, types=dict.fromkeys(("red", "green", "blue"), "uchar"))
     message = "got vertices with x, y, z, red, green, blue. This is a point cloud or a mesh: train Gaussians from it"
-    refused(tmp_path, content, message, capsys=capsys)
+    refused(tmp_path, content, message)
 
 
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
         ("x", [0.0, np.nan, np.inf], "positions must be finite, got NaN or infinity at row 1 (2 rows in all)"),
-        ("z", [np.inf, 0.0, 0.0], "positions must be finite, got NaN or infinity at row 0."),
         ("f_dc_0", [0.0, 0.0, np.nan], "radiance must be finite, got NaN or infinity at row 2."),
         ("opacity", [0.0, np.nan, 0.0], "opacity must be finite, got NaN or infinity at row 1. Repair those rows, or"),
-        ("opacity", [-np.inf, 0.0, 0.0], "opacity must be finite, got NaN or infinity at row 0."),
         ("scale_0", [-4.0, np.nan, np.nan], "natural logs in [-30, 20], got nan at row 1 (2 rows in all)"),
         ("scale_1", [-4.0, 1000.0, -4.0], "natural logs in [-30, 20], got 1000 at row 1."),
-        ("scale_2", [-np.inf, -4.0, -4.0], "natural logs in [-30, 20], got -inf at row 0."),
         (
             "rot_0",
             [0.0, 0.0, 0.0],
@@ -151,25 +146,25 @@ def test_a_point_cloud_is_named(ply_bytes, tmp_path, capsys):
         ("rot_2", [0.0, np.nan, 0.0], "rot_0 … rot_3 must be a quaternion, got NaN or infinity at row 1."),
     ],
 )
-def test_bad_values(columns, ply_bytes, tmp_path, capsys, name, values, message):
-    refused(tmp_path, ply_bytes(columns | {name: values}), message, capsys=capsys)
+def test_bad_values(columns, ply_bytes, tmp_path, name, values, message):
+    refused(tmp_path, ply_bytes(columns | {name: values}), message)
 
 
-def test_doubles_beyond_float_are_not_finite(columns, ply_bytes, tmp_path, capsys):
+def test_doubles_beyond_float_are_not_finite(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns | {"x": [1e300, 0.0, 0.0]}, types={"x": "double"})
-    refused(tmp_path, content, "positions must be finite, got NaN or infinity at row 0.", capsys=capsys)
+    refused(tmp_path, content, "positions must be finite, got NaN or infinity at row 0.")
 
 
-def test_files_that_look_linear(columns, ply_bytes, tmp_path, capsys):
+def test_files_that_look_linear(columns, ply_bytes, tmp_path):
     linear = columns | {"opacity": [0.1, 0.5, 1.0]} | {f"scale_{i}": [0.01, 0.02, 0.03] for i in range(3)}
     message = (
         "scales must be natural logs and opacities logits, got scales in [0.01, 0.03] and opacities in [0.1, 1], "
         "which look linear. Pass --activation linear"
     )
-    refused(tmp_path, ply_bytes(linear), message, capsys=capsys)
+    refused(tmp_path, ply_bytes(linear), message)
     # And the other way round: trained values are not linear ones.
     message = "scales must lie in [0, inf], got -4"
-    refused(tmp_path, ply_bytes(columns), message, "--activation", "linear", capsys=capsys)
+    refused(tmp_path, ply_bytes(columns), message, activation="linear")
 
 
 @pytest.mark.parametrize(
@@ -184,13 +179,13 @@ def test_files_that_look_linear(columns, ply_bytes, tmp_path, capsys):
         ("beam_schema 9.1", "beam_schema must be 1.x, got 9.1"),
     ],
 )
-def test_wrong_statements(columns, ply_bytes, tmp_path, capsys, comment, message):
-    refused(tmp_path, ply_bytes(columns, comments=[comment]), message, capsys=capsys)
+def test_wrong_statements(columns, ply_bytes, tmp_path, comment, message):
+    refused(tmp_path, ply_bytes(columns, comments=[comment]), message)
 
 
-def test_materials_out_of_range(columns, ply_bytes, tmp_path, capsys):
+def test_materials_out_of_range(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns | {"roughness": [0.0, 1.5, 0.0]}, comments=["beam_material linear"])
-    refused(tmp_path, content, "roughness must lie in [0, 1], got 1.5 at row 1.", capsys=capsys)
+    refused(tmp_path, content, "roughness must lie in [0, 1], got 1.5 at row 1.")
 
 
 @pytest.mark.parametrize(
@@ -200,7 +195,6 @@ def test_materials_out_of_range(columns, ply_bytes, tmp_path, capsys):
         ("0.0 1\n2\n4 5\n", "element vertex must hold rows of numbers, got the number of columns changed"),
         ("0 1\n2 3\n\n\n\n", "element vertex must hold 3 rows of 2 numbers, got 2 rows of 2"),
         ("0 1 2\n3 4 5\n6 7 8\n", "element vertex must hold 3 rows of 2 numbers, got 3 rows of 3"),
-        ("\n" * 12, "element vertex must hold 3 rows of 2 numbers, got 0 rows"),
         ("\xff\xfe 1\n2 3\n4 5\n", "element vertex must hold rows of numbers"),
         ("0 1\n", "the 3 rows that the header counts, got bytes for at most 1"),
     ],
@@ -213,11 +207,11 @@ def test_malformed_text(tmp_path, rows, message):
     assert message in str(caught.value)
 
 
-def test_rows_without_columns_cost_no_time(tmp_path, capsys):
+def test_rows_without_columns_cost_no_time(tmp_path):
     for kind in ("ascii", "binary_little_endian"):
         text = f"ply\nformat {kind} 1.0\nelement junk 2147483647\nelement vertex 1\nproperty float x\nend_header\n0000"
         message = "the 2147483647 rows that" if kind == "ascii" else "Gaussians must have the properties y, z"
-        refused(tmp_path, text.encode(), message, capsys=capsys)
+        refused(tmp_path, text.encode(), message)
 
 
 def test_control_characters_do_not_reach_the_terminal(columns, ply_bytes, tmp_path):
@@ -285,7 +279,7 @@ def test_damaged_files_are_read_or_refused(columns, ply_bytes, tmp_path, kind):
         body = np.linspace(-3.0, 3.0, 12, dtype="<f4").tobytes() + bytes(range(32))
         content = f"ply\nformat binary_little_endian 1.0\n{header}end_header\n".encode() + body
     refusals = []
-    for damaged in mutations(content, 400, seed=len(content)):
+    for damaged in mutations(content, 200, seed=len(content)):
         (tmp_path / "a.ply").write_bytes(damaged)
         started = time.perf_counter()
         try:
@@ -294,4 +288,4 @@ def test_damaged_files_are_read_or_refused(columns, ply_bytes, tmp_path, kind):
             refusals.append(str(error))
         assert time.perf_counter() - started < 2.0
     assert all(message.startswith("a.ply: ") for message in refusals)
-    assert 40 < len(refusals) < 400  # the damage is neither harmless nor always fatal
+    assert 20 < len(refusals) < 200  # the damage is neither harmless nor always fatal

@@ -69,12 +69,9 @@ class TestExr:
         np.testing.assert_array_equal(image.stack("depth", "A")[..., 0], channels["depth"])
         np.testing.assert_array_equal(image.linear_rgba()[..., 3], channels["A"])
 
-    def test_no_temporary_is_left(self, tmp_path):
-        write_exr(tmp_path / "a.exr", {"Y": np.zeros((2, 2))})
-        assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
-
     def test_failed_write_keeps_the_old_file(self, tmp_path, monkeypatch):
         write_exr(tmp_path / "a.exr", {"Y": np.ones((2, 2))})
+        assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
         monkeypatch.setattr(files.os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
         with pytest.raises(OutputError, match=r"output must be a writable file, got .*a\.exr \(.*No space left\)"):
             write_exr(tmp_path / "a.exr", {"Y": np.zeros((2, 2))})
@@ -142,13 +139,6 @@ class TestExr:
         with pytest.raises(AssetFormatError, match="flat EXR of one part, got 2 parts"):
             read_image(tmp_path / "a.exr")
 
-    def test_capture_truth(self, data_dir):
-        image = read_image(data_dir / "captures/walker/truth/test_02_0000.exr")
-        solid = image.alpha > 0.999
-        normals = image.stack("normal.X", "normal.Y", "normal.Z")[solid]
-        assert solid.any()
-        assert np.abs(np.linalg.norm(normals, axis=1) - 1).mean() < 0.02
-
 
 def png(path, values, color_type, bits=16):
     """Write an unfiltered PNG without Pillow, which has no 16-bit colour."""
@@ -209,7 +199,7 @@ class TestPngAndJpeg:
             read_image(tmp_path / "a.jpg").rgb(), [[[1, 0, 0]]] * np.ones((8, 8, 1)), atol=2 / 255
         )
 
-    @pytest.mark.parametrize("size", [0, 10, 40, 60])
+    @pytest.mark.parametrize("size", [0, 40])
     def test_truncated(self, tmp_path, rng, size):
         write_png(tmp_path / "a.png", rng.integers(0, 256, (9, 9, 3), dtype=np.uint8))
         (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:size])

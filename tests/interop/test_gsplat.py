@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference import rasterizing as reference
+from reference.harmonics import sh_color
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize_values
@@ -11,7 +12,6 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import sh_color
 
 torch = pytest.importorskip("torch")
 

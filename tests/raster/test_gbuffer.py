@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from reference import rasterizing as reference
+from reference.harmonics import sh_color
 
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.raster import forward
@@ -11,7 +12,6 @@ from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import sh_color
 
 WEIGHT_ROUNDING = 1e-5
 """A pixel coordinate below 64 is rounded by up to 4e-6 twice (centre, offset), and a response changes by at most

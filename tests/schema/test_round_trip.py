@@ -28,9 +28,17 @@ def assert_same(got, wanted, full_float):
             assert (np.abs(found.astype(np.float64) - array) <= bound).all(), name
 
 
-@pytest.mark.parametrize("full_float", [True, False])
-@pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usdz"])
-@pytest.mark.parametrize("frames", [1, 3, 65])  # one, one layer, clips with a short last segment
+@pytest.mark.parametrize(
+    ("name", "frames", "full_float"),  # one frame, one layer, clips with a short last segment
+    [
+        ("a.usda", 1, True),
+        ("a.usdc", 3, False),
+        ("a.usda", 65, False),
+        ("a.usdc", 65, True),
+        ("a.usdz", 3, True),
+        ("a.usdz", 65, False),
+    ],
+)
 def test_every_channel_survives(tmp_path, sequence, name, frames, full_float):
     source = sequence(frames, metadata={"producer": "test", "source_axes": "rdf"})
     write_asset(source, tmp_path / name, full_float=full_float, segment_length=30)
@@ -47,8 +55,7 @@ def test_every_channel_survives(tmp_path, sequence, name, frames, full_float):
 RASTER = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
 
 
-@pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usdz"])
-@pytest.mark.parametrize("frames", [1, 3, 65])
+@pytest.mark.parametrize(("name", "frames"), [("a.usdc", 1), ("a.usda", 65), ("a.usdz", 3)])
 def test_how_it_is_drawn_and_which_frames_it_shows_survive(tmp_path, sequence, name, frames):
     numbers = " ".join(str(7 + 2 * frame) for frame in range(frames))
     write_asset(sequence(frames, metadata={**RASTER, "capture_frames": numbers}), tmp_path / name)
@@ -69,7 +76,7 @@ def test_attributes_go_before_what_was_noted(tmp_path, sequence):
     stage.GetPrimAtPath("/Asset/Splats").GetAttribute("beam:rasterLowPass").Set(0.25)
     stage.GetPrimAtPath("/Asset").GetAttribute("beam:sequence:captureFrames").Set(Vt.IntArray([4, 6]))
     stage.GetRootLayer().Save()
-    found = read_asset(tmp_path / "a.usda").metadata
+    found = read_asset(tmp_path / "a.usda", trusted=True).metadata
     assert (found["raster_antialiased"], found["raster_low_pass"]) == ("true", "0.25")
     assert found["capture_frames"] == "4 6"
 
@@ -86,19 +93,17 @@ def test_what_is_not_said_of_drawing_is_the_fallback(tmp_path, sequence, name, t
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     splats = stage.GetPrimAtPath("/Asset/Splats")
     assert not splats.GetAttribute("beam:rasterLowPass").HasAuthoredValue()
-    assert stated_raster(read_asset(tmp_path / "a.usda").metadata) is None
+    assert stated_raster(read_asset(tmp_path / "a.usda", trusted=True).metadata) is None
     splats.CreateAttribute(name, type_name).Set(value)
     stage.GetRootLayer().Save()
-    assert stated_raster(read_asset(tmp_path / "a.usda").metadata) == raster
+    assert stated_raster(read_asset(tmp_path / "a.usda", trusted=True).metadata) == raster
 
 
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
         ({"raster_antialiased": "True"}, r"raster_antialiased must be one of true, false, got 'True'"),
-        ({"raster_low_pass": "nan"}, r"raster_low_pass must be a number in \[1e-06, 1e\+06\], got 'nan'"),
         ({"capture_frames": "0 1 2"}, r"capture_frames must be a number for each of 2 frames, got 3 in '0 1 2'"),
-        ({"capture_frames": "0 -1"}, r"capture_frames must be a number for each of 2 frames, got '0 -1'\. State"),
     ],
 )
 def test_metadata_that_say_nothing_clear_are_refused(tmp_path, sequence, stated, message):
@@ -109,7 +114,7 @@ def test_metadata_that_say_nothing_clear_are_refused(tmp_path, sequence, stated,
 
 def test_z_up_is_the_internal_world(tmp_path, cloud, sequence):
     write_asset(sequence(1, axes="rfu"), tmp_path / "a.usdc", full_float=True)
-    assert_same(read_asset(tmp_path / "a.usdc")[0], cloud(axes="rfu"), True)
+    assert_same(read_asset(tmp_path / "a.usdc", trusted=True)[0], cloud(axes="rfu"), True)
 
 
 def test_splats_without_material_survive(tmp_path, cloud, sequence):
@@ -157,9 +162,7 @@ def test_an_asset_can_be_rewritten_from_itself(tmp_path, sequence):
     assert_same(again[64], sequence(65)[64], True)
 
 
-@pytest.mark.parametrize(
-    ("name", "frames"), [("a.usda", 2), ("a.usdc", 2), ("a.usdz", 2), ("a.usda", 65), ("a.usdz", 65)]
-)
+@pytest.mark.parametrize(("name", "frames"), [("a.usdc", 2), ("a.usda", 65), ("a.usdz", 65)])
 def test_reading_sees_a_replaced_file(tmp_path, sequence, name, frames):
     write_asset(sequence(frames), tmp_path / name)
     held = read_asset(tmp_path / name, trusted=True)

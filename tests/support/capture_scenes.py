@@ -41,14 +41,8 @@ def cameras_around(count, *, distance=2.0, size=64, fov=40.0, center=(0.0, 0.0, 
 def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0.3, 0.1)):
     """One view of a ball of one colour: its rays pass the centre at no more than the radius."""
     s = SUPERSAMPLES
-    x = (np.arange(camera.width * s) + 0.5) / s
-    y = (np.arange(camera.height * s) + 0.5) / s
-    rays = np.ones((len(y), len(x), 3))
-    rays[..., 0] = (x - camera.center_x) / camera.focal_x
-    rays[..., 1] = ((y - camera.center_y) / camera.focal_y)[:, None]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    to_center = camera.camera_to_world[:3, :3].T @ (np.asarray(center, float) - camera.position)
-    along = rays @ to_center
+    to_center = np.asarray(center, float) - camera.position
+    along = camera.supersampled(s).directions() @ to_center
     hit = (along > 0.0) & ((to_center**2).sum() - along**2 <= radius**2)
     alpha = hit.reshape(camera.height, s, camera.width, s).mean(axis=(1, 3), dtype=np.float32)
     return CapturedView(name=name, camera=camera, color=alpha[..., None] * np.float32(color), alpha=alpha)

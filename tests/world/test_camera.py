@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.world.camera import Camera, bulk
+from beam_warp.world.camera import Camera
+from beam_warp.world.framing import bulk
 
 SIZE = {"width": 40, "height": 30, "vertical_fov": 60.0}
 
@@ -42,7 +43,7 @@ def test_directions_invert_project(rng):
     np.testing.assert_allclose(pixels[..., 1], rows + 0.5, atol=DOUBLE_ROUNDING)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("factor", [1, 3])
 def test_samples_of_a_pixel_lie_in_it(rng, factor):
     """A point's place grows with the image, and the samples of a pixel are spread evenly around its centre's ray."""
     camera = Camera(7, 5, 6.0, 5.0, 3.2, 2.4, Camera.orbit((0, 0, 1), 4.0, 37.0, 21.0, **SIZE).camera_to_world)
@@ -80,8 +81,9 @@ def test_world_to_camera_is_the_inverse():
     np.testing.assert_allclose(camera.world_to_camera @ camera.camera_to_world, np.eye(4), atol=DOUBLE_ROUNDING)
 
 
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (33, 20), (190, -60), (0, 90)])
-@pytest.mark.parametrize(("width", "height"), [(64, 64), (200, 50), (50, 200)])
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "width", "height"), [(33, 20, 64, 64), (190, -60, 200, 50), (0, 90, 50, 200)]
+)
 def test_frame_cloud_fills_the_image_to_its_margin(rng, azimuth, elevation, width, height):
     points = rng.uniform(-1, 1, (2000, 3)) * (0.3, 0.5, 0.9) + (5, -3, 1)
     camera = Camera.frame_cloud(points, azimuth=azimuth, elevation=elevation, width=width, height=height, margin=1.25)

