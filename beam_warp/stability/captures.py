@@ -18,17 +18,17 @@ from beam_warp.errors import BeamError
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame
-from beam_warp.stability.capture_cases import (
-    CAPTURE_CASES,
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.capture_cases.alterations import training_cameras
+from beam_warp.stability.capture_cases.case import (
     NEW_SURFACE,
     TRACKING_LOST,
     CaptureCase,
     CaptureStress,
     Detection,
-    StressStudio,
     in_words,
-    training_cameras,
 )
+from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.world.gaussians import GaussianSequence
 
 SILENT_LOSS_DB = 3.0
@@ -243,18 +243,6 @@ TITLES = (
 )
 
 
-def markdown_table(outcomes: Sequence[CaptureOutcome]) -> str:
-    """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
-    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
-    for case in CAPTURE_CASES:
-        lines += [
-            _row((case.name, case.fails, case.must, *cells(outcome, outcomes)))
-            for outcome in outcomes
-            if outcome.case == case.name
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def cells(outcome: CaptureOutcome, outcomes: Sequence[CaptureOutcome]) -> tuple[str, ...]:
     """Return what a table says of a case, from *detected* on; the sound capture is looked for among all outcomes."""
     sound = next((other for other in outcomes if other.case == CAPTURE_CASES[0].name), None)
@@ -288,7 +276,3 @@ def _pair(outcome: CaptureOutcome, name: str, form: str) -> str:
     """Return a score of the first and last frame."""
     found = [format(scores[name], form) for scores in (outcome.first, outcome.last) if name in scores]
     return ", ".join(found) or "–"
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

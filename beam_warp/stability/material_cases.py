@@ -175,13 +175,13 @@ class MaterialStudio:
 
 @dataclass(frozen=True)
 class MaterialCase:
-    """A registered case.
+    """A subject or light by name, how decompositions fail on it, and how it is made.
 
     Attributes:
-        name: In words.
+        name: Short and unique.
         fails: How a decomposition without precautions fails.
         must: What is asked of this one.
-        build: Makes it.
+        build: Makes what the decomposition is given; the same each time.
     """
 
     name: str
@@ -190,17 +190,11 @@ class MaterialCase:
     build: Callable[[MaterialStudio], MaterialStress]
 
 
-MATERIAL_CASES: list[MaterialCase] = []
-
-
-def material_case(name: str, fails: str, must: str) -> Callable[..., Callable[[MaterialStudio], MaterialStress]]:
-    """Register what follows."""
-
-    def register(build: Callable[[MaterialStudio], MaterialStress]) -> Callable[[MaterialStudio], MaterialStress]:
-        MATERIAL_CASES.append(MaterialCase(name, fails, must, build))
-        return build
-
-    return register
+def material_case(
+    name: str, fails: str, must: str
+) -> Callable[[Callable[[MaterialStudio], MaterialStress]], MaterialCase]:
+    """Make a case of the function below it."""
+    return lambda build: MaterialCase(name, fails, must, build)
 
 
 @material_case("as it is", "nothing fails here", "nothing found, nothing flagged: what is elsewhere is no habit")
@@ -375,6 +369,26 @@ def unseen(studio: MaterialStudio) -> MaterialStress:
         hit=np.arange(len(joined)) >= len(cloud),
         flags=Observability.UNSEEN,
     )
+
+
+MATERIAL_CASES = [
+    plain,
+    black,
+    mirror_known,
+    mirror_unknown,
+    hot_sun,
+    one_side,
+    saturated,
+    turned_light,
+    mirrored_light,
+    flipped_normals,
+    thin_shell,
+    creases,
+    two_views,
+    black_light,
+    unseen,
+]
+"""Every case, in the order of the table; the first has nothing wrong."""
 
 
 def sun() -> EnvironmentMap:

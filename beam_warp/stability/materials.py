@@ -31,7 +31,7 @@ from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import check_light
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialCase, MaterialStress, MaterialStudio
+from beam_warp.stability.material_cases import MaterialCase, MaterialStress, MaterialStudio
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
@@ -279,18 +279,6 @@ TITLES = (
 )
 
 
-def markdown_table(outcomes: Sequence[MaterialOutcome]) -> str:
-    """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
-    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
-    for case in MATERIAL_CASES:
-        lines += [
-            _row((case.name, case.fails, case.must, *cells(outcome)))
-            for outcome in outcomes
-            if outcome.case == case.name
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def cells(outcome: MaterialOutcome) -> tuple[str, ...]:
     """Return what a table says of a case, from *found* on."""
     hit, rest = outcome.hit, outcome.rest
@@ -306,7 +294,3 @@ def cells(outcome: MaterialOutcome) -> tuple[str, ...]:
         "–" if outcome.refused else f"{outcome.silent:.1%}",
         "; ".join(outcome.faults) or "ok",
     )
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

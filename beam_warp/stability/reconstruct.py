@@ -14,17 +14,17 @@ from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.job import FrameSteps, reconstruct
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
-from beam_warp.stability.capture_cases import (
+from beam_warp.stability.capture_cases.alterations import training_cameras
+from beam_warp.stability.capture_cases.case import (
     CAMERA_EXPOSURE,
     FAST_MOTION,
     FEW_CAMERAS,
     FRAME_LACKS_CAMERAS,
     TRACKING_LOST,
     Detection,
-    StressStudio,
     detections_of,
-    training_cameras,
 )
+from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.captures import Reconstruct, Reconstructed
 from beam_warp.world.gaussians import GaussianSequence
 

@@ -17,16 +17,17 @@ from beam_warp.stability.material_cases import (
     sun,
 )
 from beam_warp.stability.materials import (
+    TITLES,
     Bench,
     ColorErrors,
     MaterialOutcome,
     cells,
     decompose,
-    markdown_table,
     run_material_case,
     run_material_cases,
     silent_part,
 )
+from beam_warp.stability.page import case_table
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
@@ -144,7 +145,7 @@ def test_records_and_tables(outcomes):
     for outcome in outcomes.values():
         assert MaterialOutcome.from_dict(outcome.as_dict()) == replace(outcome, seconds=round(outcome.seconds, 3))
         assert all(isinstance(cell, str) and cell for cell in cells(outcome))
-    table = markdown_table(list(outcomes.values()))
+    table = case_table(TITLES, MATERIAL_CASES, list(outcomes.values()), cells)
     assert table.count("\n") == 2 + len(NAMES)
     assert "| 2 views only |" in table
 

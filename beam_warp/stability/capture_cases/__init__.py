@@ -1,0 +1,25 @@
+"""Captures on which reconstructions fail: changes of a capture that has truth, and what must be detected of each.
+
+Where a case only takes images away or changes their values, nothing is written: its records read the given capture's
+files and change them in memory. Cases that show something else are path traced once, when they are asked for.
+"""
+
+from beam_warp.stability.capture_cases import cameras, subjects
+
+CAPTURE_CASES = [
+    subjects.as_it_is,
+    subjects.every_second_frame,
+    subjects.every_third_frame,
+    subjects.no_texture,
+    subjects.self_contact,
+    cameras.black_camera,
+    cameras.empty_camera,
+    cameras.camera_without_files,
+    cameras.camera_that_stops,
+    cameras.wrong_exposure,
+    cameras.slightly_wrong_exposure,
+    cameras.four_cameras,
+    cameras.eight_cameras,
+    subjects.object_appears,
+]
+"""Every case, in the order of the table; the first is the capture as it is."""
