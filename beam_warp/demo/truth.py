@@ -26,7 +26,7 @@ CHANNEL_SAMPLES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class DemoTruth:
     """What a view should show: channels, coverage, and radiance by light."""
 
     camera: Camera
@@ -35,7 +35,7 @@ class Truth:
     radiance: Mapping[str, NDArray[np.float32]]
 
     @classmethod
-    def of(cls, traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap], paths: int) -> Truth:
+    def of(cls, traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap], paths: int) -> DemoTruth:
         """Path trace a view under every light, at least one, with so many paths a pixel."""
         images = {name: trace_radiance(traced, camera, light, sample_count=paths) for name, light in lights.items()}
         channels = trace_channels(traced, camera, sample_count=CHANNEL_SAMPLES, visibility_count=CHANNEL_SAMPLES)
@@ -66,7 +66,7 @@ def relit_views(
     ]
 
 
-def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, Any]:
+def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str, Any]:
     """Return mean scores over views, unscaled, with the scale of base colour that would fit best beside them."""
     scores: dict[str, list[Score]] = {}
     scales, normals = [], []
@@ -92,7 +92,7 @@ def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, An
     }
 
 
-def comparison(truth: Truth, view: Relit, lightings: Mapping[str, EnvironmentLighting]) -> NDArray[np.uint8]:
+def comparison(truth: DemoTruth, view: Relit, lightings: Mapping[str, EnvironmentLighting]) -> NDArray[np.uint8]:
     """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
 
     def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:

@@ -26,7 +26,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.materials_plan import MaterialsPlan
 from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews, interval_of
-from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, Subject
+from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing import device_name
 from beam_warp.study.tracing_plan import parse_offset
 from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
@@ -115,7 +115,7 @@ def materials_study(
         Axis("rays", "Rays", chosen.rays, "rays", "Rays a Gaussian; a pixel's for occlusion, and twice for light."),
         *(Axis(name, name.capitalize(), levels, "", _SENTENCES[name]) for name, levels in chosen.axes().items()),
     )
-    described = Subject(
+    described = StudySubject(
         name="materials",
         title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians",
         axes=axes,

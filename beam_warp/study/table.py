@@ -142,7 +142,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Subject:
+class StudySubject:
     """What a table is about: everything that a drawing needs beside the rows.
 
     Attributes:
@@ -201,7 +201,7 @@ class Study:
         work: Units of work of one setting, in proportion to the time it takes to measure.
     """
 
-    subject: Subject
+    subject: StudySubject
     plan: Sequence[Settings]
     measure: Callable[[Settings], Row]
     work: Callable[[Settings], int]
@@ -211,7 +211,7 @@ class Study:
 class Table:
     """What came out."""
 
-    subject: Subject
+    subject: StudySubject
     rows: tuple[Row, ...]
 
     def frontier(self, metric: Metric) -> list[Row]:
@@ -312,7 +312,7 @@ def run_study(
     return table, skipped
 
 
-def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
+def _with_pace(subject: StudySubject, probes: Sequence[float]) -> StudySubject:
     """Return the subject with a note on how the cost of one setting, measured again and again, varied."""
     if len(probes) < 2:
         return subject
@@ -323,7 +323,7 @@ def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
     return replace(subject, notes={**subject.notes, PACE: pace})
 
 
-def table_paths(folder: Path, subject: Subject) -> tuple[Path, Path]:
+def table_paths(folder: Path, subject: StudySubject) -> tuple[Path, Path]:
     """Return where a subject's table goes when it is done, and where it is until then."""
     return folder / f"{subject.name}.csv", folder / f"{subject.name}.partial.csv"
 
@@ -376,14 +376,14 @@ def _malformed(path: Path, line: int, why: str) -> AssetFormatError:
     return AssetFormatError(f"table must be a CSV that beam chart wrote, got {path}:{line}: {why}. Measure it again.")
 
 
-def _subject_of(value: dict[str, Any]) -> Subject:
+def _subject_of(value: dict[str, Any]) -> StudySubject:
     """Return the subject of its JSON form."""
     axes = tuple(Axis(**{**axis, "levels": tuple(axis["levels"])}) for axis in value.pop("axes"))
     metrics = tuple(Metric(**metric) for metric in value.pop("metrics"))
-    return Subject(axes=axes, metrics=metrics, **value)
+    return StudySubject(axes=axes, metrics=metrics, **value)
 
 
-def _earlier_rows(subject: Subject, path: Path) -> list[Row]:
+def _earlier_rows(subject: StudySubject, path: Path) -> list[Row]:
     """Return the rows of a run of the same subject that did not reach its end; none if there is no such table."""
     if not path.exists():
         return []
@@ -396,16 +396,16 @@ def _earlier_rows(subject: Subject, path: Path) -> list[Row]:
     return list(earlier.rows) if unfinished and replace(earlier.subject, notes=notes) == subject else []
 
 
-def _key(subject: Subject, settings: Settings) -> tuple[str, ...]:
+def _key(subject: StudySubject, settings: Settings) -> tuple[str, ...]:
     return tuple(str(settings.get(axis.name, "")) for axis in subject.axes)
 
 
-def _columns(subject: Subject) -> list[str]:
+def _columns(subject: StudySubject) -> list[str]:
     numbers = ["cost", *(metric.name for metric in subject.metrics)]
     return [axis.name for axis in subject.axes] + [name + end for name in numbers for end in ("", "_low", "_high")]
 
 
-def _head(subject: Subject) -> str:
+def _head(subject: StudySubject) -> str:
     return f"# {FORMAT} {json.dumps(asdict(subject), ensure_ascii=False)}\n" + _line(_columns(subject))
 
 
@@ -415,7 +415,7 @@ def _line(cells: Sequence[str]) -> str:
     return buffer.getvalue()
 
 
-def _cells(subject: Subject, row: Row) -> list[str]:
+def _cells(subject: StudySubject, row: Row) -> list[str]:
     unknown = (set(row.settings) - {axis.name for axis in subject.axes}) | (
         set(row.errors) - {metric.name for metric in subject.metrics}
     )
@@ -432,7 +432,7 @@ def _numbers(interval: Interval) -> tuple[float, float, float]:
     return interval.value, interval.low, interval.high
 
 
-def _row(subject: Subject, cells: Sequence[str]) -> Row:
+def _row(subject: StudySubject, cells: Sequence[str]) -> Row:
     """Return a row of its cells; levels are looked up in the axes, so that numbers come back as numbers."""
     columns = _columns(subject)
     if len(cells) != len(columns):
