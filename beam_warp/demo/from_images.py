@@ -46,7 +46,7 @@ CHAMFER_SAMPLES = 20_000
 
 PANEL_HEIGHT = 300
 PANEL_MARGIN = 3
-"""Around the subject [pixel of the photograph]."""
+"""Margin of a panel around the subject [pixel of the photograph]."""
 
 OVERVIEW_HEIGHT = 400
 
@@ -82,11 +82,11 @@ class FromImagesOptions:
 
 @dataclass(frozen=True)
 class FromImages:
-    """Where things are, and what was measured.
+    """The result of the demo from images.
 
     Attributes:
-        picture: Photographs, renders, normals, meshes and relightings side by side.
-        result: Of the main job on the reconstructed sequence.
+        picture: Path of a picture: photographs, renders, normals, meshes and relightings side by side.
+        result: Result of the main job on the reconstructed sequence.
         report: Scores and seconds, JSON-able.
     """
 
@@ -108,8 +108,8 @@ def demo_from_images(
     """Photograph the figure, reconstruct it from the photographs, make it relightable, and score all of that.
 
     Writes ``out/capture``, ``out/reconstruction`` and ``out/from_images``, as `write_demo_capture`, `reconstruct` and
-    `beam_warp.run` do, and ``out/reconstruction.png``. The last frame, which tracking is furthest from the key frame
-    in, is the one whose materials and relightings are scored.
+    `beam_warp.run` do, and ``out/reconstruction.png``. Materials and relightings are scored in the last frame, which is
+    the farthest from the key frame.
 
     Args:
         out: Folder, which exists.
@@ -121,10 +121,10 @@ def demo_from_images(
         progress: Called with (stage, done, total).
 
     Raises:
-        OutputError: ``out/capture`` holds something else than these options make, or a folder cannot be written.
+        OutputError: ``out/capture`` holds another capture than these options make, or a folder cannot be written.
     """
     laps = _Laps()
-    capture = _demo_capture(out, options, device, seed, progress)
+    capture = demo_capture(out, options, device, seed, progress)
     laps.end("capture")
     steps = demo_steps(options, device=device, seed=seed)
     found = reconstruct(
@@ -210,8 +210,12 @@ class _Laps:
         self._last = now
 
 
-def _demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
-    """Write the capture, or read one that was written with the same options."""
+def demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
+    """Write ``out/capture``, or read it if it was written with the same options.
+
+    Raises:
+        OutputError: ``out/capture`` holds another capture, or cannot be written.
+    """
     sizes: dict[str, Any] = {
         "frame_count": options.frame_count,
         "camera_count": options.camera_count,

@@ -40,7 +40,7 @@ class DemoOptions:
 
     Attributes:
         frame_count: Frames of the figure's dance.
-        gaussian_count: Gaussians on the figure, about.
+        gaussian_count: About how many Gaussians are on the figure.
         image_height: Height of the images with truth [pixel].
         device: Warp device; None takes the first CUDA device, or the CPU.
         seed: Same seed, same device: same result.
@@ -57,13 +57,13 @@ class DemoOptions:
 
 @dataclass(frozen=True, eq=False)
 class DemoScene:
-    """What the demo starts from.
+    """The input of the demo, and its truth.
 
     Attributes:
-        sequence: Gaussians as training would leave them: display-referred radiance, no material.
+        sequence: Gaussians as a training would leave them: display-referred radiance, no material.
         lights: Environments by name; the figure was captured under ``studio``.
-        truth: Views of ``truth_frame``.
-        truth_frame: The frame that has truth.
+        truth: Path-traced views of ``truth_frame``.
+        truth_frame: Index of the frame that has truth.
     """
 
     sequence: GaussianSequence

@@ -26,13 +26,13 @@ class BodyPart:
     """One piece of the figure.
 
     Attributes:
-        name: What it is.
-        bone: The bone that carries it.
-        material: What it is made of; see `beam_warp.demo.paint`.
+        name: Name of the piece.
+        bone: Name of the bone that carries it.
+        material: Name of its material in `beam_warp.demo.paint`.
         distance: Signed distance of points ``(N, 3)`` [m], exact or a good approximation near the surface.
-        low: Lower corner of a box around it [m].
-        high: Upper corner.
-        blend: Width over which it melts into the parts before it [m].
+        low: Lower corner of a box around the piece [m].
+        high: Upper corner of that box [m].
+        blend: Width over which the piece melts into those before it [m].
     """
 
     name: str

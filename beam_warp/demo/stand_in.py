@@ -18,7 +18,7 @@ from beam_warp.world.harmonics import sh_basis
 from beam_warp.world.mesh import MaterialMesh
 
 TANGENTIAL_DEVIATION = 0.7
-"""Of a Gaussian, in spacings: neighbours overlap so far that the surface is closed (composited alpha above 0.99)."""
+"""Deviation of a Gaussian along the surface, in spacings: neighbours overlap so that composited alpha is above 0.99."""
 
 FLATNESS = 0.12
 """Deviation across the surface over that along it."""
@@ -27,19 +27,19 @@ NORMAL_NOISE = 0.05
 """Standard deviation of the tilt of a Gaussian, per axis [rad]: 2.9 degrees, what a good training leaves."""
 
 POSITION_NOISE = 0.3
-"""Standard deviation of its distance from the surface, in deviations across it."""
+"""Standard deviation of a Gaussian's distance from the surface, in deviations across the surface."""
 
 OPACITY = (0.94, 0.99)
 SH_DEGREE = 2
 DIRECTION_COUNT = 12
 PATHS_PER_DIRECTION = 12
 SH_RIDGE = 0.03
-"""Weight of the bands above 0 against one direction's residual: half of the sphere is never seen."""
+"""Weight that keeps bands above 0 small, against one direction's residual: half of the sphere is never seen."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points that stay with the surface, and the randomness that stays with them."""
+    """Points that stay with a moving surface, and the random errors that stay with each point."""
 
     faces: NDArray[np.int64]
     weights: NDArray[np.float64]
@@ -51,7 +51,7 @@ class SurfaceSamples:
 
 
 def sample_surface(mesh: MaterialMesh, count: int, rng: np.random.Generator) -> SurfaceSamples:
-    """Spread points evenly; dart throwing leaves a little fewer than asked for."""
+    """Spread points evenly by dart throwing, which leaves a little fewer than asked for."""
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     spacing = float(np.sqrt(shape.area / count))
     # Three quarters of the darts stay; the library's warning about that is not for our users.
@@ -76,7 +76,7 @@ def sample_surface(mesh: MaterialMesh, count: int, rng: np.random.Generator) -> 
 def trained_gaussians(
     mesh: MaterialMesh, traced: TracedMesh, samples: SurfaceSamples, light: EnvironmentMap, seed: int
 ) -> GaussianCloud:
-    """Return what a training would leave: geometry with its noise, and the radiance that leaves the surface."""
+    """Return Gaussians as a training would leave them: places with noise, and the radiance that leaves the surface."""
     points = mesh.interpolate(mesh.vertices, samples.faces, samples.weights)
     normals = mesh.interpolate(mesh.normals, samples.faces, samples.weights)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -107,7 +107,7 @@ def trained_gaussians(
 def tangent_frames(
     normals: NDArray[np.float64], turn: NDArray[np.float64], tilt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rotation matrices whose third column is the normal, tilted, with the others turned at random, ``(N, 3, 3)``."""
+    """Return rotations ``(N, 3, 3)`` whose third column is the tilted normal and whose others are turned about it."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(helper, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -121,7 +121,7 @@ def tangent_frames(
 
 
 def _seen_directions(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions in which a dome of cameras sees each point, evenly over its visible side, ``(N, D, 3)``."""
+    """Return the directions in which a dome of cameras sees each point, evenly over its visible side, ``(N, D, 3)``."""
     index = np.arange(DIRECTION_COUNT) + 0.5
     z = 1.0 - 0.85 * index / DIRECTION_COUNT
     phi = np.pi * (1.0 + np.sqrt(5.0)) * index

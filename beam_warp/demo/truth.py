@@ -1,4 +1,4 @@
-"""What views of the demo figure should show, by path tracing, and how near a decomposition comes to it."""
+"""The truth of the demo: views of the figure by path tracing, and how near a decomposition comes to them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHANNEL_SAMPLES = 16
 
 @dataclass(frozen=True, eq=False)
 class DemoTruth:
-    """What a view should show: channels, coverage, and radiance by light."""
+    """The truth of a view: channels, coverage, and radiance by name of the light."""
 
     camera: Camera
     alpha: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""The stability suite as a page: what every hierarchy and device made of every scene, side by side."""
+"""The page of the stability suite: the outcome of every case on every device, side by side."""
 
 from __future__ import annotations
 
@@ -148,14 +148,14 @@ PARTS = ("occlusion", "captures", "materials", "relighting")
 
 @dataclass(frozen=True)
 class StabilityResult:
-    """Everything that one or several runs found.
+    """Outcomes of one or several runs of the suite.
 
     Attributes:
-        outcomes: Of the stress cases.
-        occlusion: Of the shapes with known ambient occlusion.
-        captures: Of the captures on which reconstructions fail.
-        materials: Of the subjects and lights on which the measurement of materials fails.
-        relighting: Of those on which relighting fails, an outcome for each renderer.
+        outcomes: One for each stress case of the tracer, hierarchy and device.
+        occlusion: One for each shape with known ambient occlusion.
+        captures: One for each capture on which reconstructions fail.
+        materials: One for each subject or light on which the measurement of materials fails.
+        relighting: One for each subject or light on which relighting fails, and each renderer.
     """
 
     outcomes: tuple[Outcome, ...] = ()
@@ -190,7 +190,7 @@ def read_result(path: Path) -> StabilityResult:
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is something else.
+        AssetFormatError: The file is something else.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -234,7 +234,7 @@ def verdict_of(outcomes: Sequence[Outcome]) -> str:
 
 
 def allowed_by(outcome: Outcome) -> str:
-    """Return median and largest of what rounding explains, for a table."""
+    """Return the median and the largest error that rounding explains, for a table."""
     return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
 
 
@@ -378,7 +378,7 @@ def write_page(path: Path, result: StabilityResult, command: str) -> None:
 
 
 def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:
-    """Return the estimate that is farthest from its truth, for a table."""
+    """Return the estimate that is farthest from its truth, for a table, with its z-score and the mean square of all."""
     if not outcomes:
         return "not run"
     worst = max(outcomes, key=lambda outcome: outcome.largest_z)

@@ -1,4 +1,4 @@
-"""What `beam stability` reconstructs with: the steps of `beam reconstruct` at two sizes; what their reports say."""
+"""The reconstruction that `beam stability` tries: the steps of `beam reconstruct` at two sizes."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ TOLD = {
     FEW_CAMERAS: "told",
     FAST_MOTION: "told",
 }
-"""What is done about findings that leave the input as it is."""
+"""What is done about findings after which the input stays as it is."""
 
 
 LEVELS = (4, 2, 1)
-"""Reductions of small images: at the next one, motion is less than a pixel."""
+"""Reductions of small images: beyond them, motion is less than a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)

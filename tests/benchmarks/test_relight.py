@@ -18,6 +18,8 @@ from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
 from beam_warp.world.environment import EnvironmentMap
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 TINY = replace(
     benchmark.QUICK,
     gaussians=300,

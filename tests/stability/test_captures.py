@@ -3,12 +3,10 @@
 import json
 from functools import partial
 
-import numpy as np
 import pytest
-import trimesh
+from support.tracked_balls import tracked_balls
 
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.stability.capture_cases import CAPTURE_CASES
 from beam_warp.stability.capture_cases.cameras import black_camera, camera_without_files, four_cameras, wrong_exposure
@@ -17,9 +15,7 @@ from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.capture_cases.subjects import as_it_is
 from beam_warp.stability.captures import TITLES, Reconstructed, cells, run_capture_case, run_capture_cases
 from beam_warp.stability.page import case_table
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-
-COUNT = 3000
+from beam_warp.world.gaussians import GaussianSequence
 
 
 @pytest.fixture
@@ -28,24 +24,10 @@ def studio(tiny_capture, tmp_path):
 
 
 def tracked(capture, dim_from=None):
-    """Grey discs on the truth that follow it; black from some frame on if asked for."""
+    """Grey balls on the truth that follow it; black from some frame on if asked for."""
+    levels = [0.0 if dim_from is not None and index >= dim_from else 0.2 for index in range(len(capture.frames))]
     meshes = [read_truth_mesh(capture, frame) for frame in capture.frames]
-    _, faces, weights = trimesh.sample.sample_surface(meshes[0], COUNT, return_barycentric=True, seed=2)
-    clouds = []
-    for index, mesh in enumerate(meshes):
-        level = 0.0 if dim_from is not None and index >= dim_from else 0.2
-        clouds.append(
-            GaussianCloud(
-                positions=np.einsum("nk,nkc->nc", weights, mesh.triangles[faces]),
-                orientations=np.tile((0.0, 0.0, 0.0, 1.0), (COUNT, 1)),
-                scales=np.full((COUNT, 3), 0.012),
-                opacities=np.full(COUNT, 0.95),
-                radiance=np.full((COUNT, 1, 3), (level - 0.5) / 0.28209479177387814),
-                radiance_color_space=LINEAR_REC709,
-                ids=np.arange(COUNT),
-            )
-        )
-    return GaussianSequence.from_clouds(clouds)
+    return GaussianSequence.from_clouds(tracked_balls(meshes, 3000, 0.012, levels))
 
 
 def finding(*findings, key_frames=(0,), dim_from=None):

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from support.fake_steps import FakeSteps
 
 from beam_warp.stability.capture_cases.cameras import wrong_exposure
@@ -84,6 +85,7 @@ def test_changed_images_reach_the_steps(tiny_capture, tmp_path):
     assert list(tmp_path.iterdir()) == []  # nothing is left behind
 
 
+@pytest.mark.slow
 class TestRealSteps:
     def test_an_exposure_is_detected_and_undone(self, tiny_capture, tmp_path):
         studio = StressStudio(tmp_path, given=tiny_capture, device="cpu")

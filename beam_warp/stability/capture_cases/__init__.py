@@ -1,7 +1,7 @@
-"""Captures on which reconstructions fail: changes of a capture that has truth, and what must be detected of each.
+"""Stress captures: captures on which reconstructions fail, and what must be detected in each.
 
-Where a case only takes images away or changes their values, nothing is written: its records read the given capture's
-files and change them in memory. Cases that show something else are path traced once, when they are asked for.
+A case that takes images away or changes their values writes nothing: its records read the given capture's files and
+change them in memory. A case that shows another subject is path traced once, when it is asked for.
 """
 
 from beam_warp.stability.capture_cases import cameras, subjects

@@ -18,8 +18,8 @@ class AlteredRecord(CaptureRecord):
     """A record whose image is changed as it is read; its truth is not.
 
     Attributes:
-        gain: Of the colour.
-        coverage: Of alpha.
+        gain: Factor of the colour.
+        coverage: Factor of alpha.
     """
 
     gain: float = 1.0
@@ -84,7 +84,7 @@ def evenly(names: Sequence[str], count: int) -> tuple[str, ...]:
     """Return some of the names, evenly spread over all of them.
 
     Raises:
-        InvalidArrayError: There are not as many.
+        InvalidArrayError: There are fewer names than ``count``.
     """
     if count > len(names):
         raise InvalidArrayError(f"capture must have {count} training cameras, got {len(names)}. Choose a larger one.")

@@ -19,7 +19,7 @@ FEW_CAMERAS = "few-cameras"
 TRACKING_LOST = "tracking-lost"
 NEW_SURFACE = "new-surface"
 FAST_MOTION = "fast-motion"
-"""Codes of what must be detected: of the inspection of a capture, and of tracking."""
+"""Codes of detections, as the inspection of a capture and tracking name them."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Detection:
     """Something that a reconstruction noticed about its input or about itself.
 
     Attributes:
-        code: Names the kind.
-        camera: Which camera, where it is about one.
-        frame: Which frame, where it is about one.
+        code: Name of the kind.
+        camera: Name of the camera that it is about; None if it is about no single one.
+        frame: Number of the frame that it is about; None if it is about no single one.
     """
 
     code: str
@@ -37,7 +37,7 @@ class Detection:
     frame: int | None = None
 
     def covers(self, other: Detection) -> bool:
-        """Whether this says what the other asks for: its kind, and its camera and frame where it names them."""
+        """Whether this has the other's kind, and its camera and frame where the other names them."""
         return (
             self.code == other.code
             and (other.camera is None or self.camera == other.camera)
@@ -45,13 +45,13 @@ class Detection:
         )
 
     def __str__(self) -> str:
-        """Return it in words: ``camera-exposure of train_03 in frame 2``."""
+        """Return the detection in words: ``camera-exposure of train_03 in frame 2``."""
         of = "" if self.camera is None else f" of {self.camera}"
         return f"{self.code}{of}" + ("" if self.frame is None else f" in frame {self.frame}")
 
 
 def detections_of(said: Iterable[Finding], cameras: Sequence[str]) -> tuple[Detection, ...]:
-    """Return what an inspection says as detections: one for each camera that it names, or one without."""
+    """Return findings as detections: one for each camera that a finding names, or one without a camera."""
     found = []
     for finding in said:
         text = f"{finding.where} {finding.what}"
@@ -74,13 +74,13 @@ def in_words(detections: Sequence[Detection]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureStress:
-    """A capture with something wrong, and what must be found out about it.
+    """A capture with something wrong, and what must be detected in it.
 
     Attributes:
-        capture: What is reconstructed; its test records are as they should be, for scores.
+        capture: What is reconstructed. Nothing is wrong with its test records: they are for scores.
         required: What must be detected.
-        may_refuse: Whether refusing it, by a clear error before anything is optimised, counts as detected too.
-        is_sound: Whether nothing is wrong with it: then nothing must be detected.
+        may_refuse: Whether a clear error before anything is optimised counts as detection too.
+        is_sound: Whether nothing is wrong: then nothing may be detected.
     """
 
     capture: Capture
@@ -96,9 +96,9 @@ class CaptureCase:
     Attributes:
         name: Short and unique.
         fails: How a reconstruction without precautions fails here.
-        must: What must come of it.
+        must: What is asked of this one.
         build: Makes the capture; the same each time.
-        traced: Whether it shows something else than the given capture, and needs the demo figure.
+        traced: Whether the case shows another subject than a given capture, and is path traced.
     """
 
     name: str

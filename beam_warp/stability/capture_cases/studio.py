@@ -1,4 +1,4 @@
-"""Where stress captures come from: a given capture that is changed, or the demo figure, path traced when asked for."""
+"""The source of stress captures: a given capture to change, or the demo figure, path traced when it is asked for."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ BRIEF_FRAMES = 2
 
 @dataclass(eq=False)
 class StressStudio:
-    """Where cases take their captures from: a given one, or the demo figure, path traced when first asked for.
+    """The source of captures for cases: a given one, or the demo figure, path traced when it is first asked for.
 
     Attributes:
-        folder: Where captures are written to, each in a folder of its own; it must exist.
-        given: The capture that is changed; the demo's without.
-        frame_count: Frames of what is path traced.
-        camera_count: Its training cameras.
-        size: Side of its images [pixel].
+        folder: An existing folder; every capture is written to a folder in it.
+        given: The capture to change; None takes the demo's.
+        frame_count: Frames of a path-traced capture.
+        camera_count: Training cameras of a path-traced capture.
+        size: Side of path-traced images [pixel].
         samples: Paths per pixel.
         device: Warp device.
     """
@@ -57,7 +57,7 @@ class StressStudio:
         return self.given or self.traced("as it is", self.dancing)
 
     def brief(self) -> Capture:
-        """Return its first frames, for cases that a camera is at fault in."""
+        """Return the first frames of that capture, for cases in which a camera is at fault."""
         base = self.base()
         return replace(base, records=base.select(frames=base.frames[:BRIEF_FRAMES]))
 
