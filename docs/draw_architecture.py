@@ -107,44 +107,29 @@ class Packages:
                 self.imports[here, _package(name)] += 1
         floor = {name: height for height, row in enumerate(self.floors) for name in row}
         self.floor = floor
-        self.arrows = [
-            (high, low)
-            for high, low in _without_detours({pair for pair in self.imports if pair[0] in floor and pair[1] in floor})
-            if floor[high] > floor[low]
-        ]
+        self.arrows = _without_detours(
+            {(high, low) for high, low in self.imports if low in floor and floor.get(high, 0) > floor[low]}
+        )
 
     def data(self) -> str:
         """Return floors and arrows as JSON: what a picture must show to be current."""
-        return json.dumps({"floors": self.floors, "arrows": sorted(self.arrows)})
+        return json.dumps({"floors": self.floors, "arrows": self.arrows})
 
 
 def _package(module: str) -> str:
     return module.split(".")[1] if "." in module else ""
 
 
-def _without_detours(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
-    """Return the transitive reduction: pairs that no chain of other pairs joins."""
+def _without_detours(pairs: set[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return the transitive reduction of pairs without circles: those that no chain of other pairs joins."""
     below: dict[str, set[str]] = {}
     for high, low in pairs:
-        if high != low:
-            below.setdefault(high, set()).add(low)
+        below.setdefault(high, set()).add(low)
 
-    def reached(start: str) -> set[str]:
-        found: set[str] = set()
-        waiting = list(below.get(start, ()))
-        while waiting:
-            name = waiting.pop()
-            if name not in found:
-                found.add(name)
-                waiting += below.get(name, ())
-        return found
+    def reached(name: str) -> set[str]:
+        return below.get(name, set()).union(*(reached(other) for other in below.get(name, ())))
 
-    return {
-        (high, low)
-        for high, lows in below.items()
-        for low in lows
-        if not any(low in reached(other) for other in lows - {low})
-    }
+    return sorted((high, low) for high, low in pairs if not any(low in reached(other) for other in below[high] - {low}))
 
 
 class Layout:
@@ -154,7 +139,7 @@ class Layout:
         """Order boxes and lanes on every floor, then place them."""
         self.rows: list[list[Any]] = [list(row) for row in packages.floors]
         self.chains: dict[tuple[str, str], list[Any]] = {}
-        for high, low in sorted(packages.arrows):
+        for high, low in packages.arrows:
             lanes = [(high, low, height) for height in range(packages.floor[high] - 1, packages.floor[low], -1)]
             for lane in lanes:
                 self.rows[lane[2]].append(lane)
