@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 import trimesh
 import warp as wp
+from scipy.spatial.transform import Rotation
 from timing import Task, commit, machine, take_turns
 from warp.geometry import IsoSurfaceMarchingCubes
 
 from beam_warp.demo.figure import build_figure
-from beam_warp.demo.job import FLATNESS, TANGENTIAL_DEVIATION, _frames, _quaternions, _sample_surface
+from beam_warp.demo.stand_in import FLATNESS, TANGENTIAL_DEVIATION, sample_surface, tangent_frames
 from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.mesh.depth_pixels import DepthCamera, project_point
 from beam_warp.mesh.consistency import depth_consistency
@@ -148,7 +149,7 @@ def sphere_images(side: int, device: Any) -> DepthImages:
 def demo_gaussians(count: int) -> tuple[GaussianCloud, trimesh.Trimesh]:
     """Gaussians on the demo figure, with the noise of its stand-in for a training, and its surface."""
     figure = build_figure()
-    samples = _sample_surface(figure.rest, count, np.random.default_rng(0))
+    samples = sample_surface(figure.rest, count, np.random.default_rng(0))
     mesh = figure.at(0.1)
     points = mesh.interpolate(mesh.vertices, samples.faces, samples.weights)
     normals = mesh.interpolate(mesh.normals, samples.faces, samples.weights)
@@ -157,7 +158,7 @@ def demo_gaussians(count: int) -> tuple[GaussianCloud, trimesh.Trimesh]:
     color = mesh.interpolate(mesh.base_color, samples.faces, samples.weights)
     cloud = GaussianCloud(
         positions=points + normals * (samples.lift * FLATNESS * sigma)[:, None],
-        orientations=_quaternions(_frames(normals, samples.turn, samples.tilt)),
+        orientations=Rotation.from_matrix(tangent_frames(normals, samples.turn, samples.tilt)).as_quat(),
         scales=np.tile([sigma, sigma, FLATNESS * sigma], (len(points), 1)),
         opacities=samples.opacities,
         base_color=np.clip(color, 0.0, 1.0),

@@ -38,7 +38,9 @@ from beam_warp.jobs.report import versions
 from beam_warp.mesh.distances import SAMPLE_COUNT
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, truth_frames
-from beam_warp.stability.capture_cases import CAPTURE_CASES, StressStudio, evenly, training_cameras, with_cameras
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.capture_cases.alterations import evenly, training_cameras, with_cameras
+from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.captures import run_capture_cases
 
 Row = dict[str, Any]

@@ -19,7 +19,8 @@ from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.raster.records import RasterOptions
-from beam_warp.stability.capture_cases import TRACKING_LOST, Detection, detections_of, training_cameras
+from beam_warp.stability.capture_cases.alterations import training_cameras
+from beam_warp.stability.capture_cases.case import TRACKING_LOST, Detection, detections_of
 from beam_warp.stability.captures import Reconstructed
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence

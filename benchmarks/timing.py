@@ -40,8 +40,8 @@ class Times:
     """Seconds of one task, one entry a repeat; entries of the same index were measured one right after the other.
 
     Attributes:
-        alone: On CUDA wall-clock time until the device has finished; on the CPU the process's CPU time of one thread,
-            which other processes disturb least.
+        alone: Wall-clock time until the device has finished, on CUDA. The process's CPU time of one thread, which other
+            processes disturb least, on the CPU.
         one_thread: Wall-clock time of one thread; None on CUDA.
         two_threads: Wall-clock time of two threads; None on CUDA and for work that has only one.
     """
@@ -91,10 +91,10 @@ def take_turns(
     Every second round runs backwards: no task always follows the same one.
 
     Args:
-        tasks: By name.
+        tasks: Tasks by name.
         repeats: Measured rounds.
         device: Where they run.
-        two_threads: On the CPU, also time two threads by wall clock.
+        two_threads: Whether to time two threads by wall clock as well, on the CPU.
     """
     names = list(tasks)
     rows: dict[Name, list[tuple[float, float, float]]] = {name: [] for name in names}

@@ -1,7 +1,7 @@
 """A small capture whose truth is known: the demo figure dances in a studio, path traced for a dome of cameras.
 
-What is written is what `beam_warp.capture.capture` reads of any capture, with the exact channels of the test views and
-the exact surface of every frame beside it.
+The capture has the layout of `beam_warp.capture.nerfstudio`. Beside it are the exact channels of the test views and the
+exact surface of every frame.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ ELEVATIONS = (-12.0, 62.0)
 """Lowest and highest camera seen from the middle of the figure [degree]."""
 
 TEST_ELEVATIONS = (4.0, 40.0)
-"""The same for test cameras: inside what the others span."""
+"""Lowest and highest test camera [degree]: inside the span of the training cameras."""
 
 VERTICAL_FOV = 35.0
 
 TEST_SAMPLES = 4
-"""Paths of a test view's pixel over those of a training view's: what is compared with has half the noise."""
+"""Paths of a test view's pixel over those of a training view's: truth has half the noise."""
 
 CHANNEL_SAMPLES = 16
 VISIBILITY_SAMPLES = 4
@@ -67,7 +67,7 @@ class DomeCamera:
     Attributes:
         name: ``train_00`` …, ``test_00`` ….
         split: ``train`` or ``test``.
-        camera: Its pinhole.
+        camera: Pinhole and pose.
     """
 
     name: str
@@ -192,11 +192,11 @@ def dome_cameras(
     spans high and low. Test cameras stand between the others.
 
     Args:
-        points: What must be seen, ``(N, 3)`` for every moment [m].
+        points: Points that every camera must see, ``(N, 3)`` for every moment [m].
         camera_count: Training cameras, at least 1.
         test_camera_count: Test cameras.
-        width: Of every image [pixel].
-        height: Of every image [pixel].
+        width: Width of every image [pixel].
+        height: Height of every image [pixel].
 
     Raises:
         InvalidOptionError: A count or size is out of range.
@@ -270,7 +270,7 @@ def require_free(folder: str | os.PathLike[str]) -> Path:
     """Return a folder's path if nothing is there yet.
 
     Raises:
-        OutputError: It holds files already.
+        OutputError: The folder holds files already.
     """
     target = Path(folder)
     if target.exists() and not (target.is_dir() and not any(target.iterdir())):
@@ -341,11 +341,11 @@ def _write_view(
 
 @dataclass(frozen=True)
 class _Window:
-    """The part of an image that a subject can be on: rays beside it would cost more than those that hit.
+    """The part of an image that can show a subject: rays beside it would cost more than those that hit.
 
     Attributes:
-        camera: Sees just that part.
-        left, top: Where it is [pixel].
+        camera: Camera that sees just that part.
+        left, top: Upper left corner of the part [pixel].
         size: (height, width) of the whole image.
     """
 
@@ -356,7 +356,7 @@ class _Window:
 
     @classmethod
     def around(cls, camera: Camera, points: NDArray[np.float32]) -> _Window:
-        """Return the part that holds points; all of the image where some are behind the camera or none is on it."""
+        """Return the part that holds points; the whole image if some are behind the camera or none is in view."""
         size = (camera.height, camera.width)
         pixels = camera.project(points)[:, :2]
         low = np.clip(np.floor(pixels.min(axis=0)), 0, size[::-1])
@@ -370,7 +370,7 @@ class _Window:
         return cls(part, left, top, size)
 
     def whole(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the whole image, 0 beside this part."""
+        """Return the whole image, which is 0 beside this part."""
         out = np.zeros((*self.size, *image.shape[2:]), np.float32)
         out[self.top : self.top + self.camera.height, self.left : self.left + self.camera.width] = image
         return out

@@ -27,14 +27,13 @@ from beam_warp.demo.shape import (
     SHOULDER,
     SIDES,
     WRIST,
+    FloatArray,
     mirrored,
     part_distances,
     rest_distance,
     rest_field,
 )
 from beam_warp.world.mesh import MaterialMesh, vertex_normals
-
-FloatArray = NDArray[np.float64]
 
 LOWER, UPPER = np.array([-0.66, -0.36, -0.04]), np.array([0.66, 0.36, 1.80])
 """Box around the figure at rest [m]."""
@@ -111,7 +110,7 @@ def dance(phase: float) -> dict[str, tuple[float, float, float]]:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """The figure at rest and what moves it.
+    """The figure at rest and its rig.
 
     Attributes:
         rest: The mesh at rest, arms held out, in the internal world (rfu).
@@ -131,7 +130,7 @@ class Figure:
         Linear blend skinning: bends stay moderate, where it loses little volume.
 
         Args:
-            turns: By name of a bone of `SKELETON`, its turn about the rest axes x, y, z [degree]; none for the rest.
+            turns: Turn about the rest axes x, y, z [degree] by name of a bone of `SKELETON`; other bones stay.
         """
         transforms = _bone_transforms(turns)
         blended = np.einsum("vb,bij->vij", self.bone_weights, transforms)
@@ -165,8 +164,9 @@ def build_figure(spacing: float = 0.011) -> Figure:
     return Figure(rest, _bone_weights(points, faces, step))
 
 
-def rest_gradient(points: FloatArray, step: float = 1e-4) -> FloatArray:
+def rest_gradient(points: FloatArray) -> FloatArray:
     """Return the gradient of the rest distance at points ``(N, 3)`` by central differences."""
+    step = 1e-4  # [m]
     offsets = step * np.eye(3)
     return np.stack([(rest_distance(points + o) - rest_distance(points - o)) / (2.0 * step) for o in offsets], axis=-1)
 

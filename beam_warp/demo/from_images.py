@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, require_free, write_demo_capture
-from beam_warp.demo.truth import Truth, display_color, relit_views, score_views
+from beam_warp.demo.truth import DemoTruth, display_color, relit_views, score_views
 from beam_warp.device.arrays import resolve_device
-from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
 from beam_warp.jobs.progress import Progress
@@ -31,17 +30,18 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions, LearningRates
-from beam_warp.reconstruction.job import reconstruct
+from beam_warp.reconstruction.job import Reconstruction, reconstruct
 from beam_warp.reconstruction.joint_tracking import JointOptions
-from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, seen_radiance
+from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import Relighting, display_exposure
 from beam_warp.trace.mesh_paths import TracedMesh
+from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.shot import Renderer
 
 TRUTH_PATHS = 64
@@ -50,7 +50,7 @@ CHAMFER_SAMPLES = 20_000
 
 PANEL_HEIGHT = 300
 PANEL_MARGIN = 3
-"""Around the subject [pixel of the photograph]."""
+"""Margin of a panel around the subject [pixel of the photograph]."""
 
 OVERVIEW_HEIGHT = 400
 
@@ -86,11 +86,11 @@ class FromImagesOptions:
 
 @dataclass(frozen=True)
 class FromImages:
-    """Where things are, and what was measured.
+    """The result of the demo from images.
 
     Attributes:
-        picture: Photographs, renders, normals, meshes and relightings side by side.
-        result: Of the main job on the reconstructed sequence.
+        picture: Path of a picture: photographs, renders, normals, meshes and relightings side by side.
+        result: Result of the main job on the reconstructed sequence.
         report: Scores and seconds, JSON-able.
     """
 
@@ -111,8 +111,8 @@ def demo_from_images(
     """Photograph the figure, reconstruct it from the photographs, make it relightable, and score all of that.
 
     Writes ``out/capture``, ``out/reconstruction`` and ``out/from_images``, as `write_demo_capture`, `reconstruct` and
-    `beam_warp.run` do, and ``out/reconstruction.png``. The last frame, which tracking is furthest from the key frame
-    in, is the one whose materials and relightings are scored.
+    `beam_warp.run` do, and ``out/reconstruction.png``. Materials and relightings are scored in the last frame, which is
+    the farthest from the key frame.
 
     Args:
         out: Folder, which exists.
@@ -123,10 +123,10 @@ def demo_from_images(
         progress: Called with (stage, done, total).
 
     Raises:
-        OutputError: ``out/capture`` holds something else than these options make, or a folder cannot be written.
+        OutputError: ``out/capture`` holds another capture than these options make, or a folder cannot be written.
     """
     laps = _Laps()
-    capture = _demo_capture(out, options, device, seed, progress)
+    capture = demo_capture(out, options, device, seed, progress)
     laps.end("capture")
     steps = demo_steps(options, device=device, seed=seed)
     found = reconstruct(
@@ -136,50 +136,34 @@ def demo_from_images(
         progress=lambda stage, done, total, note="": progress(stage, done, total),
     )
     laps.end("reconstruct")
-    samples = int(found.report["frames"][0]["samples"])
-    meshes = [_mesh(capture, frame, cloud, steps.raster, device) for frame, cloud in enumerate(found.sequence)]
+    meshes = [
+        mesh_of_gaussians(cloud, _training_cameras(capture, frame), options=steps.raster, device=device)
+        for frame, cloud in enumerate(found.sequence)
+    ]
     laps.end("mesh")
-    scores = _score_frames(capture, found.sequence, meshes, steps.raster, samples, device)
+    frames = _score_frames(capture, found, meshes, steps.raster, device)
     drift = tracking_drift(
         found.sequence,
         [read_truth_mesh(capture, frame).vertices for frame in capture.frames],
         read_truth_mesh(capture, 0).faces,
-        cameras=[record.camera for record in capture.select(split="train", frames={0})],
+        cameras=_training_cameras(capture, 0),
         device=device,
     )
     laps.end("score")
-    light, *others = lights
-    result = run(
-        found.sequence,
-        lights[light],
-        out / "from_images",
-        # The capture's light and its exposure are known, and its images are scene-linear.
-        RunOptions(exposure=0.0, roughness=ESTIMATE, device=device),
-        capture=capture,
-        overview=OverviewOptions(
-            second_light=Relighting(f"relit by a {others[0]}", lights[others[0]]) if others else None,
-            azimuth=25.0,
-            elevation=8.0,
-            height=OVERVIEW_HEIGHT,
-        ),
-        progress=progress,
-    )
+    result = _decompose(out / "from_images", capture, found.sequence, lights, device, progress)
     laps.end("decompose")
     last = capture.frames[-1]
     cameras = [record.camera for record in capture.select(split="test", frames={last})]
     traced = TracedMesh.from_mesh(
         demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS)), device=device
     )
-    truths = [Truth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
+    truths = [DemoTruth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
     renderer = DeferredRenderer(UNSHADOWED, raster=steps.raster, device=device)
     relit = relit_views(result.sequence[last], cameras, lights, renderer, raster=steps.raster, device=device)
     report: dict[str, Any] = {
         "options": asdict(options),
         "gaussians": [len(cloud) for cloud in found.sequence],
-        "frames": [
-            {"frame": frame, **score.as_dict(), "train_psnr": entry["psnr"], "kind": entry["kind"]}
-            for frame, score, entry in zip(capture.frames, scores, found.report["frames"], strict=True)
-        ],
+        "frames": frames,
         "drift": [entry.as_dict() for entry in drift],
         "relightable": {"frame": last, **score_views(truths, relit)},
         "warnings": [*found.report["warnings"], *result.report["warnings"]],
@@ -229,11 +213,13 @@ class _Laps:
         self._last = now
 
 
-def _demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
-    """Write the capture, or read one that was written with the same options."""
-    asked = {
-        "code": code_digest(),
-        "device": "cuda" if resolve_device(device).is_cuda else "cpu",
+def demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
+    """Write ``out/capture``, or read it if it was written with the same options.
+
+    Raises:
+        OutputError: ``out/capture`` holds another capture, or cannot be written.
+    """
+    sizes: dict[str, Any] = {
         "frame_count": options.frame_count,
         "camera_count": options.camera_count,
         "test_camera_count": options.test_camera_count,
@@ -241,22 +227,13 @@ def _demo_capture(out: Path, options: FromImagesOptions, device: str | None, see
         "samples": options.samples,
         "seed": seed,
     }
+    asked = {"code": code_digest(), "device": "cuda" if resolve_device(device).is_cuda else "cpu", **sizes}
     note, folder = out / "capture.json", out / "capture"
     if folder.exists() and _read_json(note) == asked:
         return Capture.read(folder)
     require_free(folder)  # before the note, which is about what it holds, is written
     write_json(note, asked)
-    return write_demo_capture(
-        folder,
-        frame_count=options.frame_count,
-        camera_count=options.camera_count,
-        test_camera_count=options.test_camera_count,
-        size=options.size,
-        samples=options.samples,
-        device=device,
-        seed=seed,
-        progress=progress,
-    )
+    return write_demo_capture(folder, **sizes, device=device, progress=progress)
 
 
 def _read_json(path: Path) -> Any:
@@ -266,36 +243,63 @@ def _read_json(path: Path) -> Any:
         return None
 
 
-def _mesh(
-    capture: Capture, frame: int, cloud: GaussianCloud, raster: RasterOptions, device: str | None
-) -> trimesh.Trimesh:
-    cameras = [record.camera for record in capture.select(split="train", frames={frame})]
-    return mesh_of_gaussians(cloud, cameras, options=raster, device=device)
+def _training_cameras(capture: Capture, frame: int) -> list[Camera]:
+    """Return the cameras that train in a frame."""
+    return [record.camera for record in capture.select(split="train", frames={frame})]
 
 
 def _score_frames(
     capture: Capture,
-    sequence: GaussianSequence,
+    found: Reconstruction,
     meshes: Sequence[trimesh.Trimesh],
     raster: RasterOptions,
-    samples: int,
     device: str | None,
-) -> list[FrameScores]:
+) -> list[dict[str, Any]]:
     """Score every frame against views that training did not see, and its mesh against the truth."""
-    return [
-        score_frame(
-            sequence[index],
+    entries = found.report["frames"]
+    reports = []
+    for index, frame in enumerate(capture.frames):
+        score = score_frame(
+            found.sequence[index],
             capture.select(split="test", frames={frame}),
             meshes[index],
             truth_mesh=read_truth_mesh(capture, frame),
-            seeing=[record.camera for record in capture.select(split="train", frames={frame})],
+            seeing=_training_cameras(capture, frame),
             options=raster,
-            samples=samples,
+            samples=int(entries[0]["samples"]),
             sample_count=CHAMFER_SAMPLES,
             device=device,
         )
-        for index, frame in enumerate(capture.frames)
-    ]
+        entry = entries[index]
+        reports.append({"frame": frame, **score.as_dict(), "train_psnr": entry["psnr"], "kind": entry["kind"]})
+    return reports
+
+
+def _decompose(
+    out: Path,
+    capture: Capture,
+    sequence: GaussianSequence,
+    lights: Mapping[str, EnvironmentMap],
+    device: str | None,
+    progress: Progress,
+) -> RunResult:
+    """Make the reconstructed sequence relightable, under the first of the lights."""
+    light, *others = lights
+    return run(
+        sequence,
+        lights[light],
+        out,
+        # The capture's light and its exposure are known, and its images are scene-linear.
+        RunOptions(exposure=0.0, roughness=ESTIMATE, device=device),
+        capture=capture,
+        overview=OverviewOptions(
+            second_light=Relighting(f"relit by a {others[0]}", lights[others[0]]) if others else None,
+            azimuth=25.0,
+            elevation=8.0,
+            height=OVERVIEW_HEIGHT,
+        ),
+        progress=progress,
+    )
 
 
 def _write_picture(

@@ -1,4 +1,4 @@
-"""What the demo figure is made of: base colour and roughness as band-limited functions of the rest position.
+"""Materials of the demo figure: base colour and roughness as band-limited functions of the rest position.
 
 Base colour stays in [0.05, 0.8] (scene-linear Rec.709) and roughness in [0.3, 0.9], as cloth, skin and leather do.
 """
@@ -8,11 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from beam_warp.demo.shape import DRESS_HEM, ELBOW, PARTS, part_distances
-
-FloatArray = NDArray[np.float64]
+from beam_warp.demo.shape import DRESS_HEM, ELBOW, PARTS, FloatArray, part_distances
 
 SEAM = 0.003
 """Distance over which one material turns into the next [m]."""

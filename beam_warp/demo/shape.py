@@ -22,17 +22,17 @@ SIDES = {"left": LEFT, "right": RIGHT}
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BodyPart:
     """One piece of the figure.
 
     Attributes:
-        name: What it is.
-        bone: The bone that carries it.
-        material: What it is made of; see `beam_warp.demo.paint`.
+        name: Name of the piece.
+        bone: Name of the bone that carries it.
+        material: Name of its material in `beam_warp.demo.paint`.
         distance: Signed distance of points ``(N, 3)`` [m], exact or a good approximation near the surface.
-        low: Lower corner of a box around it [m].
-        high: Upper corner.
-        blend: Width over which it melts into the parts before it [m].
+        low: Lower corner of a box around the piece [m].
+        high: Upper corner of that box [m].
+        blend: Width over which the piece melts into those before it [m].
     """
 
     name: str
@@ -139,34 +139,38 @@ def mirrored(point: FloatArray, side: float) -> FloatArray:
     return point * (side, 1.0, 1.0)
 
 
-def _cone(name: str, bone: str, material: str, a: object, b: object, radii: tuple[float, float], blend: float) -> Part:
+def _cone(
+    name: str, bone: str, material: str, a: object, b: object, radii: tuple[float, float], blend: float
+) -> BodyPart:
     start, end = np.asarray(a, np.float64), np.asarray(b, np.float64)
     corners = np.stack([start - radii[0], start + radii[0], end - radii[1], end + radii[1]])
     distance = partial(round_cone, a=start, b=end, radius_a=radii[0], radius_b=radii[1])
-    return Part(name, bone, material, distance, corners.min(0), corners.max(0), blend)
+    return BodyPart(name, bone, material, distance, corners.min(0), corners.max(0), blend)
 
 
-def _ball(name: str, bone: str, material: str, center: object, radii: object, blend: float) -> Part:
+def _ball(name: str, bone: str, material: str, center: object, radii: object, blend: float) -> BodyPart:
     middle, half = np.asarray(center, np.float64), np.asarray(radii, np.float64)
-    return Part(
+    return BodyPart(
         name, bone, material, partial(ellipsoid, center=middle, radii=half), middle - half, middle + half, blend
     )
 
 
-def _ring(name: str, bone: str, material: str, center: object, radii: object, thickness: float, blend: float) -> Part:
+def _ring(
+    name: str, bone: str, material: str, center: object, radii: object, thickness: float, blend: float
+) -> BodyPart:
     middle, half = np.asarray(center, np.float64), np.asarray(radii, np.float64)
     reach = np.array([*(half + thickness), thickness])
     distance = partial(ring, center=middle, radii=half, thickness=thickness)
-    return Part(name, bone, material, distance, middle - reach, middle + reach, blend)
+    return BodyPart(name, bone, material, distance, middle - reach, middle + reach, blend)
 
 
-def _body() -> list[Part]:
+def _body() -> list[BodyPart]:
     parts = [
         _ball("hips", "pelvis", "leggings", (0, 0, 0.86), (0.135, 0.105, 0.12), 0.02),
         _ball("waist", "spine", "dress", (0, 0, 0.99), (0.115, 0.092, 0.13), 0.04),
         _ball("chest", "chest", "dress", (0, 0, 1.145), (0.140, 0.105, 0.135), 0.05),
         _cone("neck", "chest", "skin", (0, 0, 1.23), (0, 0, 1.36), (0.055, 0.048), 0.03),
-        Part("dress", "dress", "dress", dress, np.array([-0.35, -0.32, 0.53]), np.array([0.35, 0.32, 1.0]), 0.02),
+        BodyPart("dress", "dress", "dress", dress, np.array([-0.35, -0.32, 0.53]), np.array([0.35, 0.32, 1.0]), 0.02),
         _ring("belt", "spine", "belt", (0, 0, 0.975), (0.118, 0.098), 0.017, 0.006),
         _ball("pouch", "spine", "leather", (0.10, -0.085, 0.925), (0.042, 0.036, 0.048), 0.006),
     ]
@@ -181,7 +185,7 @@ def _body() -> list[Part]:
             _cone(f"{name} shoulder", "chest", "shirt", (0.06 * side, 0, 1.20), shoulder, (0.075, 0.062), 0.04),
             _cone(f"{name} upper arm", f"{name} arm", "shirt", shoulder, elbow, (0.060, 0.047), 0.03),
             _cone(f"{name} wrist", f"{name} forearm", "skin", elbow + 0.05 * along, wrist, (0.030, 0.027), 0.01),
-            Part(
+            BodyPart(
                 f"{name} sleeve",
                 f"{name} forearm",
                 "shirt",
@@ -226,13 +230,13 @@ def _body() -> list[Part]:
     return parts
 
 
-def _head() -> list[Part]:
+def _head() -> list[BodyPart]:
     parts = [
         _ball("head", "head", "face", (0, -0.008, 1.455), (0.116, 0.118, 0.135), 0.02),
         _ball("chin", "head", "face", (0, -0.040, 1.398), (0.075, 0.075, 0.066), 0.05),
         _ball("nose", "head", "face", (0, -0.128, 1.432), (0.017, 0.022, 0.018), 0.02),
         _ball("hair", "head", "hair", (0, 0.030, 1.470), (0.134, 0.118, 0.150), 0.008),
-        Part("brim", "head", "hat", brim, np.array([-0.27, -0.26, 1.48]), np.array([0.27, 0.28, 1.64]), 0.008),
+        BodyPart("brim", "head", "hat", brim, np.array([-0.27, -0.26, 1.48]), np.array([0.27, 0.28, 1.64]), 0.008),
         _cone("crown", "head", "hat", (0, 0.012, 1.555), (0, 0.040, 1.652), (0.118, 0.082), 0.015),
         _ring("hat band", "head", "band", (0, 0.014, 1.578), (0.116, 0.116), 0.013, 0.006),
         _cone("feather", "head", "feather", (0.108, 0.02, 1.575), (0.165, 0.115, 1.735), (0.022, 0.014), 0.006),
@@ -258,7 +262,7 @@ def _head() -> list[Part]:
     return parts
 
 
-def _scarf() -> list[Part]:
+def _scarf() -> list[BodyPart]:
     parts = [
         _ring("scarf", "chest", "scarf", (0, 0.002, 1.292), (0.078, 0.076), 0.042, 0.006),
         _cone("scarf knot", "chest", "scarf", (0.055, -0.095, 1.265), (0.085, -0.118, 1.155), (0.036, 0.028), 0.015),
@@ -271,7 +275,7 @@ def _scarf() -> list[Part]:
     return parts
 
 
-PARTS: tuple[Part, ...] = (*_body(), *_head(), *_scarf())
+PARTS: tuple[BodyPart, ...] = (*_body(), *_head(), *_scarf())
 """Every part, in the order in which they are joined."""
 
 FAR = 1.0

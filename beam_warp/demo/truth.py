@@ -1,4 +1,4 @@
-"""What views of the demo figure should show, by path tracing, and how near a decomposition comes to it."""
+"""The truth of the demo: views of the figure by path tracing, and how near a decomposition comes to them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ CHANNEL_SAMPLES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """What a view should show: channels, coverage, and radiance by light."""
+class DemoTruth:
+    """The truth of a view: channels, coverage, and radiance by name of the light."""
 
     camera: Camera
     alpha: NDArray[np.float32]
@@ -34,7 +34,7 @@ class Truth:
     radiance: Mapping[str, NDArray[np.float32]]
 
     @classmethod
-    def of(cls, traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap], paths: int) -> Truth:
+    def of(cls, traced: TracedMesh, camera: Camera, lights: Mapping[str, EnvironmentMap], paths: int) -> DemoTruth:
         """Path trace a view under every light, at least one, with so many paths a pixel."""
         images = {name: trace_radiance(traced, camera, light, sample_count=paths) for name, light in lights.items()}
         channels = trace_channels(traced, camera, sample_count=CHANNEL_SAMPLES, visibility_count=CHANNEL_SAMPLES)
@@ -72,7 +72,7 @@ def relit_views(
     ]
 
 
-def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, Any]:
+def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str, Any]:
     """Return mean scores over views, unscaled, with the scale of base colour that would fit best beside them."""
     scores: dict[str, list[Score]] = {}
     scales, normals = [], []
@@ -98,7 +98,7 @@ def score_views(truths: Sequence[Truth], views: Sequence[Relit]) -> dict[str, An
     }
 
 
-def comparison(truth: Truth, view: Relit, lights: Mapping[str, EnvironmentMap]) -> NDArray[np.uint8]:
+def comparison(truth: DemoTruth, view: Relit, lights: Mapping[str, EnvironmentMap]) -> NDArray[np.uint8]:
     """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
 
     def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:

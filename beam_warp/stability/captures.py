@@ -1,4 +1,4 @@
-"""What a reconstruction makes of captures on which reconstructions fail: what it detected, and how good it was still.
+"""The judge of stress captures: what a reconstruction detected on them, and how good it still was.
 
 A case fails if what must be detected was not, if a sound camera is blamed, if something is found where nothing is
 wrong, if a frame is much worse than the first and nothing was said about it, or if the run ends in anything but a
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from beam_warp.capture.capture import Capture
@@ -18,17 +18,17 @@ from beam_warp.errors import BeamError
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame
-from beam_warp.stability.capture_cases import (
-    CAPTURE_CASES,
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.capture_cases.alterations import training_cameras
+from beam_warp.stability.capture_cases.case import (
     NEW_SURFACE,
     TRACKING_LOST,
     CaptureCase,
     CaptureStress,
     Detection,
-    StressStudio,
     in_words,
-    training_cameras,
 )
+from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.world.gaussians import GaussianSequence
 
 SILENT_LOSS_DB = 3.0
@@ -37,12 +37,12 @@ SILENT_LOSS_DB = 3.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstructed:
-    """What a reconstruction of a capture returns.
+    """The result of reconstructing a capture.
 
     Attributes:
         sequence: One cloud for each of the capture's frames, in their order, with persistent ids within a segment.
-        detections: What was noticed.
-        done: What was done about it, in words.
+        detections: What the reconstruction noticed.
+        done: What it did about that, in words.
         key_frames: Indices into the sequence at which a segment starts; the first is 0.
         raster: How its Gaussians are drawn; None for the defaults.
     """
@@ -55,29 +55,29 @@ class Reconstructed:
 
 
 Reconstruct = Callable[[Capture], Reconstructed]
-"""Reconstructs the training views of a capture. Raises `BeamError` before it optimises what it cannot."""
+"""Reconstructs the training views of a capture. Raises `BeamError` before it optimises if it refuses the capture."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOutcome:
-    """What a reconstruction made of one case.
+    """The outcome of reconstructing one case.
 
     Attributes:
         case: Name of the case.
         device: Warp device.
-        frames: Frames of the capture.
-        cameras: Its training cameras.
-        size: Width and height of its images [pixel].
-        gaussians: Of the last frame.
-        detected: What was found, in words.
-        done: What was done about it, in words.
-        missed: What must have been found and was not, in words.
-        refused: The error it was refused with; empty if it was reconstructed.
-        key_frames: Where segments start.
+        frames: Number of frames of the capture.
+        cameras: Number of training cameras.
+        size: Width and height of the images [pixel].
+        gaussians: Number of Gaussians in the last frame.
+        detected: What the reconstruction found, in words.
+        done: What it did about that, in words.
+        missed: What it must find and did not, in words.
+        refused: The error by which the capture was refused; empty if it was reconstructed.
+        key_frames: Frames at which segments start.
         first: Scores of the first frame that has test views; empty without one.
-        last: Scores of the last one.
-        drift: Of the first segment's last frame against its first; empty if the truth has no constant topology there.
-        faults: What should not be; empty if all is well.
+        last: Scores of the last frame that has test views; empty without one.
+        drift: Drift of the first segment's last frame against its first; empty if the truth changes topology there.
+        faults: Reasons why the case fails; empty if it passes.
         seconds: Time of the reconstruction.
     """
 
@@ -100,38 +100,33 @@ class CaptureOutcome:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is at fault."""
+        """Whether the case has no fault."""
         return not self.faults
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record."""
-        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        lists = {name: list(value) for name, value in record.items() if isinstance(value, tuple)}
-        return record | lists | {"passed": self.passed, "seconds": round(self.seconds, 3)}
+        return asdict(self) | {"passed": self.passed, "seconds": round(self.seconds, 3)}
 
 
 def run_capture_cases(
     reconstruct: Reconstruct,
     studio: StressStudio,
-    cases: Sequence[CaptureCase] | None = None,
+    cases: Sequence[CaptureCase],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[CaptureOutcome]:
     """Reconstruct case after case.
 
     Args:
-        reconstruct: What is tried.
-        studio: Where captures come from; its device is also that of the scores.
-        cases: From `CAPTURE_CASES`; None for all, of a given capture for those that need no other images.
+        reconstruct: The reconstruction that is tried.
+        studio: The source of the captures; scores are computed on its device too.
+        cases: Cases of `CAPTURE_CASES`; with a given capture, those that are not path traced.
         progress: Called with (cases done, cases in all).
     """
-    chosen = CAPTURE_CASES if cases is None else cases
-    if cases is None and studio.given is not None:
-        chosen = [case for case in chosen if not case.traced]
-    for done, case in enumerate(chosen, start=1):
+    for done, case in enumerate(cases, start=1):
         yield run_capture_case(reconstruct, studio, case)
         if progress is not None:
-            progress(done, len(chosen))
+            progress(done, len(cases))
 
 
 def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: CaptureCase) -> CaptureOutcome:
@@ -212,7 +207,7 @@ def _faults(
     first: Mapping[str, Any],
     last: Mapping[str, Any],
 ) -> list[str]:
-    """Return what should not be."""
+    """Return the reasons why a case fails."""
     faults = [f"not detected: {need}" for need in missed]
     if len(result.sequence) != len(stress.capture.frames):
         faults.append(f"{len(stress.capture.frames)} frames must come out, got {len(result.sequence)}")
@@ -243,20 +238,8 @@ TITLES = (
 )
 
 
-def markdown_table(outcomes: Sequence[CaptureOutcome]) -> str:
-    """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
-    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
-    for case in CAPTURE_CASES:
-        lines += [
-            _row((case.name, case.fails, case.must, *cells(outcome, outcomes)))
-            for outcome in outcomes
-            if outcome.case == case.name
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def cells(outcome: CaptureOutcome, outcomes: Sequence[CaptureOutcome]) -> tuple[str, ...]:
-    """Return what a table says of a case, from *detected* on; the sound capture is looked for among all outcomes."""
+    """Return the cells of a case from *detected* on; the sound capture is looked for among all outcomes."""
     sound = next((other for other in outcomes if other.case == CAPTURE_CASES[0].name), None)
     return (
         "refused: " + outcome.refused if outcome.refused else ", ".join(outcome.detected) or "nothing",
@@ -271,13 +254,13 @@ def cells(outcome: CaptureOutcome, outcomes: Sequence[CaptureOutcome]) -> tuple[
 
 
 def _drift(outcome: CaptureOutcome) -> str:
-    """Return the drift, and over how many frames."""
+    """Return the drift and its number of frames, for a table."""
     frames = min([key for key in outcome.key_frames if key > 0] + [outcome.frames])
     return f"{outcome.drift['vertices']['mean_mm']:.1f} over {frames}" if "vertices" in outcome.drift else "–"
 
 
 def _against(outcome: CaptureOutcome, sound: CaptureOutcome | None) -> str:
-    """Return the difference of PSNR from the sound capture's, of the first and the last frame."""
+    """Return how far PSNR is from the sound capture's, in the first and the last frame, for a table."""
     if sound is None or not (sound.first and outcome.first):
         return "–"
     pairs = ((outcome.first, sound.first), (outcome.last, sound.last))
@@ -285,10 +268,6 @@ def _against(outcome: CaptureOutcome, sound: CaptureOutcome | None) -> str:
 
 
 def _pair(outcome: CaptureOutcome, name: str, form: str) -> str:
-    """Return a score of the first and last frame."""
+    """Return a score of the first and the last frame, for a table."""
     found = [format(scores[name], form) for scores in (outcome.first, outcome.last) if name in scores]
     return ", ".join(found) or "–"
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -1,8 +1,8 @@
-"""Subjects and lights on which the measurement of materials fails: small ones, with every base colour known.
+"""Stress materials: small subjects and lights on which the measurement of materials fails, with known base colours.
 
-A case is a closed mesh under a light. The path tracer says what its vertices send towards every camera; Gaussians on
-the vertices, drawn with those colours, are its photographs. Light transport is thus another's than the one that is
-tried, while nothing is left to the chance of a reconstruction.
+A case is a closed mesh under a light. The path tracer for meshes computes the radiance that its vertices send towards
+every camera. Gaussians on the vertices, drawn with those colours, are its photographs. So the light transport of the
+photographs is independent of the one under test, and no reconstruction adds errors of its own.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from beam_warp.world.mesh import MaterialMesh, vertex_normals
 from beam_warp.world.shapes import TiledSurface, tile
 
 RADIUS = 0.5
-"""Of the ball that most cases are about [m]."""
+"""Radius of the ball of most cases [m]."""
 
 ROUGHNESS = 0.6
 MIRROR_ROUGHNESS = 0.05
 PATCH_COSINE = 0.5
-"""The patch that a case is about is where normals are within 60 degrees of `PATCH`."""
+"""Least cosine between `PATCH` and the normals of the patch that a case is about: 60 degrees."""
 
 PATCH = np.array([1.0, 0.0, 0.3]) / np.linalg.norm([1.0, 0.0, 0.3])
 
@@ -43,32 +43,32 @@ SHELL = 0.002
 
 CREASE_DEPTH = 0.35
 CREASES = 6
-"""Depth of creases, of the radius, and how many run from pole to pole: about as deep as they are wide."""
+"""Depth of creases in radii, and their number: from pole to pole, about as deep as they are wide."""
 
 SATURATED_QUANTILE = 0.7
 SATURATED_BY = 1.1
-"""Of the values of all images, where the ceiling of the saturated ones is; how far above it the mean over views is of
-Gaussians that the case is about."""
+"""The quantile of all image values at which the saturated images end; the factor by which the mean over views of the
+Gaussians that the case is about exceeds that ceiling."""
 
 HOLE = 1e-3
-"""Coverage by which what is drawn of a closed surface falls short of 1 through its splats."""
+"""Coverage below which a pixel of a photograph counts as empty."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaterialStress:
-    """What a decomposition is given, and what it should find.
+    """The input of a decomposition, and what must come of it.
 
     Attributes:
         cloud: Gaussians with captured radiance.
         views: Photographs.
-        environment: The light, as stated.
-        base_color: The truth, ``(N, 3)``.
+        environment: The light as stated, which may be wrong.
+        base_color: True base colour, ``(N, 3)``.
         hit: Gaussians that the case is about, ``(N,)``.
-        roughness: What the decomposition is told, ``(N,)``.
-        color_space: Of the image files, if display-referred.
-        flags: What `hit` must be flagged as, any of them; none if 0.
-        finding: Code of what must be found; empty for nothing.
-        refused: Whether it must be refused.
+        roughness: Roughness that the decomposition is given, ``(N,)``.
+        color_space: Colour space of the image files.
+        flags: Flags of which `hit` must have one; 0 for none.
+        finding: Code that must be found; empty for none.
+        refused: Whether the case must be refused.
     """
 
     cloud: GaussianCloud
@@ -92,7 +92,7 @@ class MaterialStudio:
         camera_count: Cameras around the subject.
         size: Side of the images [pixel].
         samples: Paths for each vertex and camera.
-        subdivisions: Of the ball's icosahedron: 3 gives 642 vertices, 4 2,562.
+        subdivisions: Subdivisions of the ball's icosahedron: 3 gives 642 vertices, 4 gives 2,562.
     """
 
     device: str | None = None
@@ -108,7 +108,7 @@ class MaterialStudio:
 
     @cached_property
     def plain(self) -> MaterialStress:
-        """A ball in the studio, nothing wrong with it."""
+        """A ball in the studio with nothing wrong."""
         return self.photograph(self.ball(), self.light)
 
     @cached_property
@@ -138,9 +138,9 @@ class MaterialStudio:
 
         Args:
             mesh: The subject.
-            light: What it is lit by.
-            hit: Vertices that the case is about; none if None.
-            flatness: Thickness of the Gaussians, of the spacing of vertices.
+            light: The environment that lights the mesh.
+            hit: Vertices that the case is about; None for none.
+            flatness: Thickness of the Gaussians over their width.
         """
         traced = TracedMesh.from_mesh(mesh, device=self.device)
         cameras = self.cameras()
@@ -165,7 +165,7 @@ class MaterialStudio:
         )
 
     def _view(self, cloud: GaussianCloud, camera: Camera, radiance: NDArray[np.float32]) -> CapturedView:
-        """Draw one photograph; splats let a little through, the surface that they stand for does not."""
+        """Draw one photograph. Splats let a little light through, the surface that they stand for does not."""
         drawn = rasterize_values(cloud, camera, radiance, device=self.device)
         alpha = np.where(drawn.alpha > 1.0 - 0.05, 1.0, drawn.alpha).astype(np.float32)
         scale = np.divide(alpha, drawn.alpha, out=np.zeros_like(alpha), where=drawn.alpha > HOLE)
@@ -175,13 +175,13 @@ class MaterialStudio:
 
 @dataclass(frozen=True)
 class MaterialCase:
-    """A registered case.
+    """A subject or light by name, how decompositions fail on it, and how it is made.
 
     Attributes:
-        name: In words.
+        name: Short and unique.
         fails: How a decomposition without precautions fails.
         must: What is asked of this one.
-        build: Makes it.
+        build: Makes what the decomposition is given; the same each time.
     """
 
     name: str
@@ -190,17 +190,11 @@ class MaterialCase:
     build: Callable[[MaterialStudio], MaterialStress]
 
 
-MATERIAL_CASES: list[MaterialCase] = []
-
-
-def material_case(name: str, fails: str, must: str) -> Callable[..., Callable[[MaterialStudio], MaterialStress]]:
-    """Register what follows."""
-
-    def register(build: Callable[[MaterialStudio], MaterialStress]) -> Callable[[MaterialStudio], MaterialStress]:
-        MATERIAL_CASES.append(MaterialCase(name, fails, must, build))
-        return build
-
-    return register
+def material_case(
+    name: str, fails: str, must: str
+) -> Callable[[Callable[[MaterialStudio], MaterialStress]], MaterialCase]:
+    """Make a case of the function below it."""
+    return lambda build: MaterialCase(name, fails, must, build)
 
 
 @material_case("as it is", "nothing fails here", "nothing found, nothing flagged: what is elsewhere is no habit")
@@ -234,13 +228,13 @@ def mirror_unknown(studio: MaterialStudio) -> MaterialStress:
 
 @material_case("one hot sun", "few of 64 rays find it: fireflies and shadows of noise", "as good as under soft light")
 def hot_sun(studio: MaterialStudio) -> MaterialStress:
-    """Most light from one square of 1.4 degrees, 2e4 times the mean."""
+    """A square of 1.4 degrees, 2e4 times as bright as the mean, gives most of the light."""
     return studio.photograph(studio.ball(), sun())
 
 
 @material_case("one lit side", "division by no light: noise, or white", "the dark side flagged unlit, and filled")
 def one_side(studio: MaterialStudio) -> MaterialStress:
-    """Light from a cone about the patch, nothing from anywhere else."""
+    """All light comes from a cone about the patch."""
     ball = studio.ball()
     directions = texel_directions(32, 64)
     light = EnvironmentMap(np.repeat((directions @ PATCH > np.cos(np.radians(20.0)))[..., None] * 8.0, 3, axis=-1))
@@ -369,12 +363,32 @@ def unseen(studio: MaterialStudio) -> MaterialStress:
     return replace(
         stress,
         cloud=joined,
-        # Nothing is known of it: what its neighbours on the surface have is as good as any guess.
+        # The inner ball has no true colour of its own: its neighbours' on the surface is as good a guess as any.
         base_color=both(stress.base_color, stress.base_color[inner]),
         roughness=np.concatenate([stress.roughness, np.full(extra, ROUGHNESS, np.float32)]),
         hit=np.arange(len(joined)) >= len(cloud),
         flags=Observability.UNSEEN,
     )
+
+
+MATERIAL_CASES = [
+    plain,
+    black,
+    mirror_known,
+    mirror_unknown,
+    hot_sun,
+    one_side,
+    saturated,
+    turned_light,
+    mirrored_light,
+    flipped_normals,
+    thin_shell,
+    creases,
+    two_views,
+    black_light,
+    unseen,
+]
+"""Every case, in the order of the table; the first has nothing wrong."""
 
 
 def sun() -> EnvironmentMap:

@@ -1,4 +1,4 @@
-"""What the measurement of materials makes of subjects and lights on which it fails: what it found, how far it is off.
+"""The judge of stress materials: what the measurement found, flagged and stated, and how far it is off.
 
 A case fails if what must be found or flagged was not, if something is found where nothing is wrong, if base colours are
 wrong without a word, or if the run ends in anything but materials or a refusal where one is asked for.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -31,25 +31,25 @@ from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import check_light
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialCase, MaterialStress, MaterialStudio
+from beam_warp.stability.material_cases import MaterialCase, MaterialStress, MaterialStudio
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
 FLAGGED = 0.9
-"""Part of the Gaussians that a case is about from which on they count as flagged."""
+"""Least part of the Gaussians that a case is about that must have its flag."""
 
 LIGHT_SUBSET = 256
-"""Gaussians that the light is checked by: on a ball so many see all of it."""
+"""Gaussians by which the light is checked: so many see all of it from a ball."""
 
 WRONG = 0.1
 STATED = 3.0
-"""A base colour is wrong without a word if it is off by more than the former, and by more than so many stated standard
-errors, of a Gaussian without a flag, and nothing was found."""
+"""A base colour is wrong without a word if its error is above `WRONG` and above `STATED` stated standard errors, its
+Gaussian has no flag, and nothing was found."""
 
 SILENT_PART = 0.02
-"""Part of all Gaussians that may be wrong without a word. Of the sound ball 0.002 are: some by its poles, which
-silhouettes show alone, and by what the photographs blur between neighbours."""
+"""Part of all Gaussians that may be wrong without a word. On the sound ball 0.002 are: near its poles, which only
+silhouettes show, and where photographs blur neighbours."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class ColorErrors:
     Attributes:
         count: How many Gaussians.
         median: Median absolute error.
-        high: Its 95 % quantile.
+        high: 95 % quantile of the absolute error.
         stated: Median of the stated standard error.
-        within: Part within two stated standard errors: 0.95 or more where they are honest.
-        flags: Part with each flag, by name; those that none has are left out.
+        within: Part of errors within two stated standard errors: 0.95 or more if those are honest.
+        flags: Part of the Gaussians with each flag, by name; flags that none has are left out.
     """
 
     count: int
@@ -92,19 +92,19 @@ class ColorErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOutcome:
-    """What became of one case.
+    """The outcome of measuring one case.
 
     Attributes:
-        case: Its name.
+        case: Name of the case.
         device: Warp device.
-        gaussians: How many.
-        views: Photographs.
-        found: Codes of what was found.
-        refused: The error it was refused with; empty if it was not.
-        hit: Of the Gaussians that the case is about; None if it is about none, or was refused.
-        rest: Of the others.
-        silent: Part of all that is wrong without a word.
-        faults: What should not be; empty if all is well.
+        gaussians: Number of Gaussians.
+        views: Number of photographs.
+        found: Codes of the findings.
+        refused: The error by which the case was refused; empty if it was measured.
+        hit: Errors of the Gaussians that the case is about; None if it is about none, or was refused.
+        rest: Errors of all others.
+        silent: Part of all Gaussians that is wrong without a word.
+        faults: Reasons why the case fails; empty if it passes.
         seconds: Time of the measurement.
     """
 
@@ -122,15 +122,12 @@ class MaterialOutcome:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is at fault."""
+        """Whether the case has no fault."""
         return not self.faults
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record."""
-        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        parts = {name: None if record[name] is None else dict(vars(record[name])) for name in ("hit", "rest")}
-        lists = {"found": list(self.found), "faults": list(self.faults)}
-        return record | parts | lists | {"passed": self.passed, "seconds": round(self.seconds, 3)}
+        return asdict(self) | {"passed": self.passed, "seconds": round(self.seconds, 3)}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> MaterialOutcome:
@@ -142,10 +139,10 @@ class MaterialOutcome:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Where cases are run; lights that cases share are prepared once.
+    """A place to run cases, which prepares each light once.
 
     Attributes:
-        studio: Where they come from; its device is also that of the measurement.
+        studio: The source of the cases; they are measured on its device.
     """
 
     studio: MaterialStudio
@@ -168,8 +165,8 @@ def run_material_cases(
     """Run case after case.
 
     Args:
-        studio: Where they come from.
-        cases: From `MATERIAL_CASES`.
+        studio: The source of the cases.
+        cases: Cases of `MATERIAL_CASES`.
         progress: Called with (cases done, cases in all).
     """
     bench = Bench(studio)
@@ -211,10 +208,10 @@ def run_material_case(bench: Bench, case: MaterialCase) -> MaterialOutcome:
 
 
 def decompose(bench: Bench, stress: MaterialStress) -> tuple[BaseColor, list[Finding]]:
-    """Check and measure what a case gives, as `beam decompose` does with one frame.
+    """Check and measure a case as `beam decompose` does with one frame.
 
     Raises:
-        BeamError: It is refused.
+        BeamError: The case is refused.
     """
     device = bench.studio.device
     ceiling = largest_value(stress.views, stress.color_space)
@@ -237,14 +234,14 @@ def decompose(bench: Bench, stress: MaterialStress) -> tuple[BaseColor, list[Fin
 
 
 def silent_part(solved: BaseColor, truth: NDArray[np.float32]) -> float:
-    """Return which part of all Gaussians is wrong without a word."""
+    """Return the part of all Gaussians that is wrong without a word."""
     error = np.abs(solved.base_color - truth)
     wrong = ((error > WRONG) & ~(error <= STATED * solved.standard_error)).any(axis=1)
     return float((wrong & (solved.observability == 0)).mean())
 
 
 def _faults(stress: MaterialStress, solved: BaseColor, findings: Sequence[Finding], silent: float) -> list[str]:
-    """Return what should not be."""
+    """Return the reasons why a case fails."""
     if stress.refused:
         return ["must be refused, and was not"]
     faults = []
@@ -279,20 +276,8 @@ TITLES = (
 )
 
 
-def markdown_table(outcomes: Sequence[MaterialOutcome]) -> str:
-    """Return the outcomes as a table for a page, one row a case, in the order of the registry."""
-    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
-    for case in MATERIAL_CASES:
-        lines += [
-            _row((case.name, case.fails, case.must, *cells(outcome)))
-            for outcome in outcomes
-            if outcome.case == case.name
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def cells(outcome: MaterialOutcome) -> tuple[str, ...]:
-    """Return what a table says of a case, from *found* on."""
+    """Return the cells of a case from *found* on."""
     hit, rest = outcome.hit, outcome.rest
     flags = {} if hit is None else hit.flags
     return (
@@ -306,7 +291,3 @@ def cells(outcome: MaterialOutcome) -> tuple[str, ...]:
         "–" if outcome.refused else f"{outcome.silent:.1%}",
         "; ".join(outcome.faults) or "ok",
     )
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -1,24 +1,29 @@
-"""The stability suite as a page: what every hierarchy and device made of every scene, side by side."""
+"""The page of the stability suite: the outcome of every case on every device, side by side."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from beam_warp._version import __version__
 from beam_warp.capture.images import EXPOSURE_STOPS as INSPECTED_STOPS
-from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
+from beam_warp.converters.staging import staged_outputs
+from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.jobs.markdown import markdown_table
 from beam_warp.reconstruction.gains import EXPOSURE_STOPS
+from beam_warp.stability import captures, materials, relighting
 from beam_warp.stability.analytic_occlusion import SHAPES, OcclusionOutcome
-from beam_warp.stability.captures import SILENT_LOSS_DB, CaptureOutcome, markdown_table
-from beam_warp.stability.materials import FLAGGED, SILENT_PART, STATED, WRONG, MaterialOutcome
-from beam_warp.stability.materials import markdown_table as material_table
-from beam_warp.stability.relighting import LARGEST_T, REFERENCE_TIMES, SEEDS, RelightingOutcome
-from beam_warp.stability.relighting import markdown_table as relighting_table
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.captures import CaptureOutcome
+from beam_warp.stability.material_cases import MATERIAL_CASES
+from beam_warp.stability.materials import MaterialOutcome
+from beam_warp.stability.relighting import RelightingOutcome
+from beam_warp.stability.relighting_cases import RELIGHTING_CASES
 from beam_warp.stability.tracing import Outcome
 from beam_warp.stability.tracing_cases import CASES
 
@@ -137,16 +142,20 @@ says so.
 """
 
 
+PARTS = ("occlusion", "captures", "materials", "relighting")
+"""Names of the parts of a result beside the stress cases, in its JSON form as well."""
+
+
 @dataclass(frozen=True)
 class StabilityResult:
-    """Everything that one or several runs found.
+    """Outcomes of one or several runs of the suite.
 
     Attributes:
-        outcomes: Of the stress cases.
-        occlusion: Of the shapes with known ambient occlusion.
-        captures: Of the captures on which reconstructions fail.
-        materials: Of the subjects and lights on which the measurement of materials fails.
-        relighting: Of those on which relighting fails, an outcome for each renderer.
+        outcomes: One for each stress case of the tracer, hierarchy and device.
+        occlusion: One for each shape with known ambient occlusion.
+        captures: One for each capture on which reconstructions fail.
+        materials: One for each subject or light on which the measurement of materials fails.
+        relighting: One for each subject or light on which relighting fails, and each renderer.
     """
 
     outcomes: tuple[Outcome, ...] = ()
@@ -158,17 +167,12 @@ class StabilityResult:
     @property
     def passed(self) -> bool:
         """Whether every verdict is good."""
-        parts = (self.outcomes, self.occlusion, self.captures, self.materials, self.relighting)
-        return all(outcome.passed for part in parts for outcome in part)
+        return all(outcome.passed for part in fields(self) for outcome in getattr(self, part.name))
 
     def joined(self, other: StabilityResult) -> StabilityResult:
         """Return both results as one, this one's first."""
         return StabilityResult(
-            self.outcomes + other.outcomes,
-            self.occlusion + other.occlusion,
-            self.captures + other.captures,
-            self.materials + other.materials,
-            self.relighting + other.relighting,
+            **{part.name: getattr(self, part.name) + getattr(other, part.name) for part in fields(self)}
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -177,10 +181,7 @@ class StabilityResult:
             "version": __version__,
             "passed": self.passed,
             "cases": [outcome.as_dict() for outcome in self.outcomes],
-            "occlusion": [outcome.as_dict() for outcome in self.occlusion],
-            "captures": [outcome.as_dict() for outcome in self.captures],
-            "materials": [outcome.as_dict() for outcome in self.materials],
-            "relighting": [outcome.as_dict() for outcome in self.relighting],
+            **{name: [outcome.as_dict() for outcome in getattr(self, name)] for name in PARTS},
         }
 
 
@@ -189,7 +190,7 @@ def read_result(path: Path) -> StabilityResult:
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is something else.
+        AssetFormatError: The file is something else.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -233,7 +234,7 @@ def verdict_of(outcomes: Sequence[Outcome]) -> str:
 
 
 def allowed_by(outcome: Outcome) -> str:
-    """Return median and largest of what rounding explains, for a table."""
+    """Return the median and the largest error that rounding explains, for a table."""
     return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
 
 
@@ -241,130 +242,143 @@ def markdown(result: StabilityResult, command: str, before: str = "") -> str:
     """Return the page.
 
     Args:
-        result: Of any number of devices and hierarchies.
-        command: That makes the page, for its text.
-        before: The page as it is: parts that the result has nothing of stay as they are there.
+        result: Outcomes of any number of devices and hierarchies.
+        command: The command that makes the page, for its text.
+        before: The page as it is. Parts for which the result has no outcomes stay as they are there.
     """
-    rest, *relighting = before.split(RELIGHTING_TITLE)
-    rest, *materials = rest.split(MATERIALS_TITLE)
-    tracing, *captures = rest.split(CAPTURES_TITLE)
+    later = (CAPTURES_TITLE, MATERIALS_TITLE, RELIGHTING_TITLE)
+    tracing, *others = re.split(rf"^(?={'|'.join(later)})", before, flags=re.MULTILINE)
+    kept = {title: part for title in later for part in others if part.startswith(title)}
     parts = [
         _tracing(result, command) if result.outcomes or not before else tracing,
-        _captures(result.captures) if result.captures else "".join(CAPTURES_TITLE + text for text in captures),
-        _materials(result.materials) if result.materials else "".join(MATERIALS_TITLE + text for text in materials),
-        _relighting(result.relighting)
-        if result.relighting
-        else "".join(RELIGHTING_TITLE + text for text in relighting),
+        _captures(result.captures) or kept.get(CAPTURES_TITLE, ""),
+        _materials(result.materials) or kept.get(MATERIALS_TITLE, ""),
+        _relighting(result.relighting) or kept.get(RELIGHTING_TITLE, ""),
     ]
     return "\n".join(part.rstrip() + "\n" for part in parts if part)
 
 
 def _materials(outcomes: Sequence[MaterialOutcome]) -> str:
-    """Return the part about materials, a table for each device."""
-    text = MATERIALS_TEXT.format(wrong=WRONG, stated=STATED, flagged=FLAGGED, silent=SILENT_PART)
+    """Return the part about materials, a table for each device; empty if there are no outcomes."""
+    text = MATERIALS_TEXT.format(
+        wrong=materials.WRONG, stated=materials.STATED, flagged=materials.FLAGGED, silent=materials.SILENT_PART
+    )
     lines = [MATERIALS_TITLE, "", text]
     for device in devices_of(outcomes):
-        rows = [outcome for outcome in outcomes if outcome.device == device]
+        same = [outcome for outcome in outcomes if outcome.device == device]
         facts = (
-            f"{device}: {rows[0].gaussians:,} Gaussians, {rows[0].views} views; measured in "
-            f"{sum(outcome.seconds for outcome in rows):.0f} s in all."
+            f"{device}: {same[0].gaussians:,} Gaussians, {same[0].views} views; measured in "
+            f"{sum(outcome.seconds for outcome in same):.0f} s in all."
         )
-        lines += [facts, "", material_table(rows)]
-    return "\n".join(lines)
+        lines += [facts, "", case_table(materials.TITLES, MATERIAL_CASES, same, materials.cells)]
+    return "\n".join(lines) if outcomes else ""
 
 
 def _relighting(outcomes: Sequence[RelightingOutcome]) -> str:
-    """Return the part about relighting, a table for each device."""
-    text = RELIGHTING_TEXT.format(times=REFERENCE_TIMES, seeds=SEEDS, largest_t=LARGEST_T)
+    """Return the part about relighting, a table for each device; empty if there are no outcomes."""
+    text = RELIGHTING_TEXT.format(
+        times=relighting.REFERENCE_TIMES, seeds=relighting.SEEDS, largest_t=relighting.LARGEST_T
+    )
     lines = [RELIGHTING_TITLE, "", text]
     for device in devices_of(outcomes):
-        rows = [outcome for outcome in outcomes if outcome.device == device]
+        same = [outcome for outcome in outcomes if outcome.device == device]
         facts = (
-            f"{device}: images of up to {max(row.size[0] for row in rows)} pixels a side, up to "
-            f"{max(row.gaussians for row in rows):,} Gaussians, {max(row.samples for row in rows)} paths a pixel; "
-            f"{sum(row.passed for row in rows)} of {len(rows)} hold."
+            f"{device}: images of up to {max(row.size[0] for row in same)} pixels a side, up to "
+            f"{max(row.gaussians for row in same):,} Gaussians, {max(row.samples for row in same)} paths a pixel; "
+            f"{sum(row.passed for row in same)} of {len(same)} hold."
         )
-        lines += [facts, "", relighting_table(rows)]
-    return "\n".join(lines)
+        lines += [facts, "", case_table(relighting.TITLES, RELIGHTING_CASES, same, relighting.cells)]
+    return "\n".join(lines) if outcomes else ""
 
 
 def _captures(outcomes: Sequence[CaptureOutcome]) -> str:
-    """Return the part about reconstruction, a table for each device and size."""
-    text = CAPTURES_TEXT.format(silent=SILENT_LOSS_DB, inspected=INSPECTED_STOPS, stops=EXPOSURE_STOPS)
+    """Return the part about reconstruction, a table for each device and size; empty if there are no outcomes."""
+    text = CAPTURES_TEXT.format(silent=captures.SILENT_LOSS_DB, inspected=INSPECTED_STOPS, stops=EXPOSURE_STOPS)
     lines = [CAPTURES_TITLE, "", text]
     for device, size in dict.fromkeys((outcome.device, outcome.size) for outcome in outcomes):
-        rows = [outcome for outcome in outcomes if (outcome.device, outcome.size) == (device, size)]
-        sound = rows[0]
+        same = [outcome for outcome in outcomes if (outcome.device, outcome.size) == (device, size)]
         facts = (
-            f"{device}: {sound.cameras} cameras of {' x '.join(map(str, size))} pixels, {sound.frames} frames, up to "
-            f"{max(outcome.gaussians for outcome in rows):,} Gaussians; reconstructed in "
-            f"{sum(outcome.seconds for outcome in rows):.0f} s in all."
+            f"{device}: {same[0].cameras} cameras of {' x '.join(map(str, size))} pixels, {same[0].frames} frames, up "
+            f"to {max(outcome.gaussians for outcome in same):,} Gaussians; reconstructed in "
+            f"{sum(outcome.seconds for outcome in same):.0f} s in all."
         )
-        lines += [facts, "", markdown_table(rows)]
-    return "\n".join(lines)
+        cells = partial(captures.cells, outcomes=same)
+        lines += [facts, "", case_table(captures.TITLES, CAPTURE_CASES, same, cells)]
+    return "\n".join(lines) if outcomes else ""
+
+
+def case_table(
+    titles: Sequence[str], cases: Sequence[Any], outcomes: Sequence[Any], cells: Callable[[Any], Sequence[str]]
+) -> str:
+    """Return a row for every outcome in the order of the cases: name, how others fail, what is asked, its cells."""
+    return markdown_table(
+        titles,
+        [
+            (case.name, case.fails, case.must, *cells(outcome))
+            for case in cases
+            for outcome in outcomes
+            if outcome.case == case.name
+        ],
+    )
 
 
 def _tracing(result: StabilityResult, command: str) -> str:
     """Return the part about ray tracing."""
-    devices = devices_of(result.outcomes)
-    lines = ["# Stability", "", HOW_TO_READ.format(command=command), "## Stress cases", ""]
-    lines += _header(
-        ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]
-        + [f"error, {device}" for device in devices]
-        + ["verdict"]
-    )
+    parts = ["# Stability", HOW_TO_READ.format(command=command), "## Stress cases", _tracing_table(result.outcomes)]
+    parts += ["## Ambient occlusion of known shapes", OCCLUSION_TEXT, _occlusion_table(result.occlusion)]
+    return "\n".join(part.rstrip() + "\n" for part in parts)
+
+
+def _tracing_table(outcomes: Sequence[Outcome]) -> str:
+    """Return one row a case: the worst error of its hierarchies on every device."""
+    devices = devices_of(outcomes)
+    titles = ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]
+    rows = []
     for case in CASES:
-        same = [outcome for outcome in result.outcomes if outcome.case == case.name]
+        same = [outcome for outcome in outcomes if outcome.case == case.name]
         if same:
             first = same[0]
-            errors = {device: [o.error for o in same if o.device == device] for device in devices}
-            lines.append(
-                _row(
-                    [case.name, case.fails, first.detected, first.done, first.did, allowed_by(first)]
-                    + [_number(max(found)) if found else "not run" for found in errors.values()]
-                    + [verdict_of(same)]
-                )
+            errors = [[outcome.error for outcome in same if outcome.device == device] for device in devices]
+            rows.append(
+                [case.name, case.fails, first.detected, first.done, first.did, allowed_by(first)]
+                + [_number(max(found)) if found else "not run" for found in errors]
+                + [verdict_of(same)]
             )
-    devices = devices_of(result.occlusion)
-    lines += ["", "## Ambient occlusion of known shapes", "", OCCLUSION_TEXT]
-    lines += _header(
-        ["shape", "closed form", "spacing", "Gaussians", "smooth", "tiled", "discretisation"]
-        + [f"estimate, largest z, true z², {device}" for device in devices]
-        + ["verdict"]
-    )
+    return markdown_table([*titles, *(f"error, {device}" for device in devices), "verdict"], rows)
+
+
+def _occlusion_table(outcomes: Sequence[OcclusionOutcome]) -> str:
+    """Return one row a shape and spacing."""
+    devices = devices_of(outcomes)
+    titles = ["shape", "closed form", "spacing", "Gaussians", "smooth", "tiled", "discretisation"]
+    titles += [f"estimate, largest z, true z², {device}" for device in devices]
+    rows = []
     for shape in SHAPES:
-        for spacing in dict.fromkeys(o.spacing for o in result.occlusion if o.shape == shape.name):
-            tiles = [o for o in result.occlusion if (o.shape, o.spacing) == (shape.name, spacing)]
+        for spacing in dict.fromkeys(o.spacing for o in outcomes if o.shape == shape.name):
+            tiles = [o for o in outcomes if (o.shape, o.spacing) == (shape.name, spacing)]
             smooth = (tiles[0].closed_form, tiles[0].quadrature, tiles[0].discretisation)
-            lines.append(
-                _row(
-                    [shape.name, shape.formula, f"{spacing:g}", f"{tiles[0].gaussians:,}"]
-                    + [f"{value:.4f}" for value in smooth]
-                    + [_estimates([o for o in tiles if o.device == device]) for device in devices]
-                    + ["ok" if all(o.passed for o in tiles) else "**beyond 3 standard errors**"]
-                )
+            rows.append(
+                [shape.name, shape.formula, f"{spacing:g}", f"{tiles[0].gaussians:,}"]
+                + [f"{value:.4f}" for value in smooth]
+                + [_estimates([o for o in tiles if o.device == device]) for device in devices]
+                + ["ok" if all(o.passed for o in tiles) else "**beyond 3 standard errors**"]
             )
-    return "\n".join(lines) + "\n"
+    return markdown_table([*titles, "verdict"], rows)
 
 
 def write_page(path: Path, result: StabilityResult, command: str) -> None:
-    """Write the page whole or not at all; what the result has nothing of stays as it was there.
+    """Write the page whole or not at all. Parts for which the result has no outcomes stay as they were there.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The page cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with staged_outputs() as staging:
         before = path.read_text(encoding="utf-8") if path.is_file() else ""
-        temporary.write_text(markdown(result, command, before), encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error
+        staging.path_for(path).write_text(markdown(result, command, before), encoding="utf-8")
 
 
 def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:
-    """Return the estimate that is farthest from its truth, for a table."""
+    """Return the estimate that is farthest from its truth, for a table, with its z-score and the mean square of all."""
     if not outcomes:
         return "not run"
     worst = max(outcomes, key=lambda outcome: outcome.largest_z)
@@ -374,11 +388,3 @@ def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:
 def _number(value: float) -> str:
     """Return an error for a table."""
     return "0" if value == 0.0 else f"{value:.1e}"
-
-
-def _header(titles: Sequence[str]) -> list[str]:
-    return [_row(titles), "|" + "---|" * len(titles)]
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -1,4 +1,4 @@
-"""What `beam stability` reconstructs with: the steps of `beam reconstruct` at two sizes; what their reports say."""
+"""The reconstruction that `beam stability` tries: the steps of `beam reconstruct` at two sizes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.reconstruction.job import reconstruct
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
-from beam_warp.stability.capture_cases import (
+from beam_warp.stability.capture_cases.alterations import training_cameras
+from beam_warp.stability.capture_cases.case import (
     CAMERA_EXPOSURE,
     FAST_MOTION,
     FEW_CAMERAS,
     FRAME_LACKS_CAMERAS,
     TRACKING_LOST,
     Detection,
-    StressStudio,
     detections_of,
-    training_cameras,
 )
+from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.captures import Reconstruct, Reconstructed
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -34,11 +34,11 @@ TOLD = {
     FEW_CAMERAS: "told",
     FAST_MOTION: "told",
 }
-"""What is done about findings that leave the input as it is."""
+"""What is done about findings after which the input stays as it is."""
 
 
 LEVELS = (4, 2, 1)
-"""Reductions of small images: at the next one, motion is less than a pixel."""
+"""Reductions of small images: beyond them, motion is less than a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,6 @@ from beam_warp.device.arrays import device_label, resolve_device
 from beam_warp.errors import BeamError
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
-from beam_warp.stability.relighting_cases import RELIGHTING_CASES
 from beam_warp.stability.relighting_cases.cases import (
     DEFERRED,
     PATH,
@@ -249,18 +248,6 @@ def image_faults(images: Sequence[RenderedImage]) -> list[str]:
 TITLES = ("case", "a renderer without precautions", "must", "renderer", "measured", "asked", "verdict")
 
 
-def markdown_table(outcomes: Sequence[RelightingOutcome]) -> str:
-    """Return the outcomes as a table for a page, a row for every case and renderer, in the order of the registry."""
-    lines = [_row(TITLES), "|" + "---|" * len(TITLES)]
-    for case in RELIGHTING_CASES:
-        lines += [
-            _row((case.name, case.fails, case.must, *cells(outcome)))
-            for outcome in outcomes
-            if outcome.case == case.name
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def cells(outcome: RelightingOutcome) -> tuple[str, ...]:
     """Return what a table says of a case, from *renderer* on."""
     measured = "; ".join(f"{row.what}: {row.measured}" for row in outcome.held) or "–"
@@ -272,7 +259,3 @@ def cells(outcome: RelightingOutcome) -> tuple[str, ...]:
         "; ".join(f"{row.asked} ({row.because})" for row in outcome.held) or "–",
         "; ".join(outcome.faults) or "ok",
     )
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

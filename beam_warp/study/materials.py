@@ -1,4 +1,4 @@
-"""What decomposing costs and how wrong it is on a given capture and device: the materials study of ``beam chart``."""
+"""The materials study of ``beam chart``: the cost and error of decomposing a given capture on a given device."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.materials_plan import MaterialsPlan
-from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews, interval_of
-from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, Subject
+from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews
+from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing import device_name
 from beam_warp.study.tracing_plan import parse_offset
 from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
@@ -39,13 +39,13 @@ SHARP = RasterOptions(antialiased=True, low_pass=0.1)
 """How Gaussians on a true surface are drawn."""
 
 GAUSSIANS = {False: 4000, True: 60_000}
-"""On the true surface of a capture that comes without a reconstruction, on a CPU and on CUDA."""
+"""Number of Gaussians on the true surface of a capture that comes without a reconstruction, by whether on CUDA."""
 
 ROUGHNESS = 0.5
-"""Where Gaussians have none."""
+"""Roughness of Gaussians that have none."""
 
 BAKING_RAYS = 64
-"""Rays a pixel that drawing and baking take the time of, about."""
+"""Rays a pixel that take about as long as drawing and baking."""
 
 REFERENCE_SEED = 1 << 31
 """References draw other samples than every measurement, whose seeds count up from 0."""
@@ -53,16 +53,16 @@ REFERENCE_SEED = 1 << 31
 
 @dataclass(frozen=True, eq=False)
 class MaterialsSubject:
-    """What is decomposed.
+    """The frame of a capture that is decomposed.
 
     Attributes:
         cloud: Gaussians with captured radiance, axes "rfu".
-        views: What was captured, scene-linear.
+        views: Photographs, scene-linear.
         environment: The light of the capture.
-        raster: How the Gaussians were fitted.
-        capture: Where truth may be.
-        frame: Its number there.
-        name: What to call it.
+        raster: Options under which the Gaussians were fitted.
+        capture: The capture, which may have truth.
+        frame: Number of the frame in the capture.
+        name: Name of the subject in the chart's title.
         ceiling: Largest value that the images can hold.
     """
 
@@ -95,14 +95,14 @@ class MaterialsSubject:
 def materials_study(
     subject: MaterialsSubject, plan: MaterialsPlan | None = None, *, device: str | None = None
 ) -> Study:
-    """Prepare the materials study: scene, light, what views show, and what errors are against.
+    """Prepare the materials study: scene, light, what views show, and the reference of its errors.
 
     With exact channels in the capture's test views, errors are against the truth: noise, what the method leaves out,
     and the error of the reconstruction together. Without, they are against many rays with the default settings.
 
     Args:
         subject: What is decomposed.
-        plan: What to measure; None takes everything there is.
+        plan: Settings to measure; None takes all.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
     Raises:
@@ -115,7 +115,7 @@ def materials_study(
         Axis("rays", "Rays", chosen.rays, "rays", "Rays a Gaussian; a pixel's for occlusion, and twice for light."),
         *(Axis(name, name.capitalize(), levels, "", _SENTENCES[name]) for name, levels in chosen.axes().items()),
     )
-    described = Subject(
+    described = StudySubject(
         name="materials",
         title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians",
         axes=axes,
@@ -170,7 +170,7 @@ _SENTENCES = {
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """What settings of one offset and one kind of observation share, and how long it took to make [s]."""
+    """Evidence and points that settings of one offset and kind of observation share, and the time to make them [s]."""
 
     evidence: ViewEvidence
     points: SurfacePoints
@@ -178,7 +178,7 @@ class _Prepared:
 
 
 class _Bench:
-    """Everything that settings are measured on."""
+    """The subject, light and reference on which settings are measured."""
 
     def __init__(self, subject: MaterialsSubject, plan: MaterialsPlan, device: Any) -> None:
         """Prepare the light and the reference."""
@@ -231,7 +231,7 @@ class _Bench:
             seconds.append(common + time.perf_counter() - started)
             for name, part in self.reference.squares(color, openness).items():
                 squares.setdefault(name, []).append(part)
-        errors = {name: interval_of(np.mean(parts, axis=0)) for name, parts in squares.items()}
+        errors = {name: Interval.of_root_mean_square(*np.mean(parts, axis=0).T) for name, parts in squares.items()}
         if not self._changes_occlusion(settings):
             del errors[OCCLUSION]
         return Row(settings, Interval.of_median(seconds), errors)

@@ -1,4 +1,4 @@
-"""Which ways to decompose the materials study compares: levels of each factor, and which of them are crossed."""
+"""The plan of the materials study: levels of each factor of decomposing, and which of them are crossed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DIRECT_AXES = ("sampler", "offset", "density", "ratio", "bounce", "weight", "fit
 
 @dataclass(frozen=True)
 class MaterialsPlan:
-    """Which settings to measure, and how well.
+    """The settings to measure, and how well.
 
     Attributes:
         paths: ``direct``: rays from every Gaussian. ``images``: rays from every pixel, baked; the paper's.
@@ -37,7 +37,7 @@ class MaterialsPlan:
         fits: Whether views that disagree with the others count little (``robust``) or as they are (``plain``).
         observed: What views show of a Gaussian: its fitted radiance plus the ``difference`` to the image, spread back,
             or the ``images`` themselves spread back.
-        denoisers: Of the path by images.
+        denoisers: Denoisers of the path by images.
         rays: Rays a Gaussian, or a pixel's occlusion, rising.
         reference_rays: Rays a Gaussian of the reference, where there is no truth.
         repeats: Timed calls a setting, each with samples of its own.
@@ -75,15 +75,15 @@ class MaterialsPlan:
         ):
             for value in getattr(self, name):
                 require_choice(name, value, choices)
-            _require_different(name, getattr(self, name))
         object.__setattr__(self, "offsets", tuple(map(offset_label, self.offsets)))
-        _require_different("offsets", self.offsets)
         for label in self.offsets:
             if parse_offset(label)[0] == "thicknesses":
                 raise InvalidOptionError(f"offsets must be auto or metres such as 0.02, got {label!r}. Choose those.")
         for count in self.rays:
             require_count("rays", count, 4, 4096)
-        _require_different("rays", self.rays)
+        for name, values in vars(self).items():
+            if isinstance(values, tuple) and (not values or len(set(values)) < len(values)):
+                raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
         object.__setattr__(self, "rays", tuple(sorted(self.rays)))
         require_count("reference_rays", self.reference_rays, 4, 4096)
         require_count("repeats", self.repeats, 1, 100)
@@ -124,8 +124,3 @@ class MaterialsPlan:
             found += [{**default, "denoiser": denoiser} for denoiser in self.denoisers[1:]]
             found += [{**default, "offset": offset} for offset in metres[1:]]
         return found
-
-
-def _require_different(name: str, values: tuple[object, ...]) -> None:
-    if not values or len(set(values)) < len(values):
-        raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")

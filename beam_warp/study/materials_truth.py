@@ -1,4 +1,4 @@
-"""What the materials study compares with: exact channels of views that nothing was fitted to, or many rays."""
+"""References of the materials study: exact channels of views to which nothing was fitted, or many rays."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.metrics import SOLID_ALPHA, block_means
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
-from beam_warp.study.table import CONFIDENCE, RESAMPLES, Interval
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
 BLOCK = 8
-"""Side of the squares of pixels that an interval is over [pixel]: errors of neighbours are no news."""
+"""Side of the blocks of pixels that an interval resamples [pixel]: errors of neighbours depend on each other."""
 
 OCCLUSION, COLOR = "occlusion_error", "color_error"
 
 
 class Reference(Protocol):
-    """Something that materials are compared with."""
+    """A reference that materials are compared with."""
 
     @property
     def note(self) -> str:
-        """What it is, in words."""
+        """The reference in words."""
         ...
 
     def squares(
@@ -39,8 +38,8 @@ class Reference(Protocol):
         """Return sums of squared errors and their number, over clusters that are independent of each other, ``(K, 2)``.
 
         Args:
-            base_color: Of every Gaussian, ``(N, 3)``.
-            openness: Their ambient occlusion, ``(N,)``.
+            base_color: Base colour of every Gaussian, ``(N, 3)``.
+            openness: Ambient occlusion of every Gaussian, ``(N,)``.
         """
         ...
 
@@ -71,7 +70,7 @@ class TrueViews:
 
         Args:
             cloud: What carries the materials.
-            records: With truth, at least one.
+            records: Records with truth, at least one.
             raster: How splats are drawn.
             samples: Side of the square of samples of a pixel.
             device: Warp device.
@@ -96,7 +95,7 @@ class TrueViews:
 
     @property
     def note(self) -> str:
-        """What it is, in words."""
+        """The reference in words."""
         return f"exact channels of {len(self._views)} test views, where their alpha is above {SOLID_ALPHA}"
 
     def squares(
@@ -117,18 +116,18 @@ class TrueViews:
 
 
 class ManyRays:
-    """What many rays find, per Gaussian: noise is judged, not what the method leaves out."""
+    """Materials by many rays, per Gaussian: noise is judged, not what the method leaves out."""
 
     def __init__(
         self, base_color: NDArray[np.float32], openness: NDArray[np.float32], seen: NDArray[np.bool_], rays: int
     ) -> None:
-        """Keep what was found; only the Gaussians that views show count."""
+        """Keep materials; only the Gaussians that views show count."""
         self._color, self._openness = _encoded(base_color[seen]), openness[seen].astype(np.float64)
         self._seen, self._rays = seen, rays
 
     @property
     def note(self) -> str:
-        """What it is, in words."""
+        """The reference in words."""
         return f"{self._rays:,} rays a Gaussian with the defaults, at the Gaussians that views show: no truth was given"
 
     def squares(
@@ -139,23 +138,6 @@ class ManyRays:
         occlusion = np.square(openness[self._seen] - self._openness)
         one = np.ones(len(color))
         return {OCCLUSION: np.column_stack([occlusion, one]), COLOR: np.column_stack([color, one])}
-
-
-def interval_of(clusters: NDArray[np.float64], *, seed: int = 0) -> Interval:
-    """Return the root of the mean of squares with its percentile bootstrap over clusters (Efron 1979).
-
-    Args:
-        clusters: Sum of squares and their number, ``(K, 2)``.
-        seed: Of the resamples.
-    """
-    kept = clusters[clusters[:, 1] > 0.0]
-    generator = np.random.default_rng(seed)
-    drawn = generator.multinomial(len(kept), np.full(len(kept), 1.0 / len(kept)), size=RESAMPLES)
-    sums = drawn @ kept
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.sqrt(np.quantile(sums[:, 0] / sums[:, 1], [tail, 1.0 - tail]))
-    value = float(np.sqrt(kept[:, 0].sum() / kept[:, 1].sum()))
-    return Interval(value, min(value, float(low)), max(value, float(high)))
 
 
 def _encoded(color: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
-"""What a setting costs and how wrong it is: studies of named factors, measured into a table that can be resumed.
+"""Studies of cost against error over named factors, measured into a table that can be resumed.
 
-A study says which axes there are, which settings to measure and how to measure one. Nothing here knows what is
-measured: tracing, materials and images bring their own axes. `chart_image` and `chart_page` draw the table.
+A study names its axes, the settings to measure, and a function that measures one. Nothing here knows what is measured:
+tracing and materials bring their own axes. `beam_warp.study.picture` and `beam_warp.study.page` draw the table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FORMAT = "beam-chart 1"
 """First words of a table's file; the number changes with the layout."""
 
 TOLERANCE = 0.02
-"""Errors nearer to each other than this part count as equal on a frontier; their intervals are wider by far."""
+"""Errors that differ by less than this part count as equal on a frontier; their intervals are wider by far."""
 
 CONFIDENCE = 0.95
 RESAMPLES = 1000
@@ -41,10 +41,10 @@ PACE = "Pace"
 """Title of the note on how steady the machine was."""
 
 SHAKY = 1.3
-"""Ratio of upper to lower quartile of the costs of one setting within a run above which a chart warns its reader."""
+"""A chart warns its reader if one setting's costs within a run have a ratio of upper to lower quartile above this."""
 
 PROBE_EVERY = 16
-"""Settings between two measurements of the same one: whether the machine kept its pace."""
+"""Settings between two measurements of the first one, which tell whether the machine kept its pace."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Axis:
 
     Attributes:
         name: Column of the table.
-        title: What people read.
-        levels: Its values, the default first; numbers in rising order where they are steps of a ladder.
+        title: Name for people.
+        levels: Values of the factor, the default first; steps of a ladder are numbers in rising order.
         unit: Follows the level in labels, such as ``rays``.
         sentence: One sentence that says what the levels mean.
     """
@@ -75,18 +75,18 @@ class Metric:
     """One kind of error.
 
     Attributes:
-        name: Stem of its three columns: value, low and high.
-        title: What people read.
-        unit: Its unit; empty for a ratio.
+        name: Stem of three columns: value, low and high.
+        title: Name for people.
+        unit: Unit of the error; empty for a ratio.
         color: Axis that colours distinguish; empty for none.
         marker: Axis that marker shapes distinguish.
         line: Axis that line styles distinguish.
-        by: Set for an error that belongs to the levels of this axis alone, whatever a setting costs, such as a bias:
-            it is drawn against those levels, and has no frontier.
-        apart: Axis whose levels have truths of their own: only settings with its first level compete for the frontier,
-            and the others are drawn faintly. Empty for none.
+        by: Axis on whose levels alone the error depends, whatever a setting costs, such as a bias. The error is drawn
+            against those levels and has no frontier. Empty for none.
+        apart: Axis whose levels have truths of their own. Only settings with its first level compete for the frontier;
+            the others are drawn faintly. Empty for none.
         floor: Error of the reference itself; smaller errors cannot be told apart. 0 if there is none.
-        sentence: How to read it.
+        sentence: One sentence that says how to read the error.
     """
 
     name: str
@@ -116,20 +116,26 @@ class Interval:
         return cls(float(np.median(array)), float(array.min()), float(array.max()))
 
     @classmethod
-    def of_root_mean_square(cls, squares: ArrayLike, *, seed: int = 0) -> Interval:
-        """Return the root of the mean of ``(N,)`` squared errors, N independent points.
+    def of_root_mean_square(cls, squares: ArrayLike, sizes: ArrayLike | None = None, *, seed: int = 0) -> Interval:
+        """Return the root of the mean of squared errors, with its percentile bootstrap, `CONFIDENCE` wide.
 
-        The interval is the percentile bootstrap over points, `CONFIDENCE` wide (Efron 1979).
+        Args:
+            squares: Squared errors of N independent points, or their sums over N independent clusters, ``(N,)``.
+            sizes: Number of errors in each cluster, ``(N,)``; None if each is one. Empty clusters are left out.
+            seed: Seed of the resamples.
+
+        Source: Efron 1979.
         """
-        array = np.asarray(squares, np.float64)
+        sums = np.asarray(squares, np.float64)
+        counts = np.ones(len(sums)) if sizes is None else np.asarray(sizes, np.float64)
+        sums, counts = sums[counts > 0.0], counts[counts > 0.0]
         generator = np.random.default_rng(seed)
-        # How often each point is drawn in a resample is multinomial: no index array of resamples × points.
-        counts = generator.multinomial(len(array), np.full(len(array), 1.0 / len(array)), size=RESAMPLES)
-        means = np.sort(counts @ array / len(array))
+        # How often each cluster is drawn in a resample is multinomial: no index array of resamples × clusters.
+        drawn = generator.multinomial(len(sums), np.full(len(sums), 1.0 / len(sums)), size=RESAMPLES)
         tail = (1.0 - CONFIDENCE) / 2.0
-        low, high = np.quantile(means, [tail, 1.0 - tail])
-        value = float(np.sqrt(array.mean()))
-        return cls(value, min(value, float(np.sqrt(low))), max(value, float(np.sqrt(high))))
+        low, high = np.sqrt(np.quantile(drawn @ sums / (drawn @ counts), [tail, 1.0 - tail]))
+        value = float(np.sqrt(sums.sum() / counts.sum()))
+        return cls(value, min(value, float(low)), max(value, float(high)))
 
 
 @dataclass(frozen=True)
@@ -142,22 +148,22 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What a table is about: everything that a drawing needs beside the rows.
+class StudySubject:
+    """The subject of a table: all that a drawing needs beside the rows.
 
     Attributes:
         name: Stem of the files.
         title: One line for the top of the chart.
         axes: Factors, in the order in which labels name them.
         metrics: Errors.
-        cost: What the settings cost, as people read it.
-        cost_unit: Its unit.
+        cost: Name of the cost, for people.
+        cost_unit: Unit of the cost.
         ladder: Axis whose steps are joined by lines.
         notes: Title → text: scene, device, versions, references, what was left out.
         planned: Number of settings in the plan.
 
     Raises:
-        InvalidOptionError: Two columns have one name, or an axis is named that there is none of.
+        InvalidOptionError: Two columns have one name, or an axis is named that does not exist.
     """
 
     name: str
@@ -198,10 +204,10 @@ class Study:
         subject: What is measured.
         plan: Settings, the most telling first: a budget cuts off the end.
         measure: Measures one setting.
-        work: Units of work of one setting, in proportion to the time it takes to measure.
+        work: Returns the work of one setting, in proportion to the time that measuring it takes.
     """
 
-    subject: Subject
+    subject: StudySubject
     plan: Sequence[Settings]
     measure: Callable[[Settings], Row]
     work: Callable[[Settings], int]
@@ -209,9 +215,9 @@ class Study:
 
 @dataclass(frozen=True)
 class Table:
-    """What came out."""
+    """The measured rows of a study."""
 
-    subject: Subject
+    subject: StudySubject
     rows: tuple[Row, ...]
 
     def frontier(self, metric: Metric) -> list[Row]:
@@ -312,7 +318,7 @@ def run_study(
     return table, skipped
 
 
-def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
+def _with_pace(subject: StudySubject, probes: Sequence[float]) -> StudySubject:
     """Return the subject with a note on how the cost of one setting, measured again and again, varied."""
     if len(probes) < 2:
         return subject
@@ -323,7 +329,7 @@ def _with_pace(subject: Subject, probes: Sequence[float]) -> Subject:
     return replace(subject, notes={**subject.notes, PACE: pace})
 
 
-def table_paths(folder: Path, subject: Subject) -> tuple[Path, Path]:
+def table_paths(folder: Path, subject: StudySubject) -> tuple[Path, Path]:
     """Return where a subject's table goes when it is done, and where it is until then."""
     return folder / f"{subject.name}.csv", folder / f"{subject.name}.partial.csv"
 
@@ -344,7 +350,7 @@ def read_table(path: Path) -> Table:
 
     Raises:
         MissingFileError: There is no such file.
-        AssetFormatError: It is no table of ours; the message names the line.
+        AssetFormatError: The file is no table of a study; the message names the line.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -376,14 +382,14 @@ def _malformed(path: Path, line: int, why: str) -> AssetFormatError:
     return AssetFormatError(f"table must be a CSV that beam chart wrote, got {path}:{line}: {why}. Measure it again.")
 
 
-def _subject_of(value: dict[str, Any]) -> Subject:
+def _subject_of(value: dict[str, Any]) -> StudySubject:
     """Return the subject of its JSON form."""
     axes = tuple(Axis(**{**axis, "levels": tuple(axis["levels"])}) for axis in value.pop("axes"))
     metrics = tuple(Metric(**metric) for metric in value.pop("metrics"))
-    return Subject(axes=axes, metrics=metrics, **value)
+    return StudySubject(axes=axes, metrics=metrics, **value)
 
 
-def _earlier_rows(subject: Subject, path: Path) -> list[Row]:
+def _earlier_rows(subject: StudySubject, path: Path) -> list[Row]:
     """Return the rows of a run of the same subject that did not reach its end; none if there is no such table."""
     if not path.exists():
         return []
@@ -396,16 +402,16 @@ def _earlier_rows(subject: Subject, path: Path) -> list[Row]:
     return list(earlier.rows) if unfinished and replace(earlier.subject, notes=notes) == subject else []
 
 
-def _key(subject: Subject, settings: Settings) -> tuple[str, ...]:
+def _key(subject: StudySubject, settings: Settings) -> tuple[str, ...]:
     return tuple(str(settings.get(axis.name, "")) for axis in subject.axes)
 
 
-def _columns(subject: Subject) -> list[str]:
+def _columns(subject: StudySubject) -> list[str]:
     numbers = ["cost", *(metric.name for metric in subject.metrics)]
     return [axis.name for axis in subject.axes] + [name + end for name in numbers for end in ("", "_low", "_high")]
 
 
-def _head(subject: Subject) -> str:
+def _head(subject: StudySubject) -> str:
     return f"# {FORMAT} {json.dumps(asdict(subject), ensure_ascii=False)}\n" + _line(_columns(subject))
 
 
@@ -415,7 +421,7 @@ def _line(cells: Sequence[str]) -> str:
     return buffer.getvalue()
 
 
-def _cells(subject: Subject, row: Row) -> list[str]:
+def _cells(subject: StudySubject, row: Row) -> list[str]:
     unknown = (set(row.settings) - {axis.name for axis in subject.axes}) | (
         set(row.errors) - {metric.name for metric in subject.metrics}
     )
@@ -432,7 +438,7 @@ def _numbers(interval: Interval) -> tuple[float, float, float]:
     return interval.value, interval.low, interval.high
 
 
-def _row(subject: Subject, cells: Sequence[str]) -> Row:
+def _row(subject: StudySubject, cells: Sequence[str]) -> Row:
     """Return a row of its cells; levels are looked up in the axes, so that numbers come back as numbers."""
     columns = _columns(subject)
     if len(cells) != len(columns):

@@ -15,7 +15,7 @@ from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.kernels.common.launching import thread_count
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, Subject
+from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing_plan import DEFAULT_PLAN, TracingPlan
 from beam_warp.study.tracing_truth import Progress, References, find_references
 from beam_warp.trace.incident import irradiance
@@ -75,7 +75,7 @@ def tracing_study(
         cloud, environment, plan, scene, file=references_file, seconds=reference_seconds, progress=progress
     )
     bench = _Bench(plan, references, scene, PreparedEnvironment(environment, target), len(cloud))
-    subject = Subject(
+    subject = StudySubject(
         name="tracing",
         title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {device_name(target)}",
         axes=tracing_axes(plan),

@@ -1,4 +1,4 @@
-"""Gaussians on a known surface, coloured by what views show: geometry without error, to measure what comes after it."""
+"""Gaussians on a known surface, coloured by photographs: geometry without error, to measure the steps that follow."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from beam_warp.world.mesh import vertex_normals
 from beam_warp.world.shapes import Surface, tile
 
 OPACITY = 0.99
-"""What the rasteriser caps alpha at: neighbours that overlap let 0.1 % of the light through."""
+"""Opacity of every Gaussian, the rasteriser's cap of alpha: overlapping neighbours let 0.1 % of the light through."""
 
 FLATNESS = 0.02
 """Thickness over width: thinner than the surface's bend over a Gaussian, so that silhouettes stay where they are."""
 
 COLOR_STEPS = 6
-"""Of conjugate gradients: with the pull below, the residual falls by half or more a step."""
+"""Steps of conjugate gradients: with the pull below, each halves the residual or better."""
 
 PULL = 0.1
-"""Towards the mean of what pixels show around, in parts of the pixels that a Gaussian is worth, or the median one if
-that is more: what is finer than a pixel no image tells, and least squares alone fills it with noise."""
+"""Weight of the pull towards the mean colour of the pixels around, in parts of the pixels that a Gaussian is worth, or
+that the median Gaussian is worth if that is more. No image shows detail finer than a pixel; least squares alone fills
+it with noise."""
 
 NEIGHBORS = 8
-"""Gaussians that mean is over."""
+"""Gaussians over which that mean is taken."""
 
 UNSEEN_PIXELS = 1e-2
-"""Gaussians that are worth fewer, neighbours included, take the colour of the nearest one that is worth more."""
+"""Gaussians worth fewer pixels than this, with their neighbours, take the colour of the nearest that is worth more."""
 
 GROUP_SPLATS = 2**22
 """Most splats, Gaussians times views, that are kept drawn together unless one view has more."""
@@ -109,7 +110,7 @@ def colored_by_views(
         cloud: Gaussians in the internal world.
         views: Scene-linear and premultiplied, at least one.
         options: How splats are drawn.
-        steps: Of conjugate gradients.
+        steps: Steps of conjugate gradients.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
     Returns:

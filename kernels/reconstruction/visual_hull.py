@@ -59,7 +59,9 @@ def mean_focal(view: RasterView) -> float:
 
 
 @wp.func
-def hull_depth(point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], quorum: int, unseen: float) -> float:
+def hull_depth(
+    point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], quorum: int, unseen: float
+) -> float:
     """Depth [m] in the cones: the least of all views that see the point.
 
     A point that fewer than ``quorum`` views see is as far outside as ``unseen`` says.

@@ -21,6 +21,8 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 TINY = replace(
     QUICK,
     perfect_gaussians=600,

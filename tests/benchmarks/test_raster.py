@@ -20,6 +20,8 @@ from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 TINY = benchmark.Effort(
     gaussians=300,
     size=(24, 18),

@@ -10,6 +10,8 @@ from tracing_scenes import FLATNESS
 
 from beam_warp.trace.reference import rotation_matrices
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 
 def sphere(rng, count):
     directions = rng.normal(size=(count, 3))

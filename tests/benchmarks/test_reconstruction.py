@@ -10,11 +10,13 @@ import trimesh
 from reconstruction_captures import halved, refined, texture, textured_meshes, write_large_capture
 from reconstruction_contenders import Contender, follow
 from reconstruction_plot import draw
+from support.tracked_balls import tracked_balls
 
 from beam_warp.device.arrays import resolve_device
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.gaussians import GaussianCloud
+
+pytestmark = pytest.mark.slow  # a benchmark's own tests
 
 COUNT = 800
 
@@ -31,37 +33,27 @@ class FakeSteps:
 
     def __init__(self, capture):
         self.meshes = [read_truth_mesh(capture, frame) for frame in capture.frames]
+        self.clouds = tracked_balls(self.meshes, COUNT, 0.02)
         self.frame = 0
 
     def mesh(self, cloud, cameras):
         """The true mesh whose balls these are."""
-        for frame, mesh in enumerate(self.meshes):
-            if np.array_equal(cloud.positions, self.cloud(frame).positions):
-                return mesh
-        raise AssertionError("not a cloud of these steps")
-
-    def cloud(self, frame):
-        _, faces, weights = trimesh.sample.sample_surface(self.meshes[0], COUNT, return_barycentric=True, seed=2)
-        corners = self.meshes[frame].triangles[faces]
-        return GaussianCloud(
-            positions=np.einsum("nk,nkc->nc", weights, corners),
-            orientations=np.tile((0.0, 0.0, 0.0, 1.0), (COUNT, 1)),
-            scales=np.full((COUNT, 3), 0.02),
-            opacities=np.full(COUNT, 0.95),
-            radiance=np.full((COUNT, 1, 3), (0.2 - 0.5) / 0.28209479177387814),
-            radiance_color_space=LINEAR_REC709,
-            ids=np.arange(COUNT),
+        (found,) = (
+            mesh
+            for mesh, own in zip(self.meshes, self.clouds, strict=True)
+            if np.array_equal(cloud.positions, own.positions)
         )
+        return found
 
     def begin(self, views, progress):
         self.frame = 0
         progress(1, 1, {})
         assert all(view.alpha is not None for view in views)
-        return FakeTrack(self.cloud(self.frame)), {"psnr": 20.0}
+        return FakeTrack(self.clouds[self.frame]), {"psnr": 20.0}
 
     def advance(self, track, views, progress):
         self.frame = min(self.frame + 1, len(self.meshes) - 1)
-        return FakeTrack(self.cloud(self.frame)), {"psnr": 20.0, "lost": ""}
+        return FakeTrack(self.clouds[self.frame]), {"psnr": 20.0, "lost": ""}
 
 
 @pytest.fixture

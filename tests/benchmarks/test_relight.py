@@ -17,6 +17,8 @@ from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
 from beam_warp.world.environment import EnvironmentMap
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 TINY = replace(
     benchmark.QUICK,
     gaussians=300,
@@ -123,7 +125,7 @@ class TestScenes:
 class TestBias:
     @pytest.mark.parametrize("bias", [0.0, 0.3])
     def test_z_scores_find_a_bias_and_no_other(self, rng, bias):
-        """Of normal images: without a bias, a mean of 0, a spread of 1, and tails as Student's t has them."""
+        """Normal images have, without a bias, z-scores of mean 0, spread 1, and the tails of Student's t."""
         few, many = rng.normal(10.0, 1.0, (64, 2000)), rng.normal(10.0 + bias, 0.25, (16, 2000))
         variances = [images.var(axis=0, ddof=1) / len(images) for images in (few, many)]
         found = z_scores([few.mean(axis=0), many.mean(axis=0)], variances, (64, 16))

@@ -27,6 +27,8 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.common.launching import thread_count
 from beam_warp.trace.reference import rotation_matrices, visibility_reference
 
+pytestmark = pytest.mark.slow  # a benchmark's own tests
+
 # As in test_tracing.py: the stop, and float32 rounding of responses.
 VISIBILITY_TOLERANCE = 2e-4
 

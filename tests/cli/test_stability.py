@@ -12,15 +12,12 @@ from beam_warp.cli.stability import Stability
 from beam_warp.cli.stability import stability as run_stability
 from beam_warp.stability import analytic_occlusion
 from beam_warp.stability import capture_cases as stress_captures
-from beam_warp.stability import captures as capture_stability
 from beam_warp.stability import material_cases as stress_materials
-from beam_warp.stability import materials as material_stability
-from beam_warp.stability import relighting as relighting_stability
+from beam_warp.stability import page as stability_page
 from beam_warp.stability import relighting_cases as stress_relighting
 from beam_warp.stability import tracing as stability
 from beam_warp.stability import tracing_cases as stress_cases
-
-BLACK_CAMERA = stress_captures.capture_case_of("black camera")
+from beam_warp.stability.capture_cases.cameras import black_camera
 
 NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 
@@ -29,11 +26,9 @@ NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
 def few_cases(monkeypatch):
     monkeypatch.setattr(stress_cases, "CASES", [stress_cases.case_of(name) for name in NAMES])
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
-    assert capture_stability.CAPTURE_CASES  # imported before: tables name all of them
+    assert stability_page.CAPTURE_CASES  # imported before: tables name all of them
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
-    assert material_stability.MATERIAL_CASES
     monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [])
-    assert relighting_stability.RELIGHTING_CASES
     monkeypatch.setattr(stress_relighting, "RELIGHTING_CASES", [])
     monkeypatch.setattr(analytic_occlusion, "SHAPES", (dataclasses.replace(disc, spacing=0.2),))
 
@@ -93,7 +88,7 @@ def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
 def one_capture(monkeypatch, tiny_capture):
     """A case that is run for real, of as few steps as there can be, on a capture that is there."""
     from beam_warp.stability import reconstruct
-    from beam_warp.stability.capture_cases import StressStudio
+    from beam_warp.stability.capture_cases.studio import StressStudio
 
     class Effort(reconstruct.StressEffort):
         def studio(self, folder, device):
@@ -101,7 +96,7 @@ def one_capture(monkeypatch, tiny_capture):
 
     effort = Effort(size=64, camera_count=6, gaussian_count=300, fit=(4, 2), levels=(1, 1, 1), refinement=1)
     monkeypatch.setattr(reconstruct, "QUICK", effort)
-    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [BLACK_CAMERA])
+    monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [black_camera])
 
 
 def test_captures_alone(one_capture, tmp_path, capsys):
@@ -147,10 +142,10 @@ def test_captures_of_another_device_stand_below(one_capture, tmp_path, capsys):
 
 
 def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
-    from beam_warp.stability.capture_cases import CaptureStress, Detection
+    from beam_warp.stability.capture_cases.case import CaptureStress, Detection
 
     broken = dataclasses.replace(
-        BLACK_CAMERA,
+        black_camera,
         build=lambda at: CaptureStress(capture=at.brief(), required=(Detection("black-image", "train_03"),)),
     )
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [broken])
@@ -161,7 +156,7 @@ def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
 @pytest.fixture
 def one_light(monkeypatch):
     """A case that is refused before it is measured, so that it takes no time."""
-    case = next(case for case in material_stability.MATERIAL_CASES if case.name == "black environment")
+    case = next(case for case in stability_page.MATERIAL_CASES if case.name == "black environment")
     studio = stress_materials.MaterialStudio("cpu", camera_count=2, size=8, samples=1, subdivisions=1)
     monkeypatch.setattr(stress_materials, "MaterialStudio", lambda device: studio)
     monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [case])
@@ -216,7 +211,7 @@ def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
 @pytest.fixture
 def leaking_front(monkeypatch):
     """Two Gaussians: paths hold what is asked, the deferred renderer does not."""
-    cases = relighting_stability.RELIGHTING_CASES
+    cases = stability_page.RELIGHTING_CASES
     case = next(case for case in cases if case.name == "a leaking front before a dark inside")
     monkeypatch.setattr(stress_relighting, "RELIGHTING_CASES", [case])
     return case

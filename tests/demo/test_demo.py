@@ -10,7 +10,7 @@ from PIL import Image
 
 from beam_warp.cli.demo import Demo
 from beam_warp.demo.figure import build_figure
-from beam_warp.demo.from_images import PANEL_HEIGHT, FromImagesOptions, demo_from_images
+from beam_warp.demo.from_images import PANEL_HEIGHT, FromImages, FromImagesOptions, demo_capture, demo_from_images
 from beam_warp.demo.job import DemoOptions, run_demo
 from beam_warp.demo.lights import demo_environments
 from beam_warp.errors import OutputError
@@ -83,9 +83,10 @@ def test_command_and_function_have_the_same_sizes():
     )
 
 
+@pytest.mark.slow
 def test_small_demo_recovers_its_truth(small_demo):
     """Bounds are what 4,000 coarse Gaussians must reach if the chain is sound; wrong axes, light or scale fail them."""
-    out, _, result = small_demo
+    _, _, result = small_demo
     scores = result.report["scores"]
     assert scores["ambient_occlusion"]["solid_psnr"] > 16.0
     assert scores["base_color"]["solid_psnr"] > 16.0
@@ -97,10 +98,9 @@ def test_small_demo_recovers_its_truth(small_demo):
     assert {"roughness", "ids"} <= result.sequence.constant
     # Nothing changes colour; so coarse a reconstruction may say so of a few that it misplaces.
     assert result.report["materials"]["changing_part"] < 0.02
-    for name in ("asset.usda", "report.json", "overview.png", "relit.png", "lights/studio.exr", "lights/sunset.exr"):
-        assert (out / name).stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_small_demo_from_images_recovers_its_truth(small_demo):
     """Bounds are what 1,500 Gaussians must reach on images of 64 x 64 if the chain is sound, from images to relighting.
 
@@ -130,13 +130,39 @@ def test_small_demo_from_images_recovers_its_truth(small_demo):
     assert picture.std() > 20.0
 
 
-def test_demo_takes_up_its_capture_and_refuses_another(small_demo):
+@pytest.mark.slow
+def test_demo_from_images_takes_up_what_it_finished(small_demo):
     out, options, _ = small_demo
     lights = {"studio": demo_environments()["studio"]}
-    images = replace(options.images, frame_count=1)
-    with pytest.raises(OutputError, match=r"folder must be new or empty, got .*capture with content"):
-        demo_from_images(out, images, lights, device="cpu", seed=0, progress=no_progress)
-    before = (out / "capture/transforms.json").stat().st_mtime_ns
     again = demo_from_images(out, options.images, lights, device="cpu", seed=0, progress=no_progress)
-    assert (out / "capture/transforms.json").stat().st_mtime_ns == before
     assert again.result.report["resumed_frames"] == 2
+
+
+def test_demo_takes_up_its_capture_and_refuses_another(tmp_path):
+    options = FromImagesOptions(size=16, frame_count=1, camera_count=2, test_camera_count=1, samples=1)
+    written = demo_capture(tmp_path, options, "cpu", 0, no_progress)
+    before = (tmp_path / "capture/transforms.json").stat().st_mtime_ns
+    assert demo_capture(tmp_path, options, "cpu", 0, no_progress).frames == written.frames
+    assert (tmp_path / "capture/transforms.json").stat().st_mtime_ns == before
+    for other, seed in ((replace(options, samples=2), 0), (options, 1)):
+        with pytest.raises(OutputError, match=r"folder must be new or empty, got .*capture with content"):
+            demo_capture(tmp_path, other, "cpu", seed, no_progress)
+
+
+def test_demo_writes_what_it_says(figure, tmp_path, monkeypatch):
+    """The first half at its smallest, the second made up: files and report. Slow tests say whether scores are good."""
+    monkeypatch.setattr("beam_warp.demo.job.build_figure", lambda: figure)
+    lights = {name: light.resized(16, 32) for name, light in demo_environments().items()}
+    monkeypatch.setattr("beam_warp.demo.job.demo_environments", lambda: lights)
+    made_up = FromImages(tmp_path / "reconstruction.png", None, {"frames": []})
+    monkeypatch.setattr("beam_warp.demo.job.demo_from_images", lambda *args, **options: made_up)
+    stages = []
+    options = DemoOptions(gaussian_count=500, image_height=32, device="cpu")
+    result = run_demo(tmp_path / "demo", options, lambda stage, done, total: stages.append(stage))
+    report = json.loads((tmp_path / "demo/report.json").read_text())
+    assert report["from_images"] == made_up.report
+    assert {"ambient_occlusion", "base_color", "relit_studio", "relit_sunset", "relit_stage"} <= set(report["scores"])
+    assert stages[:3] == ["capture", "path trace truth", "path trace truth"]
+    assert result.sequence[0].is_relightable
+    for name in ("asset.usda", "overview.png", "relit.png", *(f"lights/{name}.exr" for name in lights)):
+        assert (tmp_path / "demo" / name).stat().st_size > 0

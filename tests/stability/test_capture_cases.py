@@ -9,17 +9,20 @@ from scipy.spatial import cKDTree
 from beam_warp.demo.figure import SKELETON
 from beam_warp.errors import InvalidArrayError, MissingFileError
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.stability.capture_cases import (
-    CAPTURE_CASES,
-    Detection,
-    StressStudio,
-    capture_case_of,
-    detections_of,
-    evenly,
-    touching,
-    training_cameras,
-    with_every,
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.capture_cases.alterations import evenly, training_cameras, with_every
+from beam_warp.stability.capture_cases.cameras import (
+    black_camera,
+    camera_that_stops,
+    camera_without_files,
+    eight_cameras,
+    empty_camera,
+    four_cameras,
+    wrong_exposure,
 )
+from beam_warp.stability.capture_cases.case import Detection, detections_of
+from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.capture_cases.subjects import no_texture, object_appears, touching
 
 CAMERA = "train_03"
 """The middle one of six."""
@@ -43,18 +46,18 @@ def records_of(capture, camera):
 
 class TestChanges:
     @pytest.mark.parametrize(
-        ("name", "code", "factors"),
-        [("black camera", "black-image", (0, 0, 0, 1)), ("empty camera", "empty-mask", (0, 0, 0, 0))],
+        ("case", "code", "factors"),
+        [(black_camera, "black-image", (0, 0, 0, 1)), (empty_camera, "empty-mask", (0, 0, 0, 0))],
     )
-    def test_void_camera_is_void_and_others_are_as_they_were(self, studio, tiny_capture, name, code, factors):
-        stress = capture_case_of(name).build(studio)
+    def test_void_camera_is_void_and_others_are_as_they_were(self, studio, tiny_capture, case, code, factors):
+        stress = case.build(studio)
         assert stress.required == (Detection(code, CAMERA),)
         for record, original in zip(stress.capture.records, tiny_capture.records, strict=True):
             changed, known = record.image().linear_rgba(), original.image().linear_rgba()
             assert np.array_equal(changed, known * factors if record.camera_name == CAMERA else known)
 
     def test_wrong_exposure_is_twice_the_light_and_the_same_coverage(self, studio, tiny_capture):
-        capture = capture_case_of("wrong exposure").build(studio).capture
+        capture = wrong_exposure.build(studio).capture
         for record, original in zip(records_of(capture, CAMERA), records_of(tiny_capture, CAMERA), strict=True):
             changed, known = record.image(), original.image()
             assert np.array_equal(changed.rgb(), 2.0 * known.rgb())
@@ -62,25 +65,25 @@ class TestChanges:
         assert sum(type(a) is not type(b) for a, b in zip(capture.records, tiny_capture.records, strict=True)) == 2
 
     def test_camera_without_files_is_listed_and_unreadable(self, studio):
-        stress = capture_case_of("camera without files").build(studio)
+        stress = camera_without_files.build(studio)
         assert stress.may_refuse
         assert len(stress.capture.records) == 14
         with pytest.raises(MissingFileError):
             records_of(stress.capture, CAMERA)[0].image()
 
     def test_camera_that_stops_is_there_in_the_first_frame_only(self, studio):
-        capture = capture_case_of("camera that stops").build(studio).capture
+        capture = camera_that_stops.build(studio).capture
         assert [record.frame for record in records_of(capture, CAMERA)] == [0]
         assert len(capture.records) == 13
 
     def test_few_cameras_keep_the_test_views(self, studio):
-        capture = capture_case_of("4 cameras").build(studio).capture
+        capture = four_cameras.build(studio).capture
         assert training_cameras(capture) == ("train_00", "train_01", "train_03", "train_04")
         assert len(capture.select(split="test")) == 2
 
     def test_more_cameras_than_there_are_is_refused(self, studio):
         with pytest.raises(InvalidArrayError, match="capture must have 8 training cameras, got 6"):
-            capture_case_of("8 cameras").build(studio)
+            eight_cameras.build(studio)
 
     def test_left_out_frames_keep_numbers_and_times_of_the_others(self, tiny_capture):
         with pytest.raises(InvalidArrayError, match="capture must have more than 2 frames"):
@@ -94,11 +97,11 @@ class TestChanges:
 
 class TestTraced:
     def test_figure_without_texture_has_one_color(self, tracing_studio):
-        capture = capture_case_of("no texture").build(tracing_studio).capture
+        capture = no_texture.build(tracing_studio).capture
         truth = capture.select(split="test")[0].truth()
         solid = truth.channels["A"] > 0.999
         np.testing.assert_allclose(truth.stack("base_color.R", "base_color.G")[solid], 0.35, rtol=1e-6)
-        assert capture_case_of("no texture").build(tracing_studio).capture is capture  # traced once
+        assert no_texture.build(tracing_studio).capture is capture  # traced once
 
     def test_hands_touch_the_dress_in_the_last_frame_only(self, tracing_studio):
         figure = tracing_studio.figure
@@ -113,7 +116,7 @@ class TestTraced:
             assert distances[-1] < 0.018  # the side of a cell: the surfaces meet
 
     def test_the_object_is_there_from_its_frame_on(self, tracing_studio):
-        stress = capture_case_of("an object appears").build(tracing_studio)
+        stress = object_appears.build(tracing_studio)
         assert stress.required == (Detection("new-surface", frame=1),)
         before, after = (read_truth_mesh(stress.capture, frame) for frame in (0, 1))
         assert len(after.vertices) == len(before.vertices) + 2562

@@ -1,19 +1,21 @@
 """The runner of stress captures, on reconstructions that are made up: each judgement is met and missed once."""
 
 import json
+from functools import partial
 
-import numpy as np
 import pytest
-import trimesh
+from support.tracked_balls import tracked_balls
 
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.stability.capture_cases import CAPTURE_CASES, Detection, StressStudio, capture_case_of
-from beam_warp.stability.captures import Reconstructed, markdown_table, run_capture_case, run_capture_cases
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-
-COUNT = 3000
+from beam_warp.stability.capture_cases import CAPTURE_CASES
+from beam_warp.stability.capture_cases.cameras import black_camera, camera_without_files, four_cameras, wrong_exposure
+from beam_warp.stability.capture_cases.case import Detection
+from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.capture_cases.subjects import as_it_is
+from beam_warp.stability.captures import TITLES, Reconstructed, cells, run_capture_case, run_capture_cases
+from beam_warp.stability.page import case_table
+from beam_warp.world.gaussians import GaussianSequence
 
 
 @pytest.fixture
@@ -22,24 +24,10 @@ def studio(tiny_capture, tmp_path):
 
 
 def tracked(capture, dim_from=None):
-    """Grey discs on the truth that follow it; black from some frame on if asked for."""
+    """Grey balls on the truth that follow it; black from some frame on if asked for."""
+    levels = [0.0 if dim_from is not None and index >= dim_from else 0.2 for index in range(len(capture.frames))]
     meshes = [read_truth_mesh(capture, frame) for frame in capture.frames]
-    _, faces, weights = trimesh.sample.sample_surface(meshes[0], COUNT, return_barycentric=True, seed=2)
-    clouds = []
-    for index, mesh in enumerate(meshes):
-        level = 0.0 if dim_from is not None and index >= dim_from else 0.2
-        clouds.append(
-            GaussianCloud(
-                positions=np.einsum("nk,nkc->nc", weights, mesh.triangles[faces]),
-                orientations=np.tile((0.0, 0.0, 0.0, 1.0), (COUNT, 1)),
-                scales=np.full((COUNT, 3), 0.012),
-                opacities=np.full(COUNT, 0.95),
-                radiance=np.full((COUNT, 1, 3), (level - 0.5) / 0.28209479177387814),
-                radiance_color_space=LINEAR_REC709,
-                ids=np.arange(COUNT),
-            )
-        )
-    return GaussianSequence.from_clouds(clouds)
+    return GaussianSequence.from_clouds(tracked_balls(meshes, 3000, 0.012, levels))
 
 
 def finding(*findings, key_frames=(0,), dim_from=None):
@@ -48,13 +36,13 @@ def finding(*findings, key_frames=(0,), dim_from=None):
     )
 
 
-def run(studio, name, reconstruct):
-    return run_capture_case(reconstruct, studio, capture_case_of(name))
+def run(studio, case, reconstruct):
+    return run_capture_case(reconstruct, studio, case)
 
 
 class TestJudgement:
     def test_a_sound_capture_reconstructed_is_well(self, studio):
-        outcome = run(studio, "as it is", finding())
+        outcome = run(studio, as_it_is, finding())
         assert outcome.passed
         assert (outcome.frames, outcome.cameras, outcome.device) == (2, 6, "cpu")
         assert outcome.first["psnr"] == pytest.approx(outcome.last["psnr"], abs=1.0)
@@ -63,46 +51,46 @@ class TestJudgement:
         assert outcome.drift["vertices"]["mean_mm"] < 6.0
 
     def test_what_is_found_where_nothing_is_wrong_is_a_fault(self, studio):
-        outcome = run(studio, "as it is", finding(Detection("tracking-lost", frame=1)))
+        outcome = run(studio, as_it_is, finding(Detection("tracking-lost", frame=1)))
         assert outcome.faults == ("found where nothing is wrong: tracking-lost in frame 1",)
 
     def test_what_must_be_detected_and_is_not_is_a_fault(self, studio):
-        outcome = run(studio, "wrong exposure", finding())
+        outcome = run(studio, wrong_exposure, finding())
         assert outcome.missed == ("camera-exposure of train_03",)
         assert outcome.faults == ("not detected: camera-exposure of train_03",)
 
     def test_what_is_detected_passes(self, studio):
-        assert run(studio, "wrong exposure", finding(Detection("camera-exposure", "train_03"))).passed
-        assert run(studio, "black camera", finding(Detection("black-image", "train_03", 0))).passed
-        assert run(studio, "4 cameras", finding(Detection("few-cameras"))).passed
+        assert run(studio, wrong_exposure, finding(Detection("camera-exposure", "train_03"))).passed
+        assert run(studio, black_camera, finding(Detection("black-image", "train_03", 0))).passed
+        assert run(studio, four_cameras, finding(Detection("few-cameras"))).passed
 
     def test_blaming_a_sound_camera_is_a_fault(self, studio):
         outcome = run(
             studio,
-            "wrong exposure",
+            wrong_exposure,
             finding(Detection("camera-exposure", "train_03"), Detection("camera-exposure", "train_01")),
         )
         assert outcome.faults == ("train_01 is blamed",)
 
     def test_a_loss_must_be_said(self, studio):
-        silent = run(studio, "4 cameras", finding(Detection("few-cameras"), dim_from=1))
+        silent = run(studio, four_cameras, finding(Detection("few-cameras"), dim_from=1))
         assert len(silent.faults) == 1
         assert silent.faults[0].startswith("lost without a word")
         said = finding(Detection("few-cameras"), Detection("tracking-lost", frame=1), key_frames=(0, 1), dim_from=1)
-        assert run(studio, "4 cameras", said).passed
+        assert run(studio, four_cameras, said).passed
 
     def test_frames_that_are_lacking_are_a_fault(self, studio):
         def short(capture):
             return Reconstructed(sequence=GaussianSequence.from_clouds([tracked(capture)[0]]))
 
-        assert run(studio, "as it is", short).faults == ("2 frames must come out, got 1",)
+        assert run(studio, as_it_is, short).faults == ("2 frames must come out, got 1",)
 
     def test_refusal_counts_where_it_is_allowed(self, studio):
         def refuse(capture):
             raise InvalidArrayError("images must be there, got none of train_03. Copy them.")
 
-        assert run(studio, "camera without files", refuse).passed
-        outcome = run(studio, "wrong exposure", refuse)
+        assert run(studio, camera_without_files, refuse).passed
+        outcome = run(studio, wrong_exposure, refuse)
         assert outcome.refused.startswith("images must be there")
         assert not outcome.passed
 
@@ -110,7 +98,7 @@ class TestJudgement:
         def crash(capture):
             raise ZeroDivisionError("by zero")
 
-        assert run(studio, "as it is", crash).faults == ("ended with ZeroDivisionError: by zero",)
+        assert run(studio, as_it_is, crash).faults == ("ended with ZeroDivisionError: by zero",)
 
 
 def test_all_cases_of_a_given_capture_run_and_make_a_table(studio):
@@ -123,7 +111,7 @@ def test_all_cases_of_a_given_capture_run_and_make_a_table(studio):
     assert [outcome.case for outcome in outcomes] == [case.name for case in cases]
     assert seen[-1] == (len(cases), len(cases))
     json.dumps([outcome.as_dict() for outcome in outcomes])
-    table = markdown_table(outcomes).splitlines()
+    table = case_table(TITLES, CAPTURE_CASES, outcomes, partial(cells, outcomes=outcomes)).splitlines()
     assert len(table) == 2 + len(cases)
     assert all(line.count("|") == table[0].count("|") for line in table)
     assert "not detected: black-image of train_03" in table[3]

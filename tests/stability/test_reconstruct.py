@@ -3,9 +3,13 @@
 import json
 
 import numpy as np
+import pytest
 from support.fake_steps import FakeSteps
 
-from beam_warp.stability.capture_cases import Detection, StressStudio, capture_case_of, in_words
+from beam_warp.stability.capture_cases.cameras import wrong_exposure
+from beam_warp.stability.capture_cases.case import Detection, in_words
+from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.capture_cases.subjects import object_appears
 from beam_warp.stability.captures import run_capture_case
 from beam_warp.stability.reconstruct import StressEffort, detections_in, done_in, reconstructing
 
@@ -64,7 +68,6 @@ class TestReports:
 
 def test_changed_images_reach_the_steps(tiny_capture, tmp_path):
     """Records that change their images as they are read are read so by the reconstruction as well."""
-    case = capture_case_of("wrong exposure")
 
     class Looking(FakeSteps):
         def begin(self, views, progress):
@@ -73,7 +76,7 @@ def test_changed_images_reach_the_steps(tiny_capture, tmp_path):
 
     studio = StressStudio(tmp_path, given=tiny_capture, device="cpu")
     first = []
-    for capture in (studio.brief(), case.build(studio).capture):
+    for capture in (studio.brief(), wrong_exposure.build(studio).capture):
         seen = []
         reconstructing(Looking(), tmp_path)(capture)
         first.append(seen[0])
@@ -82,12 +85,11 @@ def test_changed_images_reach_the_steps(tiny_capture, tmp_path):
     assert list(tmp_path.iterdir()) == []  # nothing is left behind
 
 
+@pytest.mark.slow
 class TestRealSteps:
     def test_an_exposure_is_detected_and_undone(self, tiny_capture, tmp_path):
         studio = StressStudio(tmp_path, given=tiny_capture, device="cpu")
-        outcome = run_capture_case(
-            reconstructing(SMALL.steps("cpu"), tmp_path), studio, capture_case_of("wrong exposure")
-        )
+        outcome = run_capture_case(reconstructing(SMALL.steps("cpu"), tmp_path), studio, wrong_exposure)
         assert outcome.passed, outcome.faults
         assert "camera-exposure of train_03 in frame 0, 1" in outcome.detected
         assert "exposure matched" in outcome.done
@@ -96,9 +98,7 @@ class TestRealSteps:
 
     def test_an_object_that_appears_begins_a_segment(self, tmp_path):
         studio = SMALL.studio(tmp_path, "cpu")
-        outcome = run_capture_case(
-            reconstructing(SMALL.steps("cpu"), tmp_path), studio, capture_case_of("an object appears")
-        )
+        outcome = run_capture_case(reconstructing(SMALL.steps("cpu"), tmp_path), studio, object_appears)
         assert outcome.passed, outcome.faults
         assert "new-surface in frame 1" in outcome.detected
         assert outcome.key_frames == (0, 1)

@@ -7,16 +7,17 @@ import pytest
 
 from beam_warp.errors import InvalidArrayError
 from beam_warp.render.deferred import DeferredOptions
+from beam_warp.stability.page import case_table
 from beam_warp.stability.relighting import (
     LARGEST_T,
     SEEDS,
+    TITLES,
     Held,
     RelightingBench,
     RelightingOutcome,
     cells,
     hold,
     image_faults,
-    markdown_table,
     run_relighting_case,
     run_relighting_cases,
 )
@@ -116,7 +117,7 @@ def test_records_and_tables(outcomes):
     for outcome in outcomes.values():
         assert RelightingOutcome.from_dict(outcome.as_dict()) == replace(outcome, seconds=round(outcome.seconds, 3))
         assert all(isinstance(cell, str) and cell for cell in cells(outcome))
-    table = markdown_table(list(outcomes.values()))
+    table = case_table(TITLES, RELIGHTING_CASES, list(outcomes.values()), cells)
     assert table.count("\n") == 2 + len(NAMES) * len(RENDERERS)
     assert table.index("| roughness 0.03 |") < table.index("| roughness 1 |")
 

@@ -23,7 +23,7 @@ from beam_warp.study.table import (
     Metric,
     Row,
     Study,
-    Subject,
+    StudySubject,
     Table,
     pareto_frontier,
     read_table,
@@ -31,7 +31,7 @@ from beam_warp.study.table import (
     write_table,
 )
 
-SUBJECT = Subject(
+SUBJECT = StudySubject(
     name="toy",
     title='Error against time of a toy </script> & "quotes", ‰ of 1/0, on nothing',
     axes=(

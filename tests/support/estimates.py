@@ -4,7 +4,7 @@ import numpy as np
 from scipy import stats
 
 SIGNIFICANCE = 1e-4
-"""Of each check; seeds are fixed, so a failure is a change of code, not bad luck."""
+"""Probability of a false alarm of each check; seeds are fixed, so a failure is a change of code, not bad luck."""
 
 LARGEST_Z = stats.norm.isf(SIGNIFICANCE / 2)
 

@@ -1,0 +1,25 @@
+"""Stress captures: captures on which reconstructions fail, and what must be detected in each.
+
+A case that takes images away or changes their values writes nothing: its records read the given capture's files and
+change them in memory. A case that shows another subject is path traced once, when it is asked for.
+"""
+
+from beam_warp.stability.capture_cases import cameras, subjects
+
+CAPTURE_CASES = [
+    subjects.as_it_is,
+    subjects.every_second_frame,
+    subjects.every_third_frame,
+    subjects.no_texture,
+    subjects.self_contact,
+    cameras.black_camera,
+    cameras.empty_camera,
+    cameras.camera_without_files,
+    cameras.camera_that_stops,
+    cameras.wrong_exposure,
+    cameras.slightly_wrong_exposure,
+    cameras.four_cameras,
+    cameras.eight_cameras,
+    subjects.object_appears,
+]
+"""Every case, in the order of the table; the first is the capture as it is."""
