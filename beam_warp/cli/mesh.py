@@ -19,7 +19,7 @@ from beam_warp._version import __version__
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
+from beam_warp.cli.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes, raster_options
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.image.files import write_png
 from beam_warp.world.axes import change_axes
@@ -80,11 +80,11 @@ class Mesh:
     preview: Annotated[bool, arg(help="Also draw every mesh, as .png.")] = False
     antialiased: Antialiased = None
     low_pass: LowPass = None
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+    source_axes: SourceAxes = None
+    drop_invalid: DropInvalid = False
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def mesh(args: Mesh) -> int:

@@ -23,7 +23,7 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.shot import RenderedImage, Shot
 
 
-class Report(Protocol):
+class RenderProgress(Protocol):
     """Hears how far a stage of the work is."""
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
@@ -67,7 +67,7 @@ class FrameRenderer(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame:
+class FrameRequest:
     """One image to render.
 
     Attributes:
@@ -86,7 +86,7 @@ class Frame:
 
 
 @dataclass(eq=False)
-class Tally:
+class RenderTally:
     """What was done.
 
     Attributes:
@@ -107,19 +107,21 @@ class RenderInterruptedError(KeyboardInterrupt):
 class RenderJob:
     """Renders frames of a stage with one renderer into files of one kind."""
 
-    def __init__(self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: Report) -> None:
+    def __init__(
+        self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress
+    ) -> None:
         """Take what is rendered, by whom, how it is shown, and who wants to know."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
         self._digests = ShotDigests(__version__, renderer.decisive, writer.options)
 
-    def render_stills(self, images: Sequence[tuple[Frame, Path]]) -> Tally:
+    def render_stills(self, images: Sequence[tuple[FrameRequest, Path]]) -> RenderTally:
         """Render single images, writing over what is there; frames in the order of time are read once.
 
         Raises:
             OutputError: One cannot be written.
             RenderInterruptedError: Interrupted; images are whole or not there.
         """
-        tally = Tally()
+        tally = RenderTally()
         try:
             for frame, path in images:
                 self._draw(frame, path, tally)
@@ -131,7 +133,9 @@ class RenderJob:
             raise RenderInterruptedError(done) from error
         return tally
 
-    def render_frames(self, pattern: FramePattern, frames: Sequence[Frame], *, overwrite: bool = False) -> Tally:
+    def render_frames(
+        self, pattern: FramePattern, frames: Sequence[FrameRequest], *, overwrite: bool = False
+    ) -> RenderTally:
         """Render numbered images; those that are there and of this render are kept.
 
         Raises:
@@ -141,7 +145,7 @@ class RenderJob:
         require_folder(pattern)
         log = FrameLog(pattern)
         planned = {frame.number: frame for frame in frames}
-        with _resumable(str(pattern), tally := Tally(), len(planned)):
+        with _resumable(str(pattern), tally := RenderTally(), len(planned)):
             compared = count(1)
 
             def digest_of(number: int) -> str:
@@ -162,8 +166,8 @@ class RenderJob:
         return tally
 
     def render_film(
-        self, film: Film, frames: Sequence[Frame], options: VideoOptions, *, ffmpeg: str, overwrite: bool = False
-    ) -> Tally:
+        self, film: Film, frames: Sequence[FrameRequest], options: VideoOptions, *, ffmpeg: str, overwrite: bool = False
+    ) -> RenderTally:
         """Render the frames of a film beside it, and encode them when all are there.
 
         Raises:
@@ -182,17 +186,17 @@ class RenderJob:
         film.discard_work()
         return tally
 
-    def _pictures(self, work: FramePattern, frames: Sequence[Frame]) -> Iterator[NDArray[np.uint8]]:
+    def _pictures(self, work: FramePattern, frames: Sequence[FrameRequest]) -> Iterator[NDArray[np.uint8]]:
         """Read the frames of a film back."""
         for done, frame in enumerate(frames, start=1):
             yield np.rint(read_image(work.path(frame.number)).rgb() * 255.0).astype(np.uint8)
             self._report("encode", done, len(frames))
 
-    def _shot(self, frame: Frame) -> Shot:
+    def _shot(self, frame: FrameRequest) -> Shot:
         shot = self._stage.shot(frame.time, frame.width, frame.height)
         return shot if frame.camera is None else replace(shot, camera=frame.camera)
 
-    def _draw(self, frame: Frame, path: Path, tally: Tally, shot: Shot | None = None) -> None:
+    def _draw(self, frame: FrameRequest, path: Path, tally: RenderTally, shot: Shot | None = None) -> None:
         """Render an image and write it."""
         seen = self._shot(frame) if shot is None else shot
         total = len(tally.rendered) + len(tally.kept)
@@ -212,7 +216,7 @@ def _checkpoint(path: Path) -> Path:
 
 
 @contextmanager
-def _resumable(name: str, tally: Tally, total: int) -> Iterator[None]:
+def _resumable(name: str, tally: RenderTally, total: int) -> Iterator[None]:
     """Turn an interruption into words about what is there."""
     try:
         yield

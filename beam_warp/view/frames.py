@@ -75,7 +75,7 @@ class Painter(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PagePicture:
     """A picture on its way to a page.
 
     Attributes:
@@ -96,7 +96,7 @@ class FrameLoop:
         self,
         painter: Painter,
         schedule: Schedule,
-        deliver: Callable[[int, Frame], None],
+        deliver: Callable[[int, PagePicture], None],
         report: Callable[[int, Exception], None],
         *,
         clock: Callable[[], float] = time.monotonic,
@@ -225,7 +225,7 @@ class FrameLoop:
                 self._tracings.pop(order.client, None)
         if is_wanted:
             is_last = order.is_last and (order.kind != "traced" or is_over)
-            self._deliver(order.client, Frame(picture, drawn, is_last))
+            self._deliver(order.client, PagePicture(picture, drawn, is_last))
         taken = 1000.0 * (self._clock() - started)
         with self._changed:
             is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find

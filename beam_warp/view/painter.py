@@ -28,7 +28,7 @@ from beam_warp.view.state import (
     NO_GROUND,
     SHADOW_GROUND,
     Color,
-    Subject,
+    SubjectBox,
     ViewState,
     channels_of,
 )
@@ -126,7 +126,7 @@ class CloudPainter:
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
         self._deferred = DeferredPair(self._raster, self._target)
         clouds = self._looked_at()
-        self.subject = Subject.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
+        self.subject = SubjectBox.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
         self.channels = channels_of(next(filter(len, clouds), clouds[0]))
         self._tracer = path_tracer(self._target) if LIT in self.channels else None
         self.can_trace = self._tracer is not None
@@ -238,7 +238,7 @@ class TracedPicture:
         return _lit_picture(self.progress.image(), self.state, self.gaussian_count, self.sample_count)
 
 
-def ground_mesh(subject: Subject, *, catches_shadows: bool) -> ShotMesh:
+def ground_mesh(subject: SubjectBox, *, catches_shadows: bool) -> ShotMesh:
     """Return a horizontal square that a subject stands on."""
     reach = GROUND_REACH * subject.extent
     x, y, _ = subject.center.tolist()

@@ -267,7 +267,7 @@ def srgb_of(color: Color) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class Subject:
+class SubjectBox:
     """The box that the sequence is in, as far as it is known: what cameras frame and lights are placed around.
 
     Attributes:
@@ -279,7 +279,7 @@ class Subject:
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(3, 1.0))
 
     @classmethod
-    def of(cls, points: NDArray[np.float64]) -> Subject:
+    def of(cls, points: NDArray[np.float64]) -> SubjectBox:
         """Return the box of points; a metre around the origin where there are none."""
         return cls(points.min(axis=0), points.max(axis=0)) if len(points) else cls()
 

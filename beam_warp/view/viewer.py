@@ -20,7 +20,7 @@ from beam_warp.errors import BeamError
 from beam_warp.image.files import write_exr
 from beam_warp.image.tone import TRANSFORMS
 from beam_warp.raster.records import RasterOptions
-from beam_warp.view.frames import Frame, FrameLoop, Picture
+from beam_warp.view.frames import FrameLoop, PagePicture, Picture
 from beam_warp.view.lamps import Lamps
 from beam_warp.view.painter import CloudPainter
 from beam_warp.view.schedule import LONGEST_SIDE, Pace, Schedule
@@ -34,7 +34,7 @@ from beam_warp.view.state import (
     SHADOW_GROUND,
     TRACED,
     Playback,
-    Subject,
+    SubjectBox,
     Viewpoint,
     ViewState,
     number_within,
@@ -198,7 +198,7 @@ class Viewer:
         self._pages.pop(client.client_id, None)
         self._loop.leave(client.client_id)
 
-    def _deliver(self, client: int, frame: Frame) -> None:
+    def _deliver(self, client: int, frame: PagePicture) -> None:
         page = self._pages.get(client)
         if page is not None:
             page.show(frame)
@@ -233,7 +233,7 @@ class _Page:
         """Take note of where the page looks from."""
         self._loop.look(self._client.client_id, _viewpoint(camera))
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: PagePicture) -> None:
         """Show a picture."""
         picture = frame.picture
         if frame.is_last:
@@ -439,13 +439,13 @@ def _possible(state: ViewState, painter: CloudPainter) -> ViewState:
     )
 
 
-def _framing(subject: Subject) -> Camera:
+def _framing(subject: SubjectBox) -> Camera:
     """Return the camera that frames a subject from the front, in a square."""
     corners = np.array(np.meshgrid(*zip(subject.low, subject.high, strict=True))).reshape(3, -1).T
     return Camera.frame_points(corners, elevation=ELEVATION, width=512, height=512, vertical_fov=FIELD_OF_VIEW)
 
 
-def _place_camera(server: viser.ViserServer, subject: Subject) -> None:
+def _place_camera(server: viser.ViserServer, subject: SubjectBox) -> None:
     """Say where new pages look from."""
     camera = _framing(subject)
     server.initial_camera.fov = float(np.radians(FIELD_OF_VIEW))
