@@ -194,7 +194,7 @@ class _ChannelDrawing:
             write_exr(view.path, seen.layers())
 
     def facts(self) -> dict[str, Any]:
-        """Return what JSON says of it besides: the range of numbers, or the flags' shares of what is seen."""
+        """Return the facts for JSON: the range of numbers, or the flags' shares of what is seen."""
         said: dict[str, Any] = {"channel": self._name}
         if self._shares:
             said["flags"] = {word: float(np.mean([image[word] for image in self._shares])) for word in self._shares[0]}

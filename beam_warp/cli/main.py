@@ -28,7 +28,7 @@ class Command(NamedTuple):
 
     Attributes:
         record: Name of the dataclass of its options, in the module ``beam_warp.cli.<word>``.
-        line: What it does, in a line.
+        line: Description of the command in a line.
     """
 
     record: str

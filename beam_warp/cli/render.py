@@ -30,7 +30,7 @@ from beam_warp.world.metadata import numbers_of_frames
 DEFAULT_SAMPLES = 2
 """Side of the square of samples of a pixel where ``--samples`` is not given.
 
-A capture's images, and truth, are averages over a pixel. One sample in its middle costs an asset up to 7 dB of base
+Images of a capture, and truth, are averages over a pixel. One sample in its middle costs an asset up to 7 dB of base
 colour against them; more than 2 x 2 samples gain little (docs/evaluation.md).
 """
 

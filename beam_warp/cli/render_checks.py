@@ -1,4 +1,4 @@
-"""Options of ``beam render`` and ``beam channel`` that contradict each other; asked before anything is read."""
+"""Checks of ``beam render`` and ``beam channel``: options that contradict each other, before anything is read."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ def kind_of(target: Target) -> str:
 
 
 def refuse(record: Any, when: str, names: Iterable[str] | None = None, *, why: str) -> None:
-    """Refuse options of a record that say nothing in this place.
+    """Refuse options of a record that have no meaning beside others.
 
     Args:
         record: Options, of which those that differ from their defaults were given.
-        when: Where they say nothing.
+        when: Circumstance in which they have no meaning.
         names: Which of the options; all of them without.
-        why: What follows in the message.
+        why: Explanation at the end of the message.
     """
     usual = {field.name: field.default for field in fields(record)}
     given = [name for name in names or usual if getattr(record, name) != usual[name]]

@@ -1,4 +1,4 @@
-"""The stage that ``beam render`` shows: assets or a stage's file, and what the command line says instead."""
+"""The stage that ``beam render`` shows: assets or a stage's file, with the overrides of the command line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PacedPath:
     """A camera path by the film's seconds, on a stage that plays at another speed.
 
     Attributes:
-        path: By the film's seconds.
+        path: Camera path by the film's seconds.
         speed: Seconds of the stage in one of the film.
     """
 
@@ -39,7 +39,7 @@ class PacedPath:
 
     @property
     def duration(self) -> float | None:
-        """When it has arrived, in seconds of the stage."""
+        """Time at which the camera has arrived, in seconds of the stage."""
         return None if self.path.duration is None else self.path.duration * self.speed
 
     def camera_at(self, time: float, width: int, height: int) -> Camera:

@@ -11,7 +11,8 @@ import numpy as np
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.render_flags import StillCameraFlags
-from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.errors import InvalidOptionError
+from beam_warp.jobs.store import make_folders
 from beam_warp.world.camera import MAX_SIDE, Camera, bulk
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -80,23 +81,9 @@ def capture_views(
     bent = sum(record.is_distorted for record in within)
     if bent:
         notes.append(f"{bent} records were photographed through a lens that bends lines: drawn as undistorted images")
-    make_folder(out)
+    make_folders(out)
     views = [PlannedView(place[record.frame], record.camera, out / f"{record.name}.{suffix}") for record in within]
     return sorted(views, key=lambda view: view.frame), notes
-
-
-def make_folder(out: Path) -> None:
-    """Make a folder for results, if its parent exists.
-
-    Raises:
-        OutputError: It cannot be made.
-    """
-    try:
-        out.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"out must be a folder that can be made, got {out} ({error.strerror}). Name another."
-        ) from error
 
 
 def image_size(camera: StillCameraFlags) -> tuple[int, int]:

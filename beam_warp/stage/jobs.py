@@ -1,4 +1,4 @@
-"""Rendering many images: which are to be done, one after the other, and what is left when it is interrupted."""
+"""Rendering of many images: which ones are missing, one after the other, and what an interruption leaves."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from beam_warp.world.shot import RenderedImage, Shot
 
 
 class RenderProgress(Protocol):
-    """Hears how far a stage of the work is."""
+    """Called as the work goes on."""
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
 
 
 class ShotSource(Protocol):
-    """What is rendered, over time: a `beam_warp.stage.stage.Stage`."""
+    """Source of shots over time: a `beam_warp.stage.stage.Stage`."""
 
     def shot(self, time: float, width: int, height: int) -> Shot:
         """Return what is to be rendered at a time [s], for an image of a size [pixel]."""
@@ -40,12 +40,12 @@ class ShotSource(Protocol):
 
 @dataclass(frozen=True)
 class FrameContext:
-    """What a renderer may use besides the shot.
+    """Facts about a frame that a renderer may use besides the shot.
 
     Attributes:
-        number: Of the frame in its sequence.
-        checkpoint: Where it may keep what is done of it.
-        report: Told (samples done, samples at most) of a frame that takes long.
+        number: Number of the frame in its sequence.
+        checkpoint: File in which the renderer may keep an unfinished image.
+        report: Called with (samples done, samples at most) while a frame takes long.
     """
 
     number: int
@@ -58,7 +58,7 @@ class FrameRenderer(Protocol):
 
     @property
     def decisive(self) -> tuple[Any, ...]:
-        """Plain data that decides the images besides their shots."""
+        """Plain data that, with the shots, decides the images."""
         ...
 
     def draw(self, shot: Shot, context: FrameContext) -> RenderedImage:
@@ -71,11 +71,11 @@ class FrameRequest:
     """One image to render.
 
     Attributes:
-        number: In its sequence.
-        time: On the stage [s].
-        width: Of the image [pixel].
-        height: Of the image [pixel].
-        camera: Who looks, instead of the stage's own camera.
+        number: Number of the image in its sequence.
+        time: Time on the stage [s].
+        width: Width of the image [pixel].
+        height: Height of the image [pixel].
+        camera: Camera to use instead of the stage's own.
     """
 
     number: int
@@ -87,12 +87,12 @@ class FrameRequest:
 
 @dataclass(eq=False)
 class RenderTally:
-    """What was done.
+    """Images that a job rendered, and those that it kept.
 
     Attributes:
         rendered: Numbers of the frames that were rendered now, in order.
-        kept: Numbers of those that were there.
-        gaussian_count: Most Gaussians of an image that was rendered now.
+        kept: Numbers of the frames that were there already.
+        gaussian_count: Largest number of Gaussians in an image that was rendered now.
     """
 
     rendered: list[int] = field(default_factory=list)
@@ -110,7 +110,7 @@ class RenderJob:
     def __init__(
         self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress
     ) -> None:
-        """Take what is rendered, by whom, how it is shown, and who wants to know."""
+        """Take the stage, the renderer, the writer of images, and a callback for progress."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
         self._digests = ShotDigests(__version__, renderer.decisive, writer.options)
 

@@ -1,4 +1,4 @@
-"""Either renderer at work on the frames of a sequence: what it is told of a frame, and what decides its images."""
+"""Both renderers as renderers of the frames of a sequence; see `beam_warp.stage.jobs.FrameRenderer`."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ class Lamps:
         """Make the controls, without any light.
 
         Args:
-            server: Where controls and handles are shown; controls go into the container that is open.
-            subject: What lights are placed around.
+            server: Server that shows controls and handles; controls go into the container that is open.
+            subject: Box that lights are placed around.
             changed: Takes the lights whenever one changes.
         """
         self._server = server

@@ -1,4 +1,4 @@
-"""Pictures of what a viewer looks at: frames are read when they are wanted, light is made ready when it is chosen."""
+"""Pictures of a viewer's state: frames are read when they are wanted, light is prepared when it is chosen."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CACHED_LIGHTS = 4
 """Environments that are kept."""
 
 LEGEND_WIDTH = 300
-"""Of legends beside a picture [pixel]."""
+"""Width of legends beside a picture [pixel]."""
 
 GROUND_REACH = 6.0
 """Half the side of the ground over the subject's diagonal."""
@@ -62,8 +62,8 @@ class FrameCache:
         """Start with none.
 
         Args:
-            sequence: Where frames are read from.
-            capacity: Of what is kept [byte]; the latest frame is kept whatever its size.
+            sequence: Sequence that frames are read from.
+            capacity: Size of the frames that are kept [byte]; the latest one is kept whatever its size.
         """
         self.sequence = sequence
         self._capacity = capacity
@@ -91,9 +91,9 @@ class CloudPainter:
 
     Attributes:
         subject: The box that the first, the middle and the last frame are in.
-        channels: What can be shown of it.
+        channels: Channels that can be shown.
         can_trace: Whether paths can be traced.
-        device: What draws.
+        device: Name of the device that draws.
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class CloudPainter:
         """Read the first frame.
 
         Args:
-            sequence: What is drawn.
-            environments: By name, what reads or makes a light.
+            sequence: Gaussians to draw.
+            environments: Functions that read or make a light, by its name.
             raster: How splats are drawn; as the sequence says by default.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 

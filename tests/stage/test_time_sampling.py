@@ -159,7 +159,7 @@ class TestBetweenFrames:
         assert not np.shares_memory(got.positions, first.positions)
         assert sampler.at(0) is first
         assert sampler.at(1) is second
-        assert sampler.at_seconds(1 / 30.0) is second
+        assert sampler.at(1 / 30.0 * 30.0) is second
         assert sampler.at(1.0 - 1e-9) is second
 
     def test_equal_values_stay_bit_for_bit(self):
