@@ -5,7 +5,7 @@ import io
 import pytest
 import warp as wp
 
-from beam_warp.cli.console import COMPILING, progress
+from beam_warp.cli.console import COMPILING, progress, rate_in_words
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.compilation import compilation_heard
 
@@ -57,6 +57,7 @@ def test_compilation_is_told_once(tmp_path):
 
 def test_a_terminal_shows_it_and_nothing_else_does(tmp_path, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
     kernel = fresh_kernel()
     for stream, quiet, is_shown in (
         (Terminal(), False, True),
@@ -68,6 +69,15 @@ def test_a_terminal_shows_it_and_nothing_else_does(tmp_path, monkeypatch):
             path.unlink()
         kernel.module.unload()
         with progress(quiet) as report:
-            report("render", 1, 2)
+            report("fit", 50, 100, "frame 0, 31.25 dB")
+            report("fit", 1, 100, "frame 1, 12.00 dB")
+            report("write asset", 1, 1)
             launch(kernel)
-        assert (COMPILING.split()[0] in stream.getvalue()) == is_shown, stream.getvalue()
+        assert (COMPILING in stream.getvalue()) == is_shown
+        assert ("frame 1, 12.00 dB" in stream.getvalue()) == is_shown
+
+
+def test_rates():
+    assert rate_in_words(None) == rate_in_words(0.0) == ""
+    assert rate_in_words(12.34) == "12.3/s"
+    assert rate_in_words(0.125) == "8.0 s each"

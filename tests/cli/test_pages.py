@@ -40,6 +40,7 @@ def test_first_pages_are_short_and_second_pages_whole(words, capsys):
     assert options_of(first) <= options_of(whole)
     assert first.count(MORE) == (options_of(first) != options_of(whole))
     assert MORE not in whole
+    assert f"Example: beam {' '.join(words)}" in " ".join(first.split())
     if words == ["render"]:
         assert len(options_of(whole)) > 40
         for example in ("--frames 0:150 --mode path --out turntable.mp4", "--speed 0.25", "--turns 1"):
