@@ -14,6 +14,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 from beam_warp import converters
 from beam_warp.checks import require_number, require_package
 from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.cli.flags import Device, Json, Quiet, SourceAxes
+from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.study.page import write_page
 from beam_warp.study.picture import write_image
@@ -61,7 +63,7 @@ class TracingChart:
     environment: Annotated[
         Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; a built-in low sun by default.")
     ] = None
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
+    source_axes: SourceAxes = None
     frame: Annotated[int, arg(metavar="N", help="Frame of a sequence, counted from 0.")] = 0
     budget_seconds: Annotated[
         float, arg(metavar="S", help="Time for references and measuring; what does not fit is skipped and counted.")
@@ -93,12 +95,12 @@ class TracingChart:
     points: Annotated[
         int | None, arg(metavar="N", help="Points at which errors are measured; 128 on a CPU, 4096 on a GPU.")
     ] = None
-    reference_rays: Annotated[int, arg(metavar="N", help="Rays per point of the references.")] = 16384
-    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts.")] = 3
-    seed: Annotated[int, arg(help="Chooses the points.")] = 0
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the frontier as JSON.")] = False
+    reference_rays: Annotated[int, arg(metavar="N", help="Rays per point of the references."), SECOND_PAGE] = 16384
+    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts."), SECOND_PAGE] = 3
+    seed: Annotated[int, arg(help="Chooses the points."), SECOND_PAGE] = 0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -163,15 +165,22 @@ class MaterialsChart:
         "fresnel_hv",
     )
     fits: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="robust, plain.")] = ("robust", "plain")
-    observed: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="difference, images.")] = ("difference", "images")
+    observed: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="difference, images."), SECOND_PAGE] = (
+        "difference",
+        "images",
+    )
     denoisers: Annotated[
-        tuple[str, ...], arg(metavar="NAME ...", help="Of the path by images: auto, oidn, bilateral, none.")
+        tuple[str, ...],
+        arg(metavar="NAME ...", help="Of the path by images: auto, oidn, bilateral, none."),
+        SECOND_PAGE,
     ] = ("auto", "none")
-    reference_rays: Annotated[int, arg(metavar="N", help="Of the reference, where there is no truth.")] = 4096
-    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts.")] = 1
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the frontier as JSON.")] = False
+    reference_rays: Annotated[
+        int, arg(metavar="N", help="Rays of the reference, where there is no truth."), SECOND_PAGE
+    ] = 4096
+    repeats: Annotated[int, arg(metavar="N", help="Timed calls a setting; the median counts."), SECOND_PAGE] = 1
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 @dataclass(frozen=True)

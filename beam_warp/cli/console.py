@@ -1,14 +1,17 @@
-"""How every command talks: errors as one line, progress only where somebody watches, JSON on request."""
+"""What every command prints: errors as one line, progress where somebody watches, JSON on request."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, Protocol
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any, Protocol
 
 from beam_warp.errors import BeamError
+
+if TYPE_CHECKING:
+    from beam_warp.device.compilation import CompilationListener
 
 
 def run_command(command: Callable[[], int]) -> int:
@@ -40,7 +43,10 @@ class ProgressCallback(Protocol):
 
 
 SPEED_PERIOD = 600.0
-"""Rates and times left are means over so long a past, in which a step of a minute still counts [s]."""
+"""Time over which rates and times left are averaged, so that a step of a minute still counts [s]."""
+
+COMPILING = "compiling kernels (first run on this machine)"
+"""Stage that is shown while Warp compiles; a warm cache never shows it."""
 
 
 def rate_in_words(steps_per_second: float | None) -> str:
@@ -52,7 +58,10 @@ def rate_in_words(steps_per_second: float | None) -> str:
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[ProgressCallback]:
-    """Show stages with rate and time left on a terminal; do nothing when quiet or not a terminal."""
+    """Show stages with rate and time left on a terminal, and compilation of kernels; nothing when quiet.
+
+    Compilation is shown where Warp has been imported by now.
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, done, total, note="": None
         return
@@ -79,7 +88,7 @@ def progress(quiet: bool) -> Iterator[ProgressCallback]:
     with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
         tasks: dict[str, Any] = {}
 
-        def update(stage: str, done: int, total: int, note: str = "") -> None:
+        def update(stage: str, done: int, total: int | None, note: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total, rate="", note="")
             task = next(t for t in bars.tasks if t.id == tasks[stage])
@@ -87,4 +96,18 @@ def progress(quiet: bool) -> Iterator[ProgressCallback]:
                 bars.reset(tasks[stage])
             bars.update(tasks[stage], completed=done, total=total, rate=rate_in_words(task.speed), note=note)
 
-        yield update
+        def compiling(module_count: int, seconds: float, *, is_running: bool) -> None:
+            update(COMPILING, module_count, None, f"{module_count} module{'s'[: module_count > 1]}, {seconds:.0f} s")
+            bars.update(tasks[COMPILING], visible=is_running)
+
+        with _kernels_heard(compiling):
+            yield update
+
+
+def _kernels_heard(listener: CompilationListener) -> AbstractContextManager[None]:
+    """Tell a listener of kernels that are compiled; do nothing where Warp is not in use: importing it takes long."""
+    if "warp" not in sys.modules:
+        return nullcontext()
+    from beam_warp.device.compilation import compilation_heard
+
+    return compilation_heard(listener)

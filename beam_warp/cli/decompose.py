@@ -13,6 +13,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.environment import EnvironmentMap
 
@@ -48,13 +50,17 @@ class Measuring:
         ),
     ] = None
     roughness_mesh: Annotated[
-        Path | None, arg(metavar="FILE", help="Mesh whose texture coordinates the roughness texture follows.")
+        Path | None,
+        arg(metavar="FILE", help="Mesh whose texture coordinates the roughness texture follows."),
+        SECOND_PAGE,
     ] = None
     samples: Annotated[int, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light.")] = 64
     offset: Annotated[
-        float | Literal["auto"], arg(metavar="M|auto", help="Lift of ray origins off the surface, in metres.")
+        float | Literal["auto"],
+        arg(metavar="M|auto", help="Lift of ray origins off the surface, in metres."),
+        SECOND_PAGE,
     ] = "auto"
-    bounce: Annotated[bool, arg(help="Account for one bounce of light between surfaces.")] = True
+    bounce: Annotated[bool, arg(help="Account for one bounce of light between surfaces."), SECOND_PAGE] = True
 
 
 @dataclass(frozen=True)
@@ -82,10 +88,10 @@ class Decompose:
         arg(help="Rays from every Gaussian (ours), or from every pixel as in the paper: 50 and 100 rays, 2 cm offset."),
     ] = "direct"
     measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
-    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    seed: Seed = 0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def decompose(args: Decompose) -> int:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import Device, Json, Quiet, Seed
 
 ROWS = {
     "ambient_occlusion": "ambient occlusion",
@@ -35,10 +36,10 @@ class Demo:
     frames: Annotated[int, arg(metavar="N", help="Frames of the stand-in.")] = 1
     gaussians: Annotated[int, arg(metavar="N", help="Gaussians of the stand-in, about.")] = 45_000
     height: Annotated[int, arg(metavar="PX", help="Height of the stand-in's images with truth.")] = 300
-    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    seed: Seed = 0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def demo(args: Demo) -> int:

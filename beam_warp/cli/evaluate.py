@@ -13,6 +13,7 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.asset import Evaluation
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     from beam_warp.evaluate.steadiness import Deviation
     from beam_warp.raster.records import RasterOptions
     from beam_warp.world.gaussians import GaussianSequence
-
-ASSET_NAME = "asset.usda"
-"""What `beam run` calls its result."""
 
 TITLES = {
     "ambient_occlusion": "ambient occlusion",
@@ -71,20 +69,17 @@ class Evaluate:
     low_pass: Annotated[
         float | None, arg(metavar="PX2", help="Variance of the pixel filter; else as the asset states, else 0.3.")
     ] = None
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    source_axes: SourceAxes = None
+    drop_invalid: DropInvalid = False
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def evaluate(args: Evaluate) -> int:
     """Score the asset and say what was found."""
     capture = Capture.read(args.truth)
-    inner = args.asset / ASSET_NAME
-    sequence = converters.read(
-        inner if inner.is_file() else args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid
-    )
+    sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
 
     from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
 

@@ -3,46 +3,60 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from typing import Annotated
-
-import tyro
-from tyro.conf import FlagCreatePairsOff, subcommand
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, NamedTuple
 
 from beam_warp._version import __version__
-from beam_warp.cli.chart import Chart, chart
 from beam_warp.cli.console import run_command
-from beam_warp.cli.decompose import Decompose, decompose
-from beam_warp.cli.demo import Demo, demo
-from beam_warp.cli.evaluate import Evaluate, evaluate
-from beam_warp.cli.inspect import Inspect, inspect
-from beam_warp.cli.mesh import Mesh, mesh
-from beam_warp.cli.reconstruct import Reconstruct, reconstruct
-from beam_warp.cli.render import Render, render
-from beam_warp.cli.run import Run, run
-from beam_warp.cli.stability import Stability, stability
-from beam_warp.cli.view import View, view
+from beam_warp.cli.pages import parse
+from beam_warp.errors import InvalidOptionError
 
 _HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.
 
 Example: beam run person.ply --environment studio.hdr --out person
 
+{commands}
+
+`beam COMMAND --help` shows the options of a command.
 See also beam-convert (formats, axes, units) and beam-validate (is an asset valid?).
 """
 
-Command = (
-    Annotated[Run, subcommand("run", prefix_name=False)]
-    | Annotated[Reconstruct, subcommand("reconstruct", prefix_name=False)]
-    | Annotated[Decompose, subcommand("decompose", prefix_name=False)]
-    | Annotated[Render, subcommand("render", prefix_name=False)]
-    | Annotated[View, subcommand("view", prefix_name=False)]
-    | Annotated[Evaluate, subcommand("evaluate", prefix_name=False)]
-    | Annotated[Mesh, subcommand("mesh", prefix_name=False)]
-    | Annotated[Demo, subcommand("demo", prefix_name=False)]
-    | Annotated[Stability, subcommand("stability", prefix_name=False)]
-    | Annotated[Chart, subcommand("chart", prefix_name=False)]
-    | Annotated[Inspect, subcommand("inspect", prefix_name=False)]
-)
+
+class Command(NamedTuple):
+    """One word of ``beam``; its module is imported when the word is used.
+
+    Attributes:
+        record: Name of the dataclass of its options, in the module ``beam_warp.cli.<word>``.
+        line: Description of the command in a line.
+    """
+
+    record: str
+    line: str
+
+    def load(self, word: str) -> tuple[type, Callable[[Any], int]]:
+        """Return the record of its options, and the function that takes it and returns the exit code."""
+        module = import_module(f"beam_warp.cli.{word}")
+        return getattr(module, self.record), getattr(module, word)
+
+
+COMMANDS = {
+    "run": Command("Run", "Make a relightable asset from Gaussians, or all the way from a capture."),
+    "reconstruct": Command("Reconstruct", "Reconstruct a multi-view capture as Gaussians, tracked over time."),
+    "decompose": Command("Decompose", "Find materials of Gaussians, from the images that they were fitted to."),
+    "render": Command("Render", "Relight assets: an image, numbered images or a film."),
+    "channel": Command("DrawChannel", "Draw one array of an asset without light: materials, errors, flags."),
+    "view": Command("ViewCommand", "Look at an asset in the browser, under lights that are moved about."),
+    "evaluate": Command("Evaluate", "Score an asset against a capture whose truth is known."),
+    "mesh": Command("Mesh", "Extract the surface of every frame as a mesh."),
+    "demo": Command("Demo", "Build, capture, decompose, relight and score a small figure."),
+    "stability": Command("Stability", "Run what tracing, reconstruction, materials and relighting may fail on."),
+    "chart": Command("Chart", "Measure error against time on your own data and device."),
+    "inspect": Command("Inspect", "Say what is wrong with a capture before hours are spent on it."),
+}
+
+MOVED = {("render", "--channel"): "beam channel ASSET NAME --out FILE"}
+"""Options that became commands of their own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,25 +65,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words == ["--version"]:
         print(f"beam {__version__}")
         return 0
-    command = tyro.cli(Command, prog="beam", description=_HELP, args=words, config=(FlagCreatePairsOff,))  # type: ignore[arg-type]
-    if isinstance(command, Run):
-        return run_command(lambda: run(command))
-    if isinstance(command, Reconstruct):
-        return run_command(lambda: reconstruct(command))
-    if isinstance(command, Decompose):
-        return run_command(lambda: decompose(command))
-    if isinstance(command, Render):
-        return run_command(lambda: render(command))
-    if isinstance(command, View):
-        return run_command(lambda: view(command))
-    if isinstance(command, Evaluate):
-        return run_command(lambda: evaluate(command))
-    if isinstance(command, Mesh):
-        return run_command(lambda: mesh(command))
-    if isinstance(command, Stability):
-        return run_command(lambda: stability(command))
-    if isinstance(command, Chart):
-        return run_command(lambda: chart(command))
-    if isinstance(command, Inspect):
-        return run_command(lambda: inspect(command))
-    return run_command(lambda: demo(command))
+    if not words or words[0] in ("-h", "--help", "--help-all"):
+        rows = (f"  {word:12} {command.line}" for word, command in COMMANDS.items())
+        print(_HELP.format(commands="\n".join(rows)), end="")
+        return 0 if words else 2
+    return run_command(lambda: _run(words[0], words[1:]))
+
+
+def _run(word: str, words: list[str]) -> int:
+    """Read the options of a command and run it."""
+    if word not in COMMANDS:
+        raise InvalidOptionError(f"command must be one of {', '.join(COMMANDS)}, got {word}. See beam --help.")
+    for (command, option), now in MOVED.items():
+        if word == command and any(given.split("=")[0] == option for given in words):
+            raise InvalidOptionError(f"{option[2:]} must be drawn by a command of its own. Use {now}.")
+    record, function = COMMANDS[word].load(word)
+    return function(parse(record, words, f"beam {word}"))

@@ -18,10 +18,11 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
+from beam_warp.cli.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes, raster_options
 from beam_warp.digests import code_digest
-from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.image.files import write_png
+from beam_warp.errors import InvalidOptionError
+from beam_warp.image.files import replacing, write_png
+from beam_warp.jobs.store import make_folders
 from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
@@ -61,7 +62,7 @@ class Mesh:
     ] = None
     split: Annotated[str, arg(help="Which records of the capture.")] = "train"
     size: Annotated[int, arg(metavar="PX", help="Side of the depth images without --capture.")] = 512
-    format: Annotated[Literal["ply", "obj", "glb"], arg(help="Of the meshes.")] = "ply"
+    format: Annotated[Literal["ply", "obj", "glb"], arg(help="Format of the meshes.")] = "ply"
     voxel: Annotated[
         float | None, arg(metavar="M", help="Edge of a voxel in metres; the width of a pixel by default.")
     ] = None
@@ -80,11 +81,11 @@ class Mesh:
     preview: Annotated[bool, arg(help="Also draw every mesh, as .png.")] = False
     antialiased: Antialiased = None
     low_pass: LowPass = None
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+    source_axes: SourceAxes = None
+    drop_invalid: DropInvalid = False
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def mesh(args: Mesh) -> int:
@@ -101,12 +102,7 @@ def mesh(args: Mesh) -> int:
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     numbers = numbers_of_frames(sequence.metadata, len(sequence))
     cameras_of = {} if capture is None else {n: _capture_cameras(args, capture, numbers[n]) for n in frames}
-    try:
-        args.out.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"out must be a folder that can be made, got {args.out} ({error.strerror}). Name another."
-        ) from error
+    make_folders(args.out)
     reports = []
     with progress(args.quiet or args.json) as report:
         for done, frame in enumerate(frames, start=1):
@@ -169,7 +165,8 @@ def _mesh_frame(
     report |= _write_meshes(args, options, cloud, seen_from, path, canonical)
     report["seconds"] = round(time.perf_counter() - started, 3)
     # Last of all: with it the frame is done.
-    _write_text(path.with_suffix(".json"), json.dumps(report, indent=2, sort_keys=True) + "\n")
+    with replacing(path.with_suffix(".json")) as temporary:
+        temporary.write_text(json.dumps(report, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     return {**report, "kept": False}
 
 
@@ -240,14 +237,6 @@ def _read_report(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Write a text in one step."""
-    from beam_warp.image.files import replacing
-
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _line(report: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.capture.capture import Capture
 from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import Device, Json, Quiet, Seed
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -57,10 +58,10 @@ class Reconstruct:
     part: Annotated[
         str | None, arg(metavar="I/N", help="Only every N-th segment from the I-th on, without the asset.")
     ] = None
-    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    seed: Seed = 0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def reconstruct(args: Reconstruct) -> int:

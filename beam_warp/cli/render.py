@@ -1,167 +1,203 @@
-"""``beam render``: its options; what is to be done is in `beam_warp.cli.render_relit` and `render_channel`."""
+"""``beam render``: options, a stage, a renderer, a plan of images, and the images or the film of that plan."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+import time
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
-
-from beam_warp.cli.drawing import Antialiased, LowPass
+from beam_warp.capture.capture import Capture
+from beam_warp.checks import require_count
+from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import raster_options, stated
 from beam_warp.cli.render_checks import require_consistent
+from beam_warp.cli.render_flags import Render
+from beam_warp.cli.render_stage import Staged, staged
+from beam_warp.cli.render_views import capture_views, image_size
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
+from beam_warp.render.options import LAYERS, DeferredOptions
+from beam_warp.render.path import PathOptions
+from beam_warp.stage.frame_times import FrameTimes, frame_times
+from beam_warp.stage.jobs import FrameRenderer, FrameRequest, RenderJob, RenderTally
+from beam_warp.stage.output import Film, FramePattern, Still, numbered, parse_target
+from beam_warp.stage.pictures import BLACK, PictureOptions, PictureWriter
+from beam_warp.stage.renderers import DeferredFrames, PathFrames
+from beam_warp.stage.stage import Stage
+from beam_warp.world.metadata import numbers_of_frames
+
+DEFAULT_SAMPLES = 2
+"""Side of the square of samples of a pixel where ``--samples`` is not given.
+
+Images of a capture, and truth, are averages over a pixel. One sample in its middle costs an asset up to 7 dB of base
+colour against them; more than 2 x 2 samples gain little (docs/evaluation.md).
+"""
 
 
 @dataclass(frozen=True)
-class Render:
-    """Light relightable assets and draw them: one image, numbered images, or a film; or draw one channel of an asset.
+class RenderPlan:
+    """Images to render, and the files that they go to.
 
-    Without a camera, the asset is framed from the front. Sequences are resumed: frames that are whole and of the same
-    render are kept, whatever stopped it. A film (.mp4) is made by ffmpeg; without one, numbered PNGs are written.
-
-    With --capture, every test record of the capture is drawn into the folder --out as CAMERA_FRAME.exr: with --aov, in
-    the layers and units of the capture's ground truth.
-
-    With --channel, one array is drawn and no light: a .png shows colours as they are, numbers and standard errors by a
-    colour map whose range is printed, observability as the gravest flag of what each pixel sees, counted in the legend;
-    an .exr holds the values. With --capture these are .png.
-
-    See docs/sequences.md.
-
-    An image. Example: beam render person.usdz --environment studio.hdr --orbit 30 10 --out person.png
-
-    A film. Example: beam render person.usdz --environment studio.hdr --frames 0:150 --mode path --out turntable.mp4
-
-    Numbered images. Example: beam render person.usdz --environment studio.hdr --frames 0:150:10 --out frames/%04d.exr
-
-    Slow motion. Example: beam render person.usdz --environment studio.hdr --speed 0.25 --fps 60 --out slow.mp4
-
-    A turntable. Example: beam render person.usdz --environment studio.hdr --turns 1 --seconds 6 --out around.mp4
-
-    Turning light. Example: beam render person.usdz --environment sky.hdr --rotate-per-second 60 --out light.mp4
-
-    A camera path. Example: beam render person.usdz --environment studio.hdr --camera path.usda --out move.mp4
-
-    Lamps and a floor. Example: beam render person.usdz --lights lamps.json --ground plain --view agx --out stage.png
-
-    Several. Example: beam render a.usdz b.usdz --spacing 1 --environment studio.hdr --ground shadows --out both.png
-
-    A stage. Example: beam render stage.json --mode path --target-error 0.004 --denoise auto --out stage.mp4
-
-    One channel. Example: beam render person.usdz --channel base_color_error --out error.png
+    Attributes:
+        requests: One for each image.
+        frames: Numbers that the user is told.
+        outputs: Files that the user is told: one for each image, or the film.
+        target: Film, or names of numbered images; None for single images, which are written over.
+        film: How a film is encoded.
+        ffmpeg: Program that encodes it.
+        notes: What the user should know.
     """
 
-    asset: Annotated[
-        Positional[tuple[Path, ...]],
-        arg(metavar="ASSET ...", help="PLY or USD files, folders of numbered PLY files; or one stage as .json."),
-    ]
-    out: Annotated[
-        Path,
-        arg(metavar="FILE", help=".png, .exr or .mp4; frames/%04d.png for numbers; a folder with --capture."),
-    ]
-    mode: Annotated[
-        Literal["deferred", "path"], arg(help="Deferred shading in real time, or path tracing, which takes its time.")
-    ] = "deferred"
-    environment: Annotated[
-        Path | None, arg(metavar="FILE", help="Lat-long light, .exr or .hdr; by default the capture's or stage's own.")
-    ] = None
-    rotate: Annotated[float, arg(metavar="DEG", help="Turn it about z, counter-clockwise from above.")] = 0.0
-    rotate_per_second: Annotated[float, arg(metavar="DEG", help="Go on turning it as the film plays.")] = 0.0
-    lights: Annotated[Path | None, arg(metavar="FILE", help="Lights as .json: directional, point, spot.")] = None
-    ground: Annotated[
-        Literal["plain", "shadows"] | None, arg(help="A floor under the assets, or only the shadows on it.")
-    ] = None
-    exposure: Annotated[float, arg(metavar="STOPS", help="Brighten what is rendered by powers of two.")] = 0.0
-    view: Annotated[
-        Literal["standard", "aces", "agx", "neutral"],
-        arg(help="How .png and .mp4 show light above white: cut off, or bent by one of these curves."),
-    ] = "standard"
-    background: Annotated[
-        tuple[float, float, float] | Literal["transparent", "environment"],
-        arg(metavar="R G B", help="Display colour behind it, 0 to 1; or the environment; transparent by default."),
-    ] = "transparent"
-    orbit: Annotated[
-        tuple[float, float] | None,
-        arg(metavar="AZIMUTH ELEVATION", help="Frame the asset from here, in degrees; 0 0 looks along +y."),
-    ] = None
-    look_at: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        arg(metavar="EX EY EZ TX TY TZ", help="Camera position and what it looks at, in metres, z up."),
-    ] = None
-    camera: Annotated[Path | None, arg(metavar="FILE", help="Camera path, .json or a USD stage's camera.")] = None
-    turntable: Annotated[
-        float | None, arg(metavar="DEG", help="Go around the asset, so many degrees a second, from --orbit on.")
-    ] = None
-    turns: Annotated[float | None, arg(metavar="N", help="Go around it N times while it plays.")] = None
-    capture: Annotated[Path | None, arg(metavar="DIR", help="Draw from the cameras of this capture.")] = None
-    split: Annotated[str, arg(help="Which records of the capture.")] = "test"
-    frame: Annotated[int | None, arg(metavar="N", help="Only this frame, counted from 0; all by default.")] = None
-    frames: Annotated[
-        str | None,
-        arg(metavar="A:B[:STEP]", help="Only these frames; B is not one of them; --frames=-10: for the last ten."),
-    ] = None
-    seconds: Annotated[float | None, arg(metavar="S", help="How long it plays; all of the asset by default.")] = None
-    fps: Annotated[
-        float | None, arg(metavar="RATE", help="Images a second, blended between frames; the asset's by default.")
-    ] = None
-    speed: Annotated[float | None, arg(metavar="X", help="0.5 plays at half speed, more images for less time.")] = None
-    loop: Annotated[bool, arg(help="Play assets again after their last frame; else that is held.")] = False
-    spacing: Annotated[float | None, arg(metavar="M", help="Put the assets in a row along x, so far apart.")] = None
-    on_ground: Annotated[bool, arg(help="Put the lowest point of every asset at height 0.")] = False
-    width: Annotated[int | None, arg(metavar="PX", help="Image width; 1024 by default.")] = None
-    height: Annotated[int | None, arg(metavar="PX", help="Image height; the width by default.")] = None
-    fov: Annotated[float | None, arg(metavar="DEG", help="Vertical field of view; 35 by default.")] = None
-    spp: Annotated[
-        int | None,
-        arg(metavar="N", help="Path: samples a pixel, at most if there is an error to reach; 64 by default."),
-    ] = None
-    bounces: Annotated[
-        int | None, arg(metavar="N", help="How often light goes from surface to surface; 4 by default, deferred 2.")
-    ] = None
-    target_error: Annotated[
-        float | None,
-        arg(metavar="E", help="Path: stop where noise is below this display value; 0.004 is 8 bits' step."),
-    ] = None
-    denoise: Annotated[
-        Literal["none", "auto", "oidn", "bilateral"] | None, arg(help="Path: take the noise off; none by default.")
-    ] = None
-    seed: Annotated[int | None, arg(metavar="N", help="Path: same seed, same device, same noise; 0 by default.")] = None
-    environment_shadows: Annotated[
-        int | None, arg(metavar="N", help="Deferred: directions from which the environment casts shadows; 0 for none.")
-    ] = None
-    shadow_resolution: Annotated[int | None, arg(metavar="PX", help="Deferred: side of a lamp's shadow map.")] = None
-    antialiased: Antialiased = None
-    low_pass: LowPass = None
-    channel: Annotated[
-        str | None, arg(metavar="NAME", help="Draw this array instead: roughness_error, observability, normals, ….")
-    ] = None
-    range: Annotated[
-        tuple[float, float] | None,
-        arg(
-            metavar="LOW HIGH",
-            help="Ends of the colour map of --channel; by default 0 and what most Gaussians are below.",
-        ),
-    ] = None
-    aov: Annotated[
-        bool,
-        arg(help="Also write base colour, roughness, occlusion, what errors there are of them, normal, depth (.exr)."),
-    ] = False
-    crf: Annotated[int | None, arg(metavar="N", help="Quality of a film, 0 (lossless) to 51; 18 by default.")] = None
-    overwrite: Annotated[bool, arg(help="Replace a film, or numbered images of another render.")] = False
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+    requests: list[FrameRequest]
+    frames: list[int]
+    outputs: list[Path]
+    target: Film | FramePattern | None = None
+    film: VideoOptions = field(default_factory=VideoOptions)
+    ffmpeg: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def render(args: Render) -> int:
-    """Draw what was asked for, and say what was written."""
+    """Render what was asked for, and say what was written."""
     require_consistent(args)
-    if args.channel is not None:
-        from beam_warp.cli.render_channel import render_channel
+    started = time.perf_counter()
+    capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
+    given = staged(args, capture)
+    device = str(resolve_device(args.device))
+    renderer = _renderer(args, given.stage)
+    picture, notes = _picture(args)
+    with progress(args.quiet or args.json) as report:
+        plan = _plan(args, given) if capture is None else _plan_of_capture(args, given.stage, capture)
+        job = RenderJob(given.stage, renderer, PictureWriter(picture), report)
+        tally = _carry_out(plan, job, overwrite=args.output.overwrite)
+    said = list(dict.fromkeys((*given.stage.notes, *notes, *plan.notes)))
+    _say(args, plan, tally, said, device, time.perf_counter() - started)
+    return 0
 
-        return render_channel(args)
-    from beam_warp.cli.render_relit import render_relit
 
-    return render_relit(args)
+def _renderer(args: Render, stage: Stage) -> FrameRenderer:
+    """Make the renderer that was asked for; options that were not given are its own."""
+    if args.mode == "path":
+        path = args.path
+        options = stated(
+            samples=path.spp,
+            bounces=args.bounces,
+            target_error=path.target_error,
+            seed=path.seed,
+            denoiser=path.denoise,
+        )
+        return PathFrames(PathOptions(**options), device=args.device)
+    flags, aov = args.deferred, args.output.aov
+    options = stated(
+        samples=DEFAULT_SAMPLES if flags.samples is None else flags.samples,
+        bounces=args.bounces,
+        environment_shadows=flags.environment_shadows,
+        light_map_size=flags.shadow_resolution,
+    )
+    raster = raster_options(stage.raster_metadata, flags.antialiased, flags.low_pass)
+    shading = DeferredOptions(layers=LAYERS if aov else (), **options)
+    return DeferredFrames(shading, raster=raster, errors=aov, device=args.device)
+
+
+def _picture(args: Render) -> tuple[PictureOptions, list[str]]:
+    """Return how images are shown, and what is to be said of it: a film is never transparent."""
+    output, notes = args.output, []
+    background = output.background
+    if background == "transparent" and args.camera.capture is None and isinstance(parse_target(output.out), Film):
+        background = BLACK
+        notes.append("a film has no transparency: its background is black")
+    options = PictureOptions(view=output.view, exposure=output.exposure, background=background, layers=output.aov)
+    return options, notes
+
+
+def _plan_of_capture(args: Render, stage: Stage, capture: Capture) -> RenderPlan:
+    """Plan an image for every record of the split."""
+    sequence = stage.assets[0].sequence
+    numbers = numbers_of_frames(sequence.metadata, len(sequence))
+    split, frame, out = args.camera.split, args.time.frame, args.output.out
+    views, notes = capture_views(capture, numbers, split=split, frame=frame, out=out, suffix="exr")
+    requests = [
+        FrameRequest(
+            number=index,
+            time=stage.time_of(view.frame),
+            width=view.camera.width,
+            height=view.camera.height,
+            camera=view.camera,
+        )
+        for index, view in enumerate(views)
+    ]
+    frames = sorted({view.frame for view in views})
+    return RenderPlan(requests, frames, [view.path for view in views], notes=tuple(notes))
+
+
+def _plan(args: Render, given: Staged) -> RenderPlan:
+    """Plan one image, numbered ones, or a film."""
+    times = _times(args, given)
+    width, height = image_size(args.camera)
+    frames = list(times.numbers)
+    requests = [
+        FrameRequest(number=number, time=moment, width=width, height=height)
+        for number, moment in zip(times.numbers, times.times, strict=True)
+    ]
+    out, notes = args.output.out, []
+    target = parse_target(out)
+    if isinstance(target, Still) and len(requests) == 1:
+        return RenderPlan(requests, frames, [target.path])
+    if isinstance(target, Film):
+        film, ffmpeg = VideoOptions(frames_per_second=times.rate, **stated(crf=args.output.crf)), find_ffmpeg()
+        if ffmpeg is not None:
+            return RenderPlan(requests, frames, [target.path], target, film, ffmpeg)
+        target = target.instead
+        notes.append(f"there is no ffmpeg to make {out.name}: its frames are {target}. For a film, {INSTALL}")
+    pattern = target if isinstance(target, FramePattern) else numbered(target)
+    outputs = [pattern.path(number) for number in frames]
+    return RenderPlan(requests, frames, outputs, pattern, notes=tuple(notes))
+
+
+def _times(args: Render, given: Staged) -> FrameTimes:
+    """Return which moments are rendered."""
+    count, rate, asked = given.frame_count, given.stage.rate, args.time
+    if asked.frame is not None:
+        number = require_count("frame", asked.frame, 0, count - 1)
+        return FrameTimes((number,), (given.stage.time_of(number),), rate)
+    return frame_times(count, rate, frames=asked.frames, seconds=asked.seconds, fps=asked.fps, speed=asked.speed)
+
+
+def _carry_out(plan: RenderPlan, job: RenderJob, *, overwrite: bool) -> RenderTally:
+    """Render the images of a plan, and encode its film."""
+    if plan.target is None:
+        return job.render_stills(list(zip(plan.requests, plan.outputs, strict=True)))
+    if isinstance(plan.target, Film):
+        return job.render_film(plan.target, plan.requests, plan.film, ffmpeg=plan.ffmpeg, overwrite=overwrite)
+    return job.render_frames(plan.target, plan.requests, overwrite=overwrite)
+
+
+def _say(args: Render, plan: RenderPlan, tally: RenderTally, notes: list[str], device: str, seconds: float) -> None:
+    """Print the result."""
+    outputs = plan.outputs
+    if args.json:
+        print_json(
+            {
+                "outputs": [str(path) for path in outputs],
+                "frames": plan.frames,
+                "rendered": len(tally.rendered),
+                "kept": len(tally.kept),
+                "gaussian_count": tally.gaussian_count,
+                "mode": args.mode,
+                "device": device,
+                "notes": notes,
+                "seconds": round(seconds, 3),
+            }
+        )
+        return
+    if args.quiet:
+        return
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+    last = f" … {outputs[-1].name}" if len(outputs) > 1 else ""
+    count = len(tally.rendered) + len(tally.kept)
+    images = f"{count} images, " if count > 1 else ""
+    kept = f"{len(tally.kept)} of them were there, " if tally.kept else ""
+    gaussians = f"{tally.gaussian_count:,} Gaussians, " if tally.rendered else ""
+    print(f"wrote {outputs[0]}{last}: {images}{kept}{gaussians}{seconds:.2f} s")

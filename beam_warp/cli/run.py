@@ -21,6 +21,8 @@ from beam_warp.cli.decompose import (
     print_warnings,
     run_options,
 )
+from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
+from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
@@ -50,16 +52,16 @@ class Run:
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
     measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
-    source_axes: Annotated[
-        str | None, arg(metavar="CODE", help="Where a PLY's x, y, z point; else its word, else rdf.")
-    ] = None
-    persistent: Annotated[bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames.")] = False
+    source_axes: Annotated[SourceAxes, SECOND_PAGE] = None
+    persistent: Annotated[
+        bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames."), SECOND_PAGE
+    ] = False
     fps: Annotated[float | None, arg(metavar="RATE", help="Frames per second; else the input's word, else 30.")] = None
-    seed: Annotated[int, arg(help="Same seed, same device: same result.")] = 0
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the report as JSON.")] = False
+    seed: Seed = 0
+    drop_invalid: Annotated[DropInvalid, SECOND_PAGE] = False
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def run(args: Run) -> int:

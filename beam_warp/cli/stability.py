@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.cli.flags import Device, Json, Quiet
 from beam_warp.errors import OutputError
 
 if TYPE_CHECKING:
@@ -37,9 +38,9 @@ class Stability:
         tuple[Path, ...], arg(metavar="FILE", help="Results of other devices, as --json printed them, for the page.")
     ] = ()
     large: Annotated[bool, arg(help="Also scenes of minutes and gigabytes; larger captures, for GPUs.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the results as JSON.")] = False
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
 
 
 def stability(args: Stability) -> int:

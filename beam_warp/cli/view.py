@@ -15,15 +15,21 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number
-from beam_warp.cli.console import print_json
-from beam_warp.cli.drawing import Antialiased, LowPass, raster_options
+from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.flags import (
+    Antialiased,
+    Device,
+    DropInvalid,
+    LowPass,
+    Quiet,
+    SourceAxes,
+    asset_in,
+    raster_options,
+)
 from beam_warp.demo.lights import stage, studio, sunset
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
-
-ASSET_NAME = "asset.usda"
-"""What `beam run` calls its result."""
 
 LIGHT_SUFFIXES = (".exr", ".hdr")
 
@@ -32,7 +38,7 @@ BUILT_IN: dict[str, Callable[[], EnvironmentMap]] = {"studio": studio, "sunset":
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Look at an asset in the browser: orbit, time, environments, lights that are dragged, channels and their errors.
 
     What the page shows are our own frames: what is seen is the renderer. While something moves they are as small as
@@ -60,21 +66,21 @@ class View:
     longest: Annotated[int, arg(metavar="PX", help="No side of a picture is longer.")] = 2048
     antialiased: Antialiased = None
     low_pass: LowPass = None
-    source_axes: Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")] = None
-    drop_invalid: Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")] = False
-    device: Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")] = None
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
+    source_axes: SourceAxes = None
+    drop_invalid: DropInvalid = False
+    device: Device = None
+    quiet: Quiet = False
     json: Annotated[bool, arg(help="Print the address as JSON once the page is there.")] = False
 
 
-def view(args: View) -> int:
+def view(args: ViewCommand) -> int:
     """Serve the page until Ctrl-C."""
     if args.open and args.no_open:
         raise InvalidOptionError("open must be given once, got --open and --no-open. Leave one out.")
     require_number("rate", args.rate, 0.1, 240.0)
     require_count("longest", args.longest, 64, 8192)
     lights = environments(args.environment)
-    sequence = _read(args)
+    sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
 
     from beam_warp.view.viewer import Viewer, ViewOptions
 
@@ -91,7 +97,8 @@ def view(args: View) -> int:
         _say(args, sequence, viewer.url, viewer.device)
         if args.open or (not (args.no_open or args.json or args.quiet) and _has_screen()):
             webbrowser.open(viewer.url)
-        viewer.wait()
+        with progress(args.quiet or args.json):
+            viewer.wait()
     except KeyboardInterrupt:
         pass  # that is how it ends
     finally:
@@ -135,14 +142,7 @@ def _unused(name: str, taken: dict[str, Callable[[], EnvironmentMap]]) -> str:
     return next(candidate for candidate in names if candidate not in taken)
 
 
-def _read(args: View) -> GaussianSequence:
-    inner = args.asset / ASSET_NAME
-    return converters.read(
-        inner if inner.is_file() else args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid
-    )
-
-
-def _say(args: View, sequence: GaussianSequence, url: str, device: str) -> None:
+def _say(args: ViewCommand, sequence: GaussianSequence, url: str, device: str) -> None:
     """Say where the page is."""
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
     if args.json:

@@ -50,18 +50,18 @@ class StageAsset:
 
     Attributes:
         sequence: Relightable Gaussians, in axes of their own.
-        name: What to call it in messages.
-        translate: In the world [m].
+        name: Name of the asset in messages.
+        translate: Shift in the world [m].
         rotate: About z, counter-clockwise from above; or about x, then y, then z, each a fixed axis of the world
             [degree].
         scale: The same in all directions.
         on_ground: Put its lowest point (of its `bulk`) at height 0 before it is translated.
         centered: Put the middle of its bulk over the origin before it is translated.
-        start: When its first frame is seen [s].
+        start: Time at which the first frame is seen [s].
         speed: How fast it plays; 2 is twice as fast.
         loop: Start again after the last frame, and play before ``start`` as well; else the end frames are held.
         blend: Which frames are blended at times between them; see `TimeSampler`.
-        files: What the sequence is read from, if it is from files: those of every frame, or once for all frames.
+        files: Files that the sequence is read from, if any: one tuple for each frame, or one for all frames.
 
     Raises:
         InvalidArrayError: The translation or rotation is not 3 finite numbers.
@@ -93,13 +93,13 @@ class StageAsset:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What its reader had to assume, and what could not be blended so far."""
+        """Assumptions of the asset's reader, and frames that could not be blended so far."""
         said = [line for line in self.sequence.metadata.get("notes", "").splitlines() if line]
         return tuple(f"{self.name}: {note}" for note in (*said, *self._sampler.notes))
 
     @property
     def end(self) -> float:
-        """When its last frame has been seen, once [s]."""
+        """Time at which the last frame has been seen once [s]."""
         return self.start + len(self.sequence) / (self.sequence.frames_per_second * self.speed)
 
     def moment(self, time: float) -> Moment:
@@ -129,12 +129,12 @@ class StageAsset:
 
     @cached_property
     def subject(self) -> NDArray[np.float64]:
-        """What bounds its bulk in the world [m], over a few of its frames, ``(N, 3)``; N is 0 if they are empty."""
+        """Points that bound the asset's bulk in the world [m], ``(N, 3)``; none if the frames looked at are empty."""
         return outline(_bulk_of([self._sampler.at(frame) for frame in self._bounding_frames]))
 
     @cached_property
     def placement(self) -> Placement:
-        """Where it stands."""
+        """Placement of the asset in the world."""
         angles = (0.0, 0.0, self.rotate) if isinstance(self.rotate, float) else self.rotate
         rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         shift = np.asarray(self.translate, np.float64)

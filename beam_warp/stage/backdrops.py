@@ -13,7 +13,7 @@ class Backdrop:
     """One environment behind any number of images; what they share is made ready once."""
 
     def __init__(self, environment: EnvironmentMap) -> None:
-        """Take the light as it is; it is turned when it is looked at."""
+        """Take the environment; `seen` turns it."""
         self._environment = environment
         self._reduced = environment
         self._held: tuple[tuple[object, ...], NDArray[np.float32]] | None = None
@@ -25,7 +25,7 @@ class Backdrop:
         than pixels it is averaged to about a pixel first, so that a sun of one texel is as bright in the next frame.
 
         Args:
-            camera: Who looks.
+            camera: Camera that sees the environment.
             rotation: Turn of the environment about z, counter-clockwise from above [degree].
 
         Returns:

@@ -1,4 +1,4 @@
-"""A camera over time: fixed, around a subject, along key frames; and the files that hold such paths.
+"""Camera paths over time: fixed, around a subject, along key frames; and the files that hold them.
 
 Every path answers ``camera_at(time, width, height)``, the time in seconds, the image in pixels. Angles of view are
 vertical: an image of another shape sees more or less at its sides.
@@ -51,7 +51,7 @@ class CameraPath(Protocol):
 
     @property
     def duration(self) -> float | None:
-        """When it has arrived [s]; None if it never does, or does not move."""
+        """Time at which the camera has arrived [s]; None if it never does, or does not move."""
         ...
 
     def camera_at(self, time: float, width: int, height: int) -> Camera:
@@ -64,14 +64,14 @@ class FixedCamera:
     """A camera that stays.
 
     Attributes:
-        camera: For its own size; others keep its height's angle of view and, in proportion, its principal point.
+        camera: Camera at its own size; other sizes keep its vertical angle of view and relative principal point.
     """
 
     camera: Camera
 
     @property
     def duration(self) -> float | None:
-        """It never arrives."""
+        """None: a fixed camera never arrives."""
         return None
 
     def camera_at(self, time: float, width: int, height: int) -> Camera:
@@ -97,11 +97,11 @@ class OrbitPath:
     """A camera that goes around a place on a level circle and looks at it.
 
     Attributes:
-        center: What it looks at [m]; without, the middle of the subject.
-        distance: How far away it is [m]; without, so near that the subject just fills the image. If it moves, the
-            distance is that of the tightest place of a whole turn, so that it is the same all the way round.
+        center: Place that the camera looks at [m]; the middle of the subject if None.
+        distance: Distance from the centre [m]; if None, the least one at which the subject fits the image. A camera
+            that moves takes the least one that fits all the way round.
         subject: Points to frame [m], ``(N, 3)``; needed without ``center`` or ``distance``. See `around`.
-        azimuth: Where it starts [degree]; see `Camera.orbit`.
+        azimuth: Azimuth at time 0 [degree]; see `Camera.orbit`.
         elevation: Height above the horizon [degree].
         degrees_per_second: Counter-clockwise seen from above; 0 stays.
         turns: Whole turns in a duration that `lasting` states, instead of ``degrees_per_second``.
@@ -124,7 +124,7 @@ class OrbitPath:
     margin: float = 1.1
 
     def __post_init__(self) -> None:
-        """Check every field, and keep of the subject what bounds it."""
+        """Check every field, and keep only the points that bound the subject."""
         require_number("azimuth", self.azimuth, -3600.0, 3600.0)
         require_number("elevation", self.elevation, -90.0, 90.0)
         require_number("degrees_per_second", self.degrees_per_second, -36_000.0, 36_000.0)
@@ -149,7 +149,7 @@ class OrbitPath:
 
     @property
     def frames_subject(self) -> bool:
-        """Whether it needs points to frame."""
+        """Whether the path needs points to frame."""
         return self.center is None or self.distance is None
 
     def around(self, subject: NDArray[np.float64]) -> OrbitPath:
@@ -217,10 +217,10 @@ class Keyframe:
     """Where a camera is at a time.
 
     Attributes:
-        time: When [s].
+        time: Time of the key frame [s].
         camera_to_world: Rigid pose, ``(4, 4)`` float64, in `Camera`'s axes (x right, y down, z forward).
         fov: Vertical angle of view [degree].
-        target: What it looks at [m], if that was said; it is then level.
+        target: Place that the camera looks at, level [m]; None if only the pose was stated.
 
     Raises:
         InvalidArrayError: The pose is not rigid, or something is not finite.
@@ -361,10 +361,10 @@ def catmull_rom(
 
     Args:
         before: The point before ``start``; where there is none, or the same, ``end`` mirrored at ``start``.
-        start: Where share 0 is, ``(3,)``.
-        end: Where share 1 is.
+        start: Position at share 0, ``(3,)``.
+        end: Position at share 1.
         following: The point after ``end``; without, ``start`` mirrored at ``end``.
-        share: In [0, 1].
+        share: Part of the way, in [0, 1].
     """
     if np.array_equal(start, end):
         return start

@@ -20,7 +20,7 @@ def read_json(path: Path, name: str) -> Any:
 
     Args:
         path: The file.
-        name: What to call it in errors.
+        name: Name of the file in errors.
 
     Raises:
         MissingFileError: It is not there or cannot be read.
@@ -49,8 +49,8 @@ class Fields:
     """One JSON object.
 
     Args:
-        value: What stands where the object should be.
-        where: Its place, ``stage.json: assets[1]``; errors put a field's name behind it.
+        value: JSON value that should be the object.
+        where: Place of the object, ``stage.json: assets[1]``; errors put a field's name behind it.
         known: The fields it may have.
 
     Raises:
@@ -77,7 +77,7 @@ class Fields:
         return f"{self.where} {name}" if self.where.endswith(":") else f"{self.where}.{name}"
 
     def placed(self) -> AbstractContextManager[None]:
-        """Put this object's place before what a record says of one of its fields."""
+        """Put this object's place before errors about one of its fields."""
         return placed(self.where, self._known)
 
     def value(self, name: str) -> Any:
@@ -140,7 +140,7 @@ class Fields:
 
 @contextmanager
 def placed(where: str, names: Sequence[str]) -> Iterator[None]:
-    """Put a place before what is said of a field, ``stage.json: assets[1].scale must …``, or of a file's content.
+    """Put a place before errors about a field, ``stage.json: assets[1].scale must …``, or about a file's content.
 
     Args:
         where: ``stage.json: assets[1]``.

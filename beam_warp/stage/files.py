@@ -1,4 +1,4 @@
-"""The JSON that says what is on a stage; ``docs/stages.md`` lists every field."""
+"""Stages as JSON; ``docs/stages.md`` lists every field."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ FILE_FIELDS = ("type", "path", "prim")
 
 
 def read_stage_file(path: Path) -> dict[str, Any]:
-    """Read a file; see `stage_contents`, and `json_fields.read_json` for what is raised besides."""
+    """Read a file; see `stage_contents`, and `fields.read_json` for further errors."""
     return stage_contents(read_json(path, "stage"), path.parent, path.name)
 
 
@@ -75,8 +75,8 @@ def stage_contents(document: Any, folder: Path, name: str = "stage") -> dict[str
 
     Args:
         document: The object.
-        folder: Where relative paths start.
-        name: What to call it in messages.
+        folder: Folder where relative paths start.
+        name: Name of the stage in messages.
 
     Raises:
         AssetFormatError: A field is malformed or unknown; says which one and what to do.
@@ -116,7 +116,7 @@ def read_stage_asset(
         path: A PLY or USD file, or a folder of numbered PLY files.
         source_axes: Axes of a PLY that does not state them.
         drop_invalid: Leave out rows that are no Gaussians.
-        name: What to call it; the file's name without.
+        name: Name of the asset in messages; the file's name if None.
         place: Further attributes of a `StageAsset`.
 
     Raises:

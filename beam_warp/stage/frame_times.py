@@ -1,4 +1,4 @@
-"""Which moments the images of a sequence show: frames as they are, or moments between them."""
+"""Moments that the images of a sequence show: frames as they are, or moments between them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class FrameTimes:
     """Images in order.
 
     Attributes:
-        numbers: What each is called by.
-        times: When it is, on the stage [s].
+        numbers: Number of each image.
+        times: Time of each image on the stage [s].
         rate: Images a second at which they play.
     """
 
@@ -51,12 +51,12 @@ def frame_times(
     numbered from 0.
 
     Args:
-        frame_count: Of what is shown.
-        frame_rate: Of what is shown [1/s].
-        frames: ``A:B`` or ``A:B:STEP``, half-open, negative from the end, any of them left out; all without.
-        seconds: How long it plays; until the last frame has been seen without.
-        fps: Images a second; ``frame_rate`` without.
-        speed: How many seconds of what is shown pass in one of the film's.
+        frame_count: Number of frames of the stage.
+        frame_rate: Frames a second of the stage [1/s].
+        frames: ``A:B`` or ``A:B:STEP``, half-open, negative from the end, any of them left out; all frames if None.
+        seconds: Length of the film [s]; if None, until the last frame has been seen.
+        fps: Images a second; ``frame_rate`` if None.
+        speed: Seconds of the stage that pass in one second of the film.
 
     Raises:
         InvalidOptionError: A number is out of range, or frames are asked for that there are not.

@@ -1,4 +1,4 @@
-"""Rendering many images: which are to be done, one after the other, and what is left when it is interrupted."""
+"""Rendering of many images: which ones are missing, one after the other, and what an interruption leaves."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.shot import RenderedImage, Shot
 
 
-class Report(Protocol):
-    """Hears how far a stage of the work is."""
+class RenderProgress(Protocol):
+    """Called as the work goes on."""
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
 
 
 class ShotSource(Protocol):
-    """What is rendered, over time: a `beam_warp.stage.stage.Stage`."""
+    """Source of shots over time: a `beam_warp.stage.stage.Stage`."""
 
     def shot(self, time: float, width: int, height: int) -> Shot:
         """Return what is to be rendered at a time [s], for an image of a size [pixel]."""
@@ -40,12 +40,12 @@ class ShotSource(Protocol):
 
 @dataclass(frozen=True)
 class FrameContext:
-    """What a renderer may use besides the shot.
+    """Facts about a frame that a renderer may use besides the shot.
 
     Attributes:
-        number: Of the frame in its sequence.
-        checkpoint: Where it may keep what is done of it.
-        report: Told (samples done, samples at most) of a frame that takes long.
+        number: Number of the frame in its sequence.
+        checkpoint: File in which the renderer may keep an unfinished image.
+        report: Called with (samples done, samples at most) while a frame takes long.
     """
 
     number: int
@@ -58,7 +58,7 @@ class FrameRenderer(Protocol):
 
     @property
     def decisive(self) -> tuple[Any, ...]:
-        """Plain data that decides the images besides their shots."""
+        """Plain data that, with the shots, decides the images."""
         ...
 
     def draw(self, shot: Shot, context: FrameContext) -> RenderedImage:
@@ -67,15 +67,15 @@ class FrameRenderer(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame:
+class FrameRequest:
     """One image to render.
 
     Attributes:
-        number: In its sequence.
-        time: On the stage [s].
-        width: Of the image [pixel].
-        height: Of the image [pixel].
-        camera: Who looks, instead of the stage's own camera.
+        number: Number of the image in its sequence.
+        time: Time on the stage [s].
+        width: Width of the image [pixel].
+        height: Height of the image [pixel].
+        camera: Camera to use instead of the stage's own.
     """
 
     number: int
@@ -86,13 +86,13 @@ class Frame:
 
 
 @dataclass(eq=False)
-class Tally:
-    """What was done.
+class RenderTally:
+    """Images that a job rendered, and those that it kept.
 
     Attributes:
         rendered: Numbers of the frames that were rendered now, in order.
-        kept: Numbers of those that were there.
-        gaussian_count: Most Gaussians of an image that was rendered now.
+        kept: Numbers of the frames that were there already.
+        gaussian_count: Largest number of Gaussians in an image that was rendered now.
     """
 
     rendered: list[int] = field(default_factory=list)
@@ -107,19 +107,21 @@ class RenderInterruptedError(KeyboardInterrupt):
 class RenderJob:
     """Renders frames of a stage with one renderer into files of one kind."""
 
-    def __init__(self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: Report) -> None:
-        """Take what is rendered, by whom, how it is shown, and who wants to know."""
+    def __init__(
+        self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress
+    ) -> None:
+        """Take the stage, the renderer, the writer of images, and a callback for progress."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
         self._digests = ShotDigests(code_digest(), renderer.decisive, writer.options)
 
-    def render_stills(self, images: Sequence[tuple[Frame, Path]]) -> Tally:
+    def render_stills(self, images: Sequence[tuple[FrameRequest, Path]]) -> RenderTally:
         """Render single images, writing over what is there; frames in the order of time are read once.
 
         Raises:
             OutputError: One cannot be written.
             RenderInterruptedError: Interrupted; images are whole or not there.
         """
-        tally = Tally()
+        tally = RenderTally()
         try:
             for frame, path in images:
                 self._draw(frame, path, tally)
@@ -131,7 +133,9 @@ class RenderJob:
             raise RenderInterruptedError(done) from error
         return tally
 
-    def render_frames(self, pattern: FramePattern, frames: Sequence[Frame], *, overwrite: bool = False) -> Tally:
+    def render_frames(
+        self, pattern: FramePattern, frames: Sequence[FrameRequest], *, overwrite: bool = False
+    ) -> RenderTally:
         """Render numbered images; those that are there and of this render are kept.
 
         Raises:
@@ -141,7 +145,7 @@ class RenderJob:
         require_folder(pattern)
         log = FrameLog(pattern)
         planned = {frame.number: frame for frame in frames}
-        with _resumable(str(pattern), tally := Tally(), len(planned)):
+        with _resumable(str(pattern), tally := RenderTally(), len(planned)):
             compared = count(1)
 
             def digest_of(number: int) -> str:
@@ -162,8 +166,8 @@ class RenderJob:
         return tally
 
     def render_film(
-        self, film: Film, frames: Sequence[Frame], options: VideoOptions, *, ffmpeg: str, overwrite: bool = False
-    ) -> Tally:
+        self, film: Film, frames: Sequence[FrameRequest], options: VideoOptions, *, ffmpeg: str, overwrite: bool = False
+    ) -> RenderTally:
         """Render the frames of a film beside it, and encode them when all are there.
 
         Raises:
@@ -182,17 +186,17 @@ class RenderJob:
         film.discard_work()
         return tally
 
-    def _pictures(self, work: FramePattern, frames: Sequence[Frame]) -> Iterator[NDArray[np.uint8]]:
+    def _pictures(self, work: FramePattern, frames: Sequence[FrameRequest]) -> Iterator[NDArray[np.uint8]]:
         """Read the frames of a film back."""
         for done, frame in enumerate(frames, start=1):
             yield np.rint(read_image(work.path(frame.number)).rgb() * 255.0).astype(np.uint8)
             self._report("encode", done, len(frames))
 
-    def _shot(self, frame: Frame) -> Shot:
+    def _shot(self, frame: FrameRequest) -> Shot:
         shot = self._stage.shot(frame.time, frame.width, frame.height)
         return shot if frame.camera is None else replace(shot, camera=frame.camera)
 
-    def _draw(self, frame: Frame, path: Path, tally: Tally, shot: Shot | None = None) -> None:
+    def _draw(self, frame: FrameRequest, path: Path, tally: RenderTally, shot: Shot | None = None) -> None:
         """Render an image and write it."""
         seen = self._shot(frame) if shot is None else shot
         total = len(tally.rendered) + len(tally.kept)
@@ -212,7 +216,7 @@ def _checkpoint(path: Path) -> Path:
 
 
 @contextmanager
-def _resumable(name: str, tally: Tally, total: int) -> Iterator[None]:
+def _resumable(name: str, tally: RenderTally, total: int) -> Iterator[None]:
     """Turn an interruption into words about what is there."""
     try:
         yield

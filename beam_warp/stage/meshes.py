@@ -33,14 +33,14 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """A level square that others stand on.
+    """A level square under the assets.
 
     Attributes:
-        size: Its side [m].
-        height: Of the plane [m]; ``auto`` is the lowest point of the assets' bulk.
-        center: Its middle, x and y [m]; ``auto`` is below the middle of the assets.
+        size: Side of the square [m].
+        height: Height of the plane [m]; ``auto`` is the lowest point of the assets' bulk.
+        center: Middle of the square, x and y [m]; ``auto`` is below the middle of the assets.
         base_color: Scene-linear Rec.709 in [0, 1].
-        roughness: In [0, 1].
+        roughness: GGX roughness in [0, 1].
         catches_shadows: Whether only the shadows on it are seen.
 
     Raises:
@@ -97,10 +97,10 @@ def read_stage_mesh(
 
     Args:
         path: Any format of trimesh; in the world's axes (z up) and metres, but for glTF, which is turned.
-        placement: Where it stands.
+        placement: Placement of the mesh in the world.
         base_color: Scene-linear Rec.709 in [0, 1]; without, the file's colours at its vertices: those of glTF are
             linear, others are taken as sRGB; a texture is looked up at the vertices. Without those, grey.
-        roughness: In [0, 1].
+        roughness: GGX roughness in [0, 1].
         catches_shadows: Whether only the shadows on it are seen.
         smooth: Whether normals are those of the file, or smooth over edges where it has none; else triangles are flat.
 

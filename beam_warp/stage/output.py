@@ -35,7 +35,7 @@ class FramePattern:
     """Names of numbered images.
 
     Attributes:
-        folder: Where they lie.
+        folder: Folder of the images.
         prefix: Name before the number.
         digits: Digits of the number, more where it is larger; 0 for as many as it takes.
         suffix: Name after it, with the kind of image at its end.
@@ -237,7 +237,7 @@ class FrameLog:
 
 
 def _entry(line: str) -> tuple[int, str, int | None] | None:
-    """Return what a line says; None if it says nothing."""
+    """Return the entry of a log's line; None if the line is malformed."""
     try:
         entry: Any = json.loads(line)
         number, digest, size = entry["frame"], entry["digest"], entry["size"]

@@ -33,7 +33,7 @@ class PictureOptions:
     Attributes:
         view: View transform of PNGs and films; an EXR holds scene-linear light.
         exposure: Gain of the light [stops], in every kind of file.
-        background: What is behind. A colour is itself in a PNG whatever exposure and view; in an EXR it is decoded.
+        background: Colour or light behind. A PNG shows a colour whatever exposure and view; an EXR holds it decoded.
         layers: Whether an EXR also holds the renderer's layers.
 
     Raises:

@@ -1,10 +1,14 @@
-"""Either renderer at work on the frames of a sequence: what it is told of a frame, and what decides its images."""
+"""Both renderers as renderers of the frames of a sequence; see `beam_warp.stage.jobs.FrameRenderer`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.image.metrics import block_means
 from beam_warp.raster.channels import ERROR_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
@@ -26,6 +30,7 @@ class DeferredFrames:
     ) -> None:
         """Take the options of both, and whether errors are drawn."""
         self._renderer = DeferredRenderer(options, raster=raster, device=device)
+        self._samples = options.samples
         self._raster, self._errors, self._device = raster, errors, device
         self.decisive: tuple[Any, ...] = ("deferred", options, raster)
 
@@ -35,8 +40,20 @@ class DeferredFrames:
         names = [name for name in ERROR_CHANNELS if self._errors and getattr(shot.cloud, name) is not None]
         if not names or not len(shot.cloud):
             return image
-        drawn = rasterize(shot.cloud, shot.camera, channels=names, options=self._raster, device=self._device)
-        return replace(image, layers={**image.layers, **drawn.channels})
+        camera, side = shot.camera.supersampled(self._samples), self._samples
+        drawn = rasterize(shot.cloud, camera, channels=names, options=self._raster, device=self._device)
+        layers = {name: _mean_where_covered(drawn.channels[name], drawn.alpha, side) for name in names}
+        return replace(image, layers={**image.layers, **layers})
+
+
+def _mean_where_covered(values: NDArray[np.float32], alpha: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Return the mean over the samples of each pixel, weighted by alpha; 0 where nothing is covered."""
+    if side == 1:
+        return values
+    weights = alpha[..., None]
+    total, weight = block_means(values.reshape(*alpha.shape, -1) * weights, side), block_means(weights, side)
+    mean = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0).astype(np.float32)
+    return mean[..., 0] if values.ndim == 2 else mean
 
 
 class PathFrames:

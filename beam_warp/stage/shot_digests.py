@@ -1,4 +1,4 @@
-"""What an image is made of, as one digest: two shots with the same digest render to the same image."""
+"""Digests of shots: two shots with the same digest render to the same image."""
 
 from __future__ import annotations
 

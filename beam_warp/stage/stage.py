@@ -1,4 +1,4 @@
-"""What is rendered over time: Gaussians, meshes, lights and a camera, and of them the shot of any moment."""
+"""Gaussians, meshes, lights and a camera over time, and the shot of any moment."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ TURNTABLE_SECONDS = 5.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stage:
-    """All that decides what images show, but for their size and renderer.
+    """Everything that images show over time; their size and renderer are chosen apart.
 
     Attributes:
         assets: Gaussians; none is fine.
         meshes: Triangles among them, in the world, and grounds.
         lights: Lights at places and from directions.
         environment: Distant light.
-        camera: Without, one that frames the assets from the front.
-        fps: Images a second; without, the rate of the first asset that moves.
-        duration: Of the whole [s]; without, until the last moving asset has ended, else the camera has arrived, else
-            one turn of the environment; a single image if nothing moves.
-        given_notes: What was assumed while its parts were read.
+        camera: Camera path; if None, a camera that frames the assets from the front.
+        fps: Images a second; if None, the rate of the first asset that moves.
+        duration: Length [s]; if None, until the last moving asset has ended, else the camera has arrived, else the
+            environment has turned once; a single image if nothing moves.
+        given_notes: Assumptions made while the parts were read.
 
     Raises:
         InvalidOptionError: The rate or the duration is out of range.
@@ -64,7 +64,7 @@ class Stage:
     _known_files: dict[str, list[Any]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Settle how long it is and how fast, and give the camera what it is to frame."""
+        """Settle duration and rate, and give the camera the points that it is to frame."""
         for name in ("assets", "meshes", "lights", "given_notes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         moving = [asset for asset in self.assets if len(asset.sequence) > 1]
@@ -117,12 +117,12 @@ class Stage:
             environment: Distant light, or its .exr or .hdr file.
             rotate: How far the environment is turned at time 0 [degree].
             rotate_per_second: How fast it turns [degree/s].
-            exposure: Of the environment [stops].
+            exposure: Gain of the environment [stops].
             lights: Other lights.
             meshes: Triangles in the world, and grounds.
-            camera: Without, one that frames the assets from the front.
+            camera: Camera path; if None, a camera that frames the assets from the front.
             fps: Images a second.
-            duration: Of the whole [s].
+            duration: Length of the whole [s].
             source_axes: Axes of PLY files that do not state them.
             drop_invalid: Leave out rows that are no Gaussians.
             on_ground: Put the lowest point of every asset at height 0.
@@ -164,7 +164,7 @@ class Stage:
 
     @property
     def seconds(self) -> float:
-        """Its duration [s]."""
+        """Duration of the stage [s]."""
         assert self.duration is not None
         return self.duration
 
@@ -176,7 +176,7 @@ class Stage:
 
     @property
     def frame_count(self) -> int:
-        """Number of images at its rate, at least 1."""
+        """Number of images at the stage's rate, at least 1."""
         return max(1, round(self.seconds * self.rate))
 
     def time_of(self, frame: int) -> float:
@@ -201,12 +201,12 @@ class Stage:
 
     @property
     def raster_metadata(self) -> Mapping[str, str]:
-        """How its Gaussians are to be drawn, as `RasterOptions.from_metadata` reads it: as the first one says."""
+        """Metadata for `RasterOptions.from_metadata`: those of the first asset that states how it is drawn."""
         return {} if self._drawn_as is None else _raster(self._drawn_as)
 
     @cached_property
     def subject(self) -> NDArray[np.float64]:
-        """What bounds its assets [m], or its meshes if they show nothing, ``(N, 3)``."""
+        """Points that bound the assets [m], or the meshes if the assets show nothing, ``(N, 3)``."""
         points = [asset.subject for asset in self.assets if len(asset.subject)]
         if not points:
             points = [mesh.surface.vertices for mesh in self.meshes if isinstance(mesh, ShotMesh)]
@@ -235,9 +235,9 @@ class Stage:
         """Return what is rendered at a time.
 
         Args:
-            time: From the start [s]; also before it or after the end.
-            width: Of the image [pixel].
-            height: Of the image [pixel].
+            time: Time from the start [s]; also before it or after the end.
+            width: Width of the image [pixel].
+            height: Height of the image [pixel].
 
         Raises:
             InvalidOptionError: The time is not finite, a size is out of range, or there is nothing to frame.
@@ -282,7 +282,7 @@ class Stage:
 
     @property
     def _drawn_as(self) -> StageAsset | None:
-        """The asset that says how all are drawn."""
+        """First asset that states how it is drawn: all are drawn so."""
         return next((asset for asset in self.assets if _raster(asset)), None)
 
     @cached_property
@@ -337,6 +337,6 @@ _PLACES = ("start", "speed", "loop", "blend")
 
 
 def _raster(asset: StageAsset) -> dict[str, str]:
-    """Return what an asset says of how it is drawn."""
+    """Return the metadata of an asset that state how it is drawn."""
     metadata = asset.sequence.metadata
     return {key: metadata[key] for key in (RASTER_ANTIALIASED, RASTER_LOW_PASS) if key in metadata}

@@ -1,4 +1,4 @@
-"""A sequence of Gaussians at any time, between its frames too."""
+"""Sampling of a sequence of Gaussians at any time, between frames too."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class TimeSampler:
 
     Args:
         sequence: Frames to read.
-        ends: What is seen before the first and after the last frame: ``hold`` them, or ``loop``, where the first frame
+        ends: Behaviour before the first and after the last frame: ``hold`` them, or ``loop``, where the first frame
             follows the last one, and times between the two are blended like others.
         blend: ``identified`` blends two frames if their Gaussians are known to correspond: by equal ids, or by the
             sequence's topology. ``rows`` takes row i of both for the same wherever counts agree. ``nearest`` never
@@ -97,10 +97,6 @@ class TimeSampler:
         """
         return self.at_moment(self.moment(frame))
 
-    def at_seconds(self, seconds: float) -> GaussianCloud:
-        """Return the cloud at a time from the start of the sequence [s]."""
-        return self.at(require_number("seconds", seconds, -1e9, 1e9) * self.sequence.frames_per_second)
-
     def at_moment(self, moment: Moment) -> GaussianCloud:
         """Return the cloud at a place that `moment` found."""
         if moment.frame == moment.following:
@@ -143,9 +139,9 @@ def blend_clouds(first: GaussianCloud, second: GaussianCloud, fraction: float) -
     """Return what lies between two clouds whose rows correspond; see `TimeSampler`.
 
     Args:
-        first: Where fraction 0 is.
-        second: Where fraction 1 is; as many Gaussians with the same arrays, in the same axes.
-        fraction: In [0, 1].
+        first: Cloud at fraction 0.
+        second: Cloud at fraction 1; as many Gaussians with the same arrays, in the same axes.
+        fraction: Part of the way, in [0, 1].
 
     Raises:
         InvalidOptionError: The fraction is out of range.

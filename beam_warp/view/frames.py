@@ -1,4 +1,4 @@
-"""A thread that draws for every page what it wants now: the newest, never a queue of what it wanted before."""
+"""A thread that draws the newest picture that each page wants, and never a queue of older ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from beam_warp.world.camera import Camera
 log = logging.getLogger(__name__)
 
 NOBODY = -1
-"""The page of what fails before there is one: it is told to none."""
+"""Page number of errors before there is a page; nobody is told of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Picture:
     Attributes:
         pixels: Display sRGB, ``(H, W, 3)`` uint8.
         layers: The same as numbers, the layers of an image file: name to ``(H, W)``.
-        gaussian_count: How many there were.
+        gaussian_count: Number of Gaussians.
         samples: Paths a pixel; 0 where none were traced.
-        legend: What its colours mean, ``(h, w, 3)`` uint8; None where they mean themselves.
+        legend: Legend of its colours, ``(h, w, 3)`` uint8; None where they need none.
     """
 
     pixels: NDArray[np.uint8]
@@ -75,12 +75,12 @@ class Painter(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PagePicture:
     """A picture on its way to a page.
 
     Attributes:
-        picture: What is to be seen.
-        milliseconds: How long it took; of a traced one, each path of every pixel.
+        picture: Picture to show.
+        milliseconds: Time that it took; for a traced one, the time of each path of every pixel.
         is_last: True if nothing finer follows.
     """
 
@@ -96,7 +96,7 @@ class FrameLoop:
         self,
         painter: Painter,
         schedule: Schedule,
-        deliver: Callable[[int, Frame], None],
+        deliver: Callable[[int, PagePicture], None],
         report: Callable[[int, Exception], None],
         *,
         clock: Callable[[], float] = time.monotonic,
@@ -145,7 +145,7 @@ class FrameLoop:
 
     @property
     def state(self) -> ViewState:
-        """What is looked at."""
+        """State that is shown."""
         with self._changed:
             return self._schedule.state
 
@@ -225,7 +225,7 @@ class FrameLoop:
                 self._tracings.pop(order.client, None)
         if is_wanted:
             is_last = order.is_last and (order.kind != "traced" or is_over)
-            self._deliver(order.client, Frame(picture, drawn, is_last))
+            self._deliver(order.client, PagePicture(picture, drawn, is_last))
         taken = 1000.0 * (self._clock() - started)
         with self._changed:
             is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find

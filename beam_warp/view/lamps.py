@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beam_warp.view.state import LightKind, PlacedLight, Subject
+from beam_warp.view.state import LightKind, PlacedLight, SubjectBox
 from beam_warp.world.lights import Light
 
 if TYPE_CHECKING:
@@ -24,13 +24,13 @@ class Lamps:
     """The lights that were added, shared by all pages."""
 
     def __init__(
-        self, server: viser.ViserServer, subject: Subject, changed: Callable[[tuple[Light, ...]], Any]
+        self, server: viser.ViserServer, subject: SubjectBox, changed: Callable[[tuple[Light, ...]], Any]
     ) -> None:
         """Make the controls, without any light.
 
         Args:
-            server: Where controls and handles are shown; controls go into the container that is open.
-            subject: What lights are placed around.
+            server: Server that shows controls and handles; controls go into the container that is open.
+            subject: Box that lights are placed around.
             changed: Takes the lights whenever one changes.
         """
         self._server = server
@@ -92,7 +92,7 @@ class _Lamp:
         self,
         server: viser.ViserServer,
         number: int,
-        subject: Subject,
+        subject: SubjectBox,
         kind: LightKind,
         changed: Callable[[], None],
         remove: Callable[[int], None],

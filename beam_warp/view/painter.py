@@ -1,4 +1,4 @@
-"""Pictures of what a viewer looks at: frames are read when they are wanted, light is made ready when it is chosen."""
+"""Pictures of a viewer's state: frames are read when they are wanted, light is prepared when it is chosen."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from beam_warp.view.state import (
     NO_GROUND,
     SHADOW_GROUND,
     Color,
-    Subject,
+    SubjectBox,
     ViewState,
     channels_of,
 )
@@ -47,7 +47,7 @@ CACHED_LIGHTS = 4
 """Environments that are kept."""
 
 LEGEND_WIDTH = 300
-"""Of legends beside a picture [pixel]."""
+"""Width of legends beside a picture [pixel]."""
 
 GROUND_REACH = 6.0
 """Half the side of the ground over the subject's diagonal."""
@@ -63,8 +63,8 @@ class FrameCache:
         """Start with none.
 
         Args:
-            sequence: Where frames are read from.
-            capacity: Of what is kept [byte]; the latest frame is kept whatever its size.
+            sequence: Sequence that frames are read from.
+            capacity: Size of the frames that are kept [byte]; the latest one is kept whatever its size.
         """
         self.sequence = sequence
         self._capacity = capacity
@@ -92,9 +92,9 @@ class CloudPainter:
 
     Attributes:
         subject: The box that the first, the middle and the last frame are in.
-        channels: What can be shown of it.
+        channels: Channels that can be shown.
         can_trace: Whether paths can be traced.
-        device: What draws.
+        device: Name of the device that draws.
     """
 
     def __init__(
@@ -108,8 +108,8 @@ class CloudPainter:
         """Read the first frame.
 
         Args:
-            sequence: What is drawn.
-            environments: By name, what reads or makes a light.
+            sequence: Gaussians to draw.
+            environments: Functions that read or make a light, by its name.
             raster: How splats are drawn; as the sequence says by default.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
@@ -127,7 +127,7 @@ class CloudPainter:
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
         self._deferred = DeferredPair(self._raster, self._target)
         clouds = self._looked_at()
-        self.subject = Subject.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
+        self.subject = SubjectBox.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
         self.channels = channels_of(next(filter(len, clouds), clouds[0]))
         self._tracer = path_tracer(self._target) if LIT in self.channels else None
         self.can_trace = self._tracer is not None
@@ -239,7 +239,7 @@ class TracedPicture:
         return _lit_picture(self.progress.image(), self.state, self.gaussian_count, self.sample_count)
 
 
-def ground_mesh(subject: Subject, *, catches_shadows: bool) -> ShotMesh:
+def ground_mesh(subject: SubjectBox, *, catches_shadows: bool) -> ShotMesh:
     """Return a horizontal square that a subject stands on."""
     reach = GROUND_REACH * subject.extent
     x, y, _ = subject.center.tolist()

@@ -1,4 +1,4 @@
-"""Which renderers a viewer has: one that lights at once, one that traces paths, and what a display shows of both."""
+"""Renderers of a viewer: one that shades at once, one that traces paths; and their images for a display."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class DeferredPair:
         """Render a shot.
 
         Args:
-            shot: What is rendered.
-            lighting: What light depends on: where it is what it was, what was found for it is there.
+            shot: Shot to render.
+            lighting: Values that light depends on; light that was found for the same values is used again.
             is_thorough: Whether the environment is to cast shadows.
             is_quick: Whether something moves.
         """
@@ -58,7 +58,7 @@ def path_tracer(device: str | None) -> PathRenderer:
 
 
 def displayed(image: RenderedImage, transform: ViewTransform, stops: float, background: Color) -> NDArray[np.uint8]:
-    """Return what a display shows of an image over a display colour, ``(H, W, 3)``: see `tone_mapping.display_over`."""
+    """Return an image over a display colour as a display shows it, ``(H, W, 3)``; see `tone.display_over`."""
     behind = np.asarray(background, np.uint8)
     shown = np.broadcast_to(behind, image.rgb.shape).copy()
     rows, columns = (np.flatnonzero((image.alpha > 0.0).any(axis=axis)) for axis in (1, 0))

@@ -1,4 +1,4 @@
-"""Which picture a viewer draws next: coarse ones while something moves, finer and finer ones once nothing does."""
+"""Order of a viewer's pictures: coarse ones while something moves, finer and finer ones once nothing does."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Literal
 from beam_warp.view.state import Viewpoint, ViewState
 
 STILL_AFTER = 0.2
-"""So long after the last change nothing moves any more [s]."""
+"""Time after the last change from which nothing counts as moving [s]."""
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125)
-"""Sides of pictures over those of the page; few, so that what is made for a size serves many frames."""
+"""Sides of pictures over those of the page; few, so that arrays made for a size serve many frames."""
 
 SMALLEST_SIDE = 96
 """Pictures of moving things are not made smaller than this, but for pages that are [pixel]."""
 
 FORGETTING = 0.8
-"""What a picture counts for once the next one is measured."""
+"""Weight of a measured picture once the next one is measured."""
 
 PATIENCE = 1.5
 """Where no size is fast enough, pictures may take this much longer than the fastest ones."""
@@ -33,7 +33,7 @@ LONGEST_SIDE = 2048
 
 @dataclass
 class Pace:
-    """Learns what pictures cost, time = a + b pixels, and says which size is fast enough.
+    """Model of the cost of pictures, time = a + b pixels, that finds the size that is fast enough.
 
     Attributes:
         target: Time that a picture may take [ms].
@@ -83,12 +83,12 @@ class Order:
     """A picture to draw.
 
     Attributes:
-        client: For whom.
-        version: Of what is to be seen; a picture of an older one is stale.
-        state: What is looked at.
-        viewpoint: From where.
+        client: Page that the picture is for.
+        version: Version of state and viewpoint; a picture of an older one is stale.
+        state: State to draw.
+        viewpoint: Viewpoint of the page.
         kind: ``"moving"``: quickly; ``"still"``: finer than the last one; ``"traced"``: more paths for the last one.
-        scale: Of the picture's sides over the page's.
+        scale: Sides of the picture over those of the page.
         is_last: True if nothing finer follows, but more paths.
     """
 
@@ -119,7 +119,7 @@ class _Page:
 
 
 class Schedule:
-    """Decides what to draw next; knows no clock but what it is told, and draws nothing."""
+    """Decides what to draw next; takes times as arguments, and draws nothing."""
 
     def __init__(
         self, state: ViewState, *, moving: Pace | None = None, traced: Pace | None = None, longest: int = LONGEST_SIDE
@@ -127,9 +127,9 @@ class Schedule:
         """Start without pages.
 
         Args:
-            state: What is looked at first.
-            moving: Of pictures while something moves; a tenth of a second each by default.
-            traced: Of one path a pixel; half a second by default.
+            state: First state.
+            moving: Pace of pictures while something moves; a tenth of a second each by default.
+            traced: Pace of one path a pixel; half a second by default.
             longest: No side of a picture is longer [pixel].
         """
         self.moving = moving or Pace(100.0)
@@ -142,7 +142,7 @@ class Schedule:
 
     @property
     def state(self) -> ViewState:
-        """What is looked at."""
+        """State that is shown."""
         return self._state
 
     def look(self, client: int, viewpoint: Viewpoint, now: float) -> None:

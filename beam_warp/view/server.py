@@ -1,4 +1,4 @@
-"""viser's server as we need it: on one address or not at all, silent, and never shared with the world."""
+"""A viser server on one address or none, silent, and never shared with the world."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def start_server(host: str, port: int, label: str) -> viser.ViserServer:
 
     Args:
         host: Address of this machine to listen at.
-        port: Where; 0 takes any that is free.
-        label: Above the controls.
+        port: Port to listen at; 0 takes any that is free.
+        label: Title above the controls.
 
     Raises:
         MissingPackageError: viser is not installed.

@@ -1,4 +1,4 @@
-"""What a viewer looks at and how: time, channel, light, tone, and from where; values that no mouse can break."""
+"""State of a viewer: time, channel, light, tone, viewpoints; values that no mouse can break."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.errors import InvalidOptionError
+from beam_warp.image.color import srgb_to_linear
 from beam_warp.image.tone import ViewTransform
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, unknown_light
 
 LIT = "lit"
-"""The channel that is what light makes of all the others."""
+"""The channel that shows the asset under light."""
 
 DEPTH, ALPHA = "depth", "alpha"
 """Channels that every cloud has, whatever arrays it holds."""
@@ -39,7 +40,7 @@ LIMITS = {
 """Least and most of every number."""
 
 SPOT_CORE = 0.7
-"""Of a spot light's cone, the part that gets all of its light."""
+"""Part of a spot light's cone that gets all of its light."""
 
 LARGEST_SIDE = 8192
 """Sides of a page beyond this are a mistake [pixel]."""
@@ -50,13 +51,13 @@ LightKind = Literal["point", "directional", "spot"]
 
 @dataclass(frozen=True, kw_only=True)
 class ViewState:
-    """What all pages show; each has a camera of its own.
+    """State that all pages share; each has a camera of its own.
 
     Attributes:
         frame: Which frame of the sequence.
         channel: `LIT`, `DEPTH`, `ALPHA` or a channel of the cloud.
         environment: Name of a light, or `NO_ENVIRONMENT`.
-        rotation: Of the environment about z, counter-clockwise from above [degree].
+        rotation: Turn of the environment about z, counter-clockwise from above [degree].
         exposure: Stops.
         transform: Name of what turns scene-linear light into display colours.
         background: Display colour behind everything, 0 to 255.
@@ -99,7 +100,7 @@ class ViewState:
 
     @property
     def lighting(self) -> object:
-        """What light on the subject depends on, from wherever it is seen."""
+        """Values that light on the subject depends on, from wherever it is seen."""
         return self.frame, self.environment, self.rotation, self.lights, self.ground
 
     @property
@@ -131,10 +132,10 @@ class Viewpoint:
 
     Attributes:
         wxyz: Rotation from camera to world, x right, y down, z forward; of any length but 0.
-        position: In the world [m].
+        position: Position in the world [m].
         fov: Angle between the upper and the lower edge [rad].
-        width: Of the page's canvas [pixel].
-        height: Of the page's canvas [pixel].
+        width: Width of the page's canvas [pixel].
+        height: Height of the page's canvas [pixel].
     """
 
     wxyz: tuple[float, float, float, float]
@@ -199,12 +200,12 @@ class PlacedLight:
 
     Attributes:
         kind: ``"point"``, ``"directional"`` or ``"spot"``.
-        position: In the world [m]; of a directional light, where its handle is.
+        position: Position in the world [m]; for a directional light, that of its handle.
         wxyz: Turn of its handle; it shines along the handle's -z.
         color: Display colour of the light, 0 to 255.
-        power: Of a directional light the irradiance [W/m^2], else the radiant intensity [W/sr], of white.
-        size: Radius [m]; of a directional light the angular diameter [degree].
-        cone: Of a spot light, the angle between its axis and where light ends [degree].
+        power: Irradiance of a directional light [W/m^2], else radiant intensity [W/sr], of white.
+        size: Radius [m]; for a directional light the angular diameter [degree].
+        cone: Angle between a spot light's axis and the edge of its cone [degree].
         casts_shadows: Whether what is in the way casts a shadow.
     """
 
@@ -264,14 +265,12 @@ class PlacedLight:
 
 def srgb_of(color: Color) -> tuple[float, float, float]:
     """Return the scene-linear value of a display colour."""
-    from beam_warp.image.color import srgb_to_linear
-
     red, green, blue = srgb_to_linear(np.asarray(color, np.float64) / 255.0).tolist()
     return red, green, blue
 
 
 @dataclass(frozen=True)
-class Subject:
+class SubjectBox:
     """The box that the sequence is in, as far as it is known: what cameras frame and lights are placed around.
 
     Attributes:
@@ -283,7 +282,7 @@ class Subject:
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(3, 1.0))
 
     @classmethod
-    def of(cls, points: NDArray[np.float64]) -> Subject:
+    def of(cls, points: NDArray[np.float64]) -> SubjectBox:
         """Return the box of points; a metre around the origin where there are none."""
         return cls(points.min(axis=0), points.max(axis=0)) if len(points) else cls()
 
@@ -329,10 +328,10 @@ class Playback:
     """A sequence that runs: which frame it shows at a time.
 
     Attributes:
-        started: When it was started, by any clock [s].
+        started: Time of the start, by any clock [s].
         first: The frame it was started at.
-        frames_per_second: Its rate.
-        frame_count: Of the sequence.
+        frames_per_second: Rate of the playback.
+        frame_count: Number of frames of the sequence.
         loops: Whether it starts over at its end.
     """
 

@@ -20,7 +20,7 @@ from beam_warp.errors import BeamError
 from beam_warp.image.files import write_exr
 from beam_warp.image.tone import TRANSFORMS
 from beam_warp.raster.records import RasterOptions
-from beam_warp.view.frames import Frame, FrameLoop, Picture
+from beam_warp.view.frames import FrameLoop, PagePicture, Picture
 from beam_warp.view.lamps import Lamps
 from beam_warp.view.painter import CloudPainter
 from beam_warp.view.schedule import LONGEST_SIDE, Pace, Schedule
@@ -34,7 +34,7 @@ from beam_warp.view.state import (
     SHADOW_GROUND,
     TRACED,
     Playback,
-    Subject,
+    SubjectBox,
     Viewpoint,
     ViewState,
     number_within,
@@ -53,10 +53,10 @@ MOVING_QUALITY, STILL_QUALITY = 75, 92
 """JPEG qualities; the last picture is a PNG."""
 
 FIELD_OF_VIEW = 35.0
-"""Of new pages, from the upper to the lower edge [degree]."""
+"""Vertical field of view of new pages [degree]."""
 
 ELEVATION = 5.0
-"""New pages look from the front, from so far above the horizon [degree]."""
+"""Elevation above the horizon from which new pages look, from the front [degree]."""
 
 LABELS = {
     LIT: "lit",
@@ -83,7 +83,7 @@ class ViewOptions:
 
     Attributes:
         host: Address of this machine to listen at; others reach what is not 127.0.0.1.
-        port: Where; 0 takes any that is free.
+        port: Port to listen at; 0 takes any that is free.
         rate: Frames per second to hold while something moves; pictures get as small as that takes.
         longest: No side of a picture is longer [pixel].
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -113,10 +113,10 @@ class Viewer:
         """Start serving.
 
         Args:
-            sequence: What is looked at; frames are read when they are wanted.
-            environments: By name, what reads or makes a light; the first one shines at first.
+            sequence: Gaussians to show; frames are read when they are wanted.
+            environments: Functions that read or make a light, by its name; the first one shines at first.
             title: Above the controls.
-            state: What is looked at first, as far as it is there; environments cast shadows at first only on a GPU.
+            state: First state, as far as it can be shown; environments cast shadows at first only on a GPU.
             options: See `ViewOptions`.
 
         Raises:
@@ -148,26 +148,21 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """What to type into a browser on this machine."""
+        """Address for a browser on this machine."""
         return server_url(self._server)
 
     @property
     def device(self) -> str:
-        """What draws."""
+        """Name of the device that draws."""
         return self._painter.device
 
     @property
-    def page_count(self) -> int:
-        """How many pages look."""
-        return len(self._pages)
-
-    @property
     def state(self) -> ViewState:
-        """What is looked at."""
+        """State that is shown."""
         return self._loop.state
 
     def change(self, **values: Any) -> ViewState:
-        """Change what is looked at as the controls do, and the controls with it; see `ViewState.changed`."""
+        """Change the state as the controls do, and the controls with it; see `ViewState.changed`."""
         state = self._loop.change(**values)
         self._controls.follow(state)
         return state
@@ -198,7 +193,7 @@ class Viewer:
         self._pages.pop(client.client_id, None)
         self._loop.leave(client.client_id)
 
-    def _deliver(self, client: int, frame: Frame) -> None:
+    def _deliver(self, client: int, frame: PagePicture) -> None:
         page = self._pages.get(client)
         if page is not None:
             page.show(frame)
@@ -233,7 +228,7 @@ class _Page:
         """Take note of where the page looks from."""
         self._loop.look(self._client.client_id, _viewpoint(camera))
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: PagePicture) -> None:
         """Show a picture."""
         picture = frame.picture
         if frame.is_last:
@@ -414,10 +409,10 @@ class _Controls:
         """Let a control change a part of what is looked at.
 
         Args:
-            name: Of `ViewState`.
-            control: What shows it.
-            meant: What a value of the control means.
-            shown: The control's value for a meaning.
+            name: Field of `ViewState`.
+            control: Control of the field.
+            meant: Turns a value of the control into one of the field.
+            shown: Turns a value of the field into one of the control.
         """
         self._bound[name] = control, shown
 
@@ -439,13 +434,13 @@ def _possible(state: ViewState, painter: CloudPainter) -> ViewState:
     )
 
 
-def _framing(subject: Subject) -> Camera:
+def _framing(subject: SubjectBox) -> Camera:
     """Return the camera that frames a subject from the front, in a square."""
     corners = np.array(np.meshgrid(*zip(subject.low, subject.high, strict=True))).reshape(3, -1).T
     return Camera.frame_points(corners, elevation=ELEVATION, width=512, height=512, vertical_fov=FIELD_OF_VIEW)
 
 
-def _place_camera(server: viser.ViserServer, subject: Subject) -> None:
+def _place_camera(server: viser.ViserServer, subject: SubjectBox) -> None:
     """Say where new pages look from."""
     camera = _framing(subject)
     server.initial_camera.fov = float(np.radians(FIELD_OF_VIEW))

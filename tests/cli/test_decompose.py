@@ -127,12 +127,3 @@ class TestMistakes:
         other = tmp_path / "other.usda"
         write(GaussianSequence.from_clouds([read(figure)[0]], metadata={"capture_frames": "7"}), other)
         mistake(other, "--capture", small, "--roughness", 0.5, says="got none of frame 7")
-
-
-def test_help_has_examples(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["decompose", "--help"])
-    assert stop.value.code == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("Example: beam decompose") == 2
-    assert "--preset paper" in said

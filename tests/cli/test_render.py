@@ -4,24 +4,22 @@ import json
 
 import numpy as np
 import pytest
-import tyro
-from tyro.conf import FlagCreatePairsOff
+from support.drawn_ball import drawn_ball, judged_ball, save, write_capture
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import run_command
-from beam_warp.cli.render import Render, render
+from beam_warp.cli.main import main
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
 
 SIDE = ["--width", "48"]
 
-PLAIN = ["--environment-shadows", "0", "--bounces", "0"]
+PLAIN = ["--environment-shadows", "0", "--bounces", "0", "--samples", "1"]
 """Where shading is not what a test is about."""
 
 LAYERS = {"R", "G", "B", "A", "depth", "roughness", "ambient_occlusion"} | {
@@ -33,29 +31,7 @@ CODED = 2e-3
 
 
 def run(*words):
-    args = tyro.cli(Render, args=[str(word) for word in words], config=(FlagCreatePairsOff,))
-    return run_command(lambda: render(args))
-
-
-def sphere(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
-    """Opaque flat discs on a ball of radius 0.5 m."""
-    index = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * index / count
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
-    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    return GaussianCloud(
-        positions=0.5 * normals + center,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
-        scales=np.tile([0.015, 0.015, 1e-4], (count, 1)),
-        opacities=np.full(count, 0.99),
-        radiance=np.zeros((count, 1, 3)),
-        radiance_color_space="lin_rec709_scene",
-        base_color=np.tile(color, (count, 1)),
-        roughness=np.full(count, 0.5),
-        ambient_occlusion=np.ones(count),
-        normals=normals,
-    )
+    return main(["render", *map(str, words)])
 
 
 def see_ball(camera):
@@ -67,13 +43,9 @@ def see_ball(camera):
     return (camera.position + distance[..., None] * rays) / 0.5, distance * (rays @ camera.forward)
 
 
-def save(clouds, path):
-    converters.write(GaussianSequence.from_clouds(clouds), path, converters.WriteOptions(profile="beam"))
-
-
 @pytest.fixture
 def ball(tmp_path):
-    save([sphere()], tmp_path / "ball.ply")
+    save([drawn_ball()], tmp_path / "ball.ply")
     return tmp_path / "ball.ply"
 
 
@@ -94,23 +66,6 @@ def sided_light(tmp_path):
     return path
 
 
-def write_capture(folder, cameras, **changes):
-    """A capture of one camera per (name, frame, split), without images: none are needed to draw over them."""
-    folder.mkdir()
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    camera = Camera.orbit((0, 0, 0), 3.0, 30.0, 20.0, width=40, height=32, vertical_fov=30.0)
-    content = {
-        "w": 40, "h": 32, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 20, "cy": 16,
-        "frames": [
-            {"file_path": f"images/{name}/{frame:04d}.exr", "camera": name, "frame": frame, "split": split,
-             "transform_matrix": (camera.camera_to_world @ flip).tolist(), **changes}
-            for name, frame, split in cameras
-        ],
-    }  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps(content))
-    return camera
-
-
 def test_exr_shows_the_white_furnace(ball, white_light, tmp_path):
     assert run(ball, "--environment", white_light, "--out", tmp_path / "x.exr", *SIDE, "--aov", "--device", "cpu") == 0
     layers = read_image(tmp_path / "x.exr").channels
@@ -119,7 +74,7 @@ def test_exr_shows_the_white_furnace(ball, white_light, tmp_path):
     assert 0.4 < solid.mean() < np.pi / 4
     np.testing.assert_allclose(layers["base_color.G"][solid], 0.4, atol=CODED)
     np.testing.assert_allclose(layers["roughness"][solid], 0.5, atol=CODED)
-    expected_normals, expected_depth = see_ball(Camera.frame_points(sphere().positions, width=48, height=48))
+    expected_normals, expected_depth = see_ball(Camera.frame_points(drawn_ball().positions, width=48, height=48))
     facing = solid & (expected_depth < 1.5)  # where the surface is turned by 53 degrees at most
     normals = np.stack([layers[f"normal.{part}"] for part in "XYZ"], axis=-1)
     # A disc's deviation is 0.015 m, the low-pass's 0.55 pixel or 0.01 m, 0.017 m on the turned surface: 0.023 together.
@@ -165,7 +120,7 @@ def test_png_is_display_encoded_with_straight_alpha(ball, white_light, tmp_path)
 
 
 def test_usd_shows_the_same_picture(ball, sided_light, tmp_path):
-    save([sphere()], tmp_path / "ball.usdc")
+    save([drawn_ball()], tmp_path / "ball.usdc")
     look = ["--environment", sided_light, *SIDE, *PLAIN, "--look-at", 2, -2, 1, 0, 0, 0]
     assert run(ball, "--out", tmp_path / "ply.png", *look) == 0
     assert run(tmp_path / "ball.usdc", "--out", tmp_path / "usd.png", *look) == 0
@@ -178,7 +133,7 @@ def test_usd_shows_the_same_picture(ball, sided_light, tmp_path):
 
 def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(white_light, tmp_path):
     stated = {"raster_antialiased": "true", "raster_low_pass": "2.0"}
-    ball = GaussianSequence.from_clouds([sphere()], metadata=stated)
+    ball = GaussianSequence.from_clouds([drawn_ball()], metadata=stated)
     for name, options in (("ball.ply", {"profile": "beam"}), ("ball.usdc", {"full_float": True})):
         converters.write(ball, tmp_path / name, converters.WriteOptions(**options))
 
@@ -213,122 +168,25 @@ def test_look_at_and_size(ball, white_light, tmp_path):
 ERRORS = {"ambient_occlusion_error", "roughness_error", *(f"base_color_error.{part}" for part in "RGB")}
 
 
-def judged(error=0.02):
-    """The ball, with errors and flags; not relightable, since it has no normals."""
-    return sphere().with_arrays(
-        normals=None,
-        ambient_occlusion_error=np.full(10_000, 0.01),
-        base_color_error=np.full((10_000, 3), 0.03),
-        roughness_error=np.full(10_000, error),
-        observability=np.where(sphere().positions[:, 0] > 0.0, 32, 0),  # at the right of the image
-    )
-
-
 def test_aov_writes_the_errors_that_there_are(white_light, tmp_path):
     for name, changes, more in (
         ("all", {}, ERRORS),
         ("some", {"base_color_error": None, "ambient_occlusion_error": None}, {"roughness_error"}),
     ):
-        cloud = judged().with_arrays(normals=sphere().normals, **changes)
+        cloud = judged_ball().with_arrays(normals=drawn_ball().normals, **changes)
         path = tmp_path / f"{name}.usdc"
         converters.write(GaussianSequence.from_clouds([cloud]), path, converters.WriteOptions(full_float=True))
         out = tmp_path / f"{name}.exr"
-        words = ["--environment", white_light, "--out", out, *SIDE, *PLAIN, "--aov", "--device", "cpu"]
+        words = ["--environment", white_light, "--out", out, *SIDE, *PLAIN, "--samples", 2, "--aov", "--device", "cpu"]
         assert run(path, *words) == 0
         layers = read_image(out).channels
         assert set(layers) == LAYERS | more
         np.testing.assert_allclose(layers["roughness_error"][layers["A"] > 0.99], 0.02, rtol=1e-5)
 
 
-def test_a_channel_needs_no_light_and_no_material(tmp_path, capsys):
-    converters.write(GaussianSequence.from_clouds([judged()]), tmp_path / "ball.usdc")
-    common = [tmp_path / "ball.usdc", *SIDE, "--device", "cpu"]
-    assert run(*common, "--channel", "base_color_error", "--out", tmp_path / "x.png") == 0
-    assert "base_color_error: 0 (dark) to 0.05" in capsys.readouterr().out
-    image = read_image(tmp_path / "x.png")
-    assert image.alpha is None
-    assert image.height > image.width == 48  # a legend below
-    assert run(*common, "--channel", "base_color_error", "--out", tmp_path / "x.exr", "--json") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["channel"], said["range"]) == ("base_color_error", [0.0, 0.05])
-    layers = read_image(tmp_path / "x.exr").channels
-    assert set(layers) == {"A", *(f"base_color_error.{part}" for part in "RGB")}
-    np.testing.assert_allclose(layers["base_color_error.G"][layers["A"] > 0.99], 0.03, rtol=2e-3)  # half has 11 bits
-
-
-def test_flags_are_drawn_and_counted(tmp_path, capsys):
-    converters.write(GaussianSequence.from_clouds([judged()]), tmp_path / "ball.usdc")
-    common = [tmp_path / "ball.usdc", *SIDE, "--device", "cpu", "--channel", "observability"]
-    assert run(*common, "--out", tmp_path / "x.png", "--json") == 0
-    flags = json.loads(capsys.readouterr().out)["flags"]
-    assert flags.pop("grazing") == pytest.approx(0.5, abs=0.02)  # a half of the ball's disc
-    assert set(flags.values()) == {0.0}
-    assert run(*common, "--out", tmp_path / "x.exr") == 0
-    assert "observability: unseen 0.0%, unlit 0.0%, grazing " in capsys.readouterr().out
-    layers = read_image(tmp_path / "x.exr").channels
-    picture = np.rint(255.0 * read_image(tmp_path / "x.png").rgb())[:48]
-    for columns, share, color in ((np.s_[27:], 1.0, [0x00, 0x9E, 0x73]), (np.s_[:21], 0.0, [0xD9, 0xD9, 0xD9])):
-        solid = layers["A"][:, columns] > 0.999
-        assert solid.sum() > 100
-        np.testing.assert_allclose(layers["observability.grazing"][:, columns][solid], share, atol=1e-5)
-        assert np.abs(picture[:, columns][solid] - color).max() <= 1
-
-
-def test_all_frames_have_one_range(tmp_path, capsys):
-    clouds = [judged(error) for error in (0.02, 0.9)]
-    converters.write(GaussianSequence.from_clouds(clouds), tmp_path / "a.usda")
-    common = [tmp_path / "a.usda", *SIDE, "--channel", "roughness_error", "--out", tmp_path / "x.png"]
-    assert run(*common) == 0
-    assert "roughness_error: 0 (dark) to 0.02" in capsys.readouterr().out
-    low, high = (read_image(tmp_path / f"x{frame:06d}.png").rgb() for frame in range(2))
-    assert np.array_equal(low[48:], high[48:])  # the legend
-    assert np.array_equal(low, high)  # 0.9 is beyond the end, and 0.02 is the end
-    assert run(*common, "--range", 0, 1) == 0
-    assert "roughness_error: 0 (dark) to 1\n" in capsys.readouterr().out
-    low, high = (read_image(tmp_path / f"x{frame:06d}.png").rgb() for frame in range(2))
-    assert high[24, 24] @ [1, 1, 1] > low[24, 24] @ [1, 1, 1] + 0.5
-
-
-def test_a_channel_from_the_cameras_of_a_capture(tmp_path):
-    converters.write(GaussianSequence.from_clouds([judged()]), tmp_path / "ball.usdc")
-    write_capture(tmp_path / "capture", [("b", 0, "test"), ("c", 0, "test")])
-    words = ["--channel", "base_color", "--capture", tmp_path / "capture", "--out", tmp_path / "out"]
-    assert run(tmp_path / "ball.usdc", *words) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["b_0000.png", "c_0000.png"]
-    image = read_image(tmp_path / "out" / "b_0000.png")
-    assert (image.width, image.height) == (40, 32)
-    np.testing.assert_allclose(image.rgb()[16, 20], linear_to_srgb(np.array([0.8, 0.4, 0.2])), atol=0.01)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--channel", "albedo"], "channel must be one of radiance, surface_normals, base_color,"),
-        (["--channel", "roughness_error"], "channels must name arrays that the cloud holds, got 'roughness_error'"),
-        (["--channel", "observability"], "channel must be one that the cloud holds, got 'observability'"),
-        (
-            ["--channel", "roughness", "--environment", "x.hdr"],
-            "environment must be left out with --channel, got x.hdr",
-        ),
-        (["--channel", "roughness", "--exposure", "1"], "exposure must be left out with --channel, got 1.0"),
-        (["--channel", "roughness", "--aov"], "aov must be left out with --channel, got True"),
-        (["--channel", "roughness", "--range", "1", "0"], "range must be two numbers, the lower one first, got (1.0"),
-        (["--channel", "roughness", "--range", "0", "nan"], "range must be two numbers, the lower one first, got (0.0"),
-        (["--range", "0", "1"], "range must come with --channel, got (0.0, 1.0) without. Leave it out."),
-    ],
-)
-def test_refusals_of_channels_are_one_line(ball, tmp_path, capsys, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert run(ball, "--out", "x.png", *words) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
-
-
 def test_several_frames_are_numbered_and_share_a_camera(white_light, tmp_path, capsys):
     (tmp_path / "walk").mkdir()
-    save([sphere((x, 0, 0)) for x in (-0.5, 0.0, 0.5)], tmp_path / "walk" / "walk.ply")
+    save([drawn_ball((x, 0, 0)) for x in (-0.5, 0.0, 0.5)], tmp_path / "walk" / "walk.ply")
     common = [tmp_path / "walk", "--environment", white_light, *SIDE, *PLAIN, "--height", 24, "--json"]
     assert run(*common, "--out", tmp_path / "x.png") == 0
     result = json.loads(capsys.readouterr().out)
@@ -363,32 +221,6 @@ def test_capture_gives_a_file_for_each_record(ball, white_light, tmp_path, capsy
     assert run(*common, "--split", "train", "--frame", 0, "--quiet") == 0
     assert (out / "a_0000.exr").exists()
     assert set(read_image(out / "a_0000.exr").channels) == set("RGBA")
-
-
-def test_records_are_those_that_the_asset_says_it_shows(white_light, tmp_path, capsys):
-    """An asset of the frames 3 and 7 of a capture: its frame 1 is the capture's frame 7."""
-    clouds = [sphere((x, 0.0, 0.0)) for x in (-0.4, 0.4)]
-    sequence = GaussianSequence.from_clouds(clouds, metadata={"capture_frames": "3 7"})
-    converters.write(sequence, tmp_path / "a.usda")
-    write_capture(tmp_path / "capture", [("b", frame, "test") for frame in (0, 1, 3, 7)])
-    common = [tmp_path / "a.usda", "--channel", "base_color", "--capture", tmp_path / "capture", "--out"]
-    assert run(*common, tmp_path / "x") == 0
-    assert "2 records are of frames that the asset lacks (0, 1): not drawn" in capsys.readouterr().err
-    assert sorted(path.name for path in (tmp_path / "x").iterdir()) == ["b_0003.png", "b_0007.png"]
-    assert run(*common, tmp_path / "y", "--frame", 1, "--json") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["frames"] == [1]
-    assert said["outputs"] == [str(tmp_path / "y" / "b_0007.png")]
-    first, second, same = (
-        read_image(tmp_path / name).rgb() for name in ("x/b_0003.png", "x/b_0007.png", "y/b_0007.png")
-    )
-    np.testing.assert_array_equal(second, same)
-    camera = Capture.read(tmp_path / "capture").records[0].camera
-    for image, cloud in ((first, clouds[0]), (second, clouds[1])):
-        alpha = rasterize(cloud, camera, channels=(), device="cpu").alpha
-        there = image[..., 0] > 0.4  # red of the ball, not the grey behind
-        assert (there[alpha > 0.9]).all()
-        assert not there[alpha < 0.1].any()
 
 
 def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_light, tmp_path, capsys):
@@ -447,7 +279,7 @@ def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
     assert "environment must be given, got none" in capsys.readouterr().err
     assert run(ball, "--environment", tmp_path / "no.exr", "--out", out) == 2
     assert "no.exr" in capsys.readouterr().err
-    converters.write(GaussianSequence.from_clouds([sphere()]), tmp_path / "plain.ply")
+    converters.write(GaussianSequence.from_clouds([drawn_ball()]), tmp_path / "plain.ply")
     assert run(tmp_path / "plain.ply", "--environment", white_light, "--out", out) == 2
     error = capsys.readouterr().err
     assert (

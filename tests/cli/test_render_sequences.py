@@ -6,15 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
-from tyro.conf import FlagCreatePairsOff
 
 from beam_warp import converters
-from beam_warp.cli import render_relit
-from beam_warp.cli.console import run_command
+from beam_warp.cli.channel import DrawChannel
 from beam_warp.cli.main import main
-from beam_warp.cli.render import Render, render
+from beam_warp.cli.pages import parse
 from beam_warp.cli.render_checks import require_consistent
+from beam_warp.cli.render_flags import Render
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.video import find_ffmpeg
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -27,8 +25,7 @@ LAMP = {"type": "point", "position": [1, -2, 2], "intensity": [4, 4, 4]}
 
 
 def run(*words):
-    args = tyro.cli(Render, args=[str(word) for word in words], config=(FlagCreatePairsOff,))
-    return run_command(lambda: render(args))
+    return main(["render", *map(str, words)])
 
 
 def points(x, count=40):
@@ -111,8 +108,8 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch):
     made = Recorder()
-    monkeypatch.setattr(render_relit, "DeferredFrames", made.make)
-    monkeypatch.setattr(render_relit, "PathFrames", made.make)
+    monkeypatch.setattr("beam_warp.cli.render.DeferredFrames", made.make)
+    monkeypatch.setattr("beam_warp.cli.render.PathFrames", made.make)
     return made
 
 
@@ -309,6 +306,7 @@ class TestRenderers:
         assert run(*common_still, "--out", tmp_path / "x.exr", *more) == 0
         options, more = recorder.options[0]
         assert (options.environment_shadows, options.light_map_size, options.bounces) == (4, 256, 1)
+        assert options.samples == 2
         assert (more["raster"].low_pass, more["errors"]) == (0.5, True)
 
     def test_what_is_behind(self, common_still, recorder, tmp_path):
@@ -344,7 +342,7 @@ class TestFilm:
 
 
 def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(render_relit, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr("beam_warp.cli.render.find_ffmpeg", lambda: None)
     assert run(*common, "--out", tmp_path / "x.mp4", "--frames", "0:2") == 0
     captured = capsys.readouterr()
     assert "note: there is no ffmpeg to make x.mp4: its frames are" in captured.err
@@ -397,11 +395,8 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
             ["--out", "o", "--capture", "c", "--turntable", "9"],
             "camera must move in one way, got --capture and --turntable",
         ),
-        (
-            ["--out", "x.png", "--channel", "roughness", "--mode", "path"],
-            "mode must be left out with --channel, got path",
-        ),
-        (["--out", "x.mp4", "--channel", "roughness"], "out must end in .png or .exr with --channel, got x.mp4"),
+        (["--out", "x.png", "--samples", "0"], "samples must be an integer in [1, 16], got 0"),
+        (["--out", "x.png", "--mode", "path", "--samples", "2"], "samples must be left out with --mode path, got 2"),
         (["--out", "%d.png", "--seconds", "-1"], "seconds must be a number in"),
         (["--out", "%d.png", "--speed", "0"], "speed must be a number in [0.001, 1000], got 0.0"),
         (["--out", "x.mp4", "--crf", "99"], "crf must be an integer in [0, 51], got 99"),
@@ -416,8 +411,7 @@ def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps([{"time": 0, "camera_to_world": pose}]))
     before = sorted(tmp_path.iterdir())
-    environment = [] if "--channel" in words else ["--environment", light]
-    assert run(walk, *environment, "--device", "cpu", *words) == 2
+    assert run(walk, "--environment", light, "--device", "cpu", *words) == 2
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1
@@ -432,8 +426,6 @@ def test_one_stage_or_several_assets(walk, light, tmp_path, capsys):
     assert "asset must be one stage, or several assets, got" in capsys.readouterr().err
     assert run(stage, *words, "--spacing", 1) == 2
     assert "spacing must be left out with a stage, got 1.0" in capsys.readouterr().err
-    assert run(walk, walk, "--out", tmp_path / "x.png", "--channel", "roughness") == 2
-    assert "asset must be one with --channel" in capsys.readouterr().err
     assert run(walk, "--background", "environment", "--out", tmp_path / "x.png") == 2
     assert "environment must be given, got none. Pass --environment with a lat-long" in capsys.readouterr().err
 
@@ -445,19 +437,23 @@ def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch
 
 
 def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):
-    """Those of the page and of the help say nothing that contradicts itself; channels are asked for without light."""
+    """Those of the pages and of the help say nothing that contradicts itself."""
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).parents[2] / "docs" / "sequences.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^    beam render (.+)$", page, re.MULTILINE)
-    shown += re.findall(r"Example: beam render (.+)$", Render.__doc__, re.MULTILINE)
-    assert len(shown) > 15
-    for words in shown:
-        require_consistent(tyro.cli(Render, args=words.split(), config=(FlagCreatePairsOff,)))
+    docs = Path(__file__).parents[2] / "docs"
+    pages = "".join((docs / name).read_text(encoding="utf-8") for name in ("sequences.md", "materials.md"))
+    for word, record, least in (("render", Render, 15), ("channel", DrawChannel, 3)):
+        shown = re.findall(rf"^    beam {word} (.+)$", pages, re.MULTILINE)
+        shown += re.findall(rf"Example: beam {word} (.+)$", record.__doc__, re.MULTILINE)
+        assert len(shown) > least
+        for words in shown:
+            args = parse(record, words.split(), f"beam {word}")
+            if isinstance(args, Render):
+                require_consistent(args)
 
 
-def test_help_shows_a_line_for_every_use(capsys):
-    with pytest.raises(SystemExit):
-        main(["render", "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    for words in ("--frames 0:150 --mode path --out turntable.mp4", "frames/%04d.exr", "--speed 0.25", "--turns 1"):
-        assert words in said
+def test_other_samples_make_another_render(common, recorder, tmp_path, capsys):
+    for samples, code in ((None, 0), (2, 0), (1, 2)):
+        more = [] if samples is None else ["--samples", samples]
+        assert run(*common, "--out", tmp_path / "%d.png", *more) == code
+    assert len(recorder.shots) == 4
+    assert "frames that are there must be of the same render" in capsys.readouterr().err

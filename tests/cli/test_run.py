@@ -115,14 +115,6 @@ def test_output_folder_that_cannot_be_made(ball, sky, tmp_path, capsys):
     assert "error: out must be a folder that can be made" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["render", "--help"], ["demo", "--help"]])
-def test_help_has_an_example(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 0
-    assert "Example: beam" in " ".join(capsys.readouterr().out.split())
-
-
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("beam 0.")

@@ -4,12 +4,8 @@ import dataclasses
 import json
 
 import pytest
-import tyro
-from tyro.conf import FlagCreatePairsOff
 
-from beam_warp.cli.console import run_command
-from beam_warp.cli.stability import Stability
-from beam_warp.cli.stability import stability as run_stability
+from beam_warp.cli.main import main
 from beam_warp.stability import analytic_occlusion
 from beam_warp.stability import capture_cases as stress_captures
 from beam_warp.stability import material_cases as stress_materials
@@ -34,46 +30,54 @@ def few_cases(monkeypatch):
 
 
 def run(*words):
-    args = tyro.cli(Stability, args=["--device", "cpu", *map(str, words)], config=(FlagCreatePairsOff,))
-    return run_command(lambda: run_stability(args))
+    return main(["stability", "--device", "cpu", *map(str, words)])
 
 
-def test_tables(capsys):
-    assert run() == 0
-    out, err = capsys.readouterr()
-    assert "stress cases on cpu" in out
-    assert "10 with a zero quaternion" in out
-    assert "coaxial disc" in out
-    assert "2 million" not in out
-    assert err == ""
-
-
-def test_page(tmp_path, capsys):
-    assert run("--out", tmp_path / "page.md", "--quiet") == 0
-    assert capsys.readouterr().out == ""
-    page = (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert "| error, cpu | verdict |" in page
-    row = next(line for line in page.splitlines() if line.startswith("| broken rows |"))
-    assert "60 not finite, 10 with a negative scale, 10 with a zero quaternion | left out |" in row
-    assert row.endswith("| ok |")
-    assert [path.name for path in tmp_path.iterdir()] == ["page.md"]
-
-
-def test_json_of_another_device_stands_beside(tmp_path, capsys):
-    assert run("--json") == 0
+def run_beside(page, capsys, *words, code=0, **changes):
+    """Run for JSON, let a GPU have found the same but for some changes, and run again beside it."""
+    assert run(*words, "--json") == code
     record = json.loads(capsys.readouterr().out)
+    rows = [row for part in record.values() if isinstance(part, list) for row in part]
+    for row in rows:
+        row["device"] = "Some GPU"
+    rows[0].update(changes)
+    gpu = page.with_name("gpu.json")
+    gpu.write_text(json.dumps(record), encoding="utf-8")
+    assert run(*words, "--out", page, "--beside", gpu) == code
+    return record, capsys.readouterr(), page.read_text(encoding="utf-8")
+
+
+def test_tables_and_a_page_of_two_devices(tmp_path, capsys):
+    fault = "3 rays differ by more than rounding explains"
+    record, said, page = run_beside(tmp_path / "page.md", capsys, faults=[fault])
     assert record["passed"]
     assert [(row["case"], row["hierarchy"]) for row in record["cases"]] == [
         (name, hierarchy) for name in NAMES[:2] for hierarchy in stability.HIERARCHIES
     ]
-    for row in (*record["cases"], *record["occlusion"]):
-        row["device"] = "Some GPU"
-    record["cases"][1]["faults"] = ["3 rays differ by more than rounding explains"]
-    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
-    assert run("--out", tmp_path / "page.md", "--beside", tmp_path / "gpu.json", "--quiet") == 0
-    page = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "stress cases on cpu" in said.out
+    assert "10 with a zero quaternion" in said.out
+    assert "coaxial disc" in said.out
+    assert "2 million" not in said.out
+    assert said.err == ""
     assert "| error, cpu | error, Some GPU | verdict |" in page
-    assert "| Some GPU, fast: 3 rays differ by more than rounding explains |" in page
+    row = next(line for line in page.splitlines() if line.startswith("| broken rows |"))
+    assert "60 not finite, 10 with a negative scale, 10 with a zero quaternion | left out |" in row
+    assert row.endswith("| ok |")
+    assert f"| Some GPU, fast: {fault} |" in page
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "page.md"]
+
+
+def test_quietly_a_page_keeps_what_was_not_run(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    parts = ("Captures on which reconstructions fail", "Materials", "Relighting")
+    after = "\n".join(f"## {part}\n\nkept, {part}\n" for part in parts)
+    page.write_text(f"# Stability\n\nrays of before\n\n{after}", encoding="utf-8")
+    assert run("--only", "tracing", "--out", page, "--quiet") == 0
+    assert capsys.readouterr().out == ""
+    text = page.read_text(encoding="utf-8")
+    assert "| broken rows |" in text
+    assert "rays of before" not in text
+    assert text.endswith(f"| ok |\n\n{after}")
 
 
 def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
@@ -99,46 +103,21 @@ def one_capture(monkeypatch, tiny_capture):
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [black_camera])
 
 
-def test_captures_alone(one_capture, tmp_path, capsys):
+def test_captures_alone_of_two_devices(one_capture, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text(
         "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n", encoding="utf-8"
     )
-    assert run("--only", "reconstruction", "--out", page) == 0
-    out, _ = capsys.readouterr()
-    assert "stress captures on cpu" in out
-    assert "black-image of" in out
-    assert "coaxial disc" not in out
-    text = page.read_text(encoding="utf-8")
+    fault = "not detected: black-image of train_03"
+    _, said, text = run_beside(page, capsys, "--only", "reconstruction", faults=[fault])
+    assert "stress captures on cpu" in said.out
+    assert "black-image of" in said.out
+    assert "coaxial disc" not in said.out
     assert text.startswith("# Stability\n\nrays\n\n## Captures")  # what was not run stays
     assert "what was before" not in text
-    row = next(line for line in text.splitlines() if line.startswith("| black camera |"))
-    assert "black-image of train_03 | 1 of 6 cameras left out, told |" in row  # told: six cameras are few
-    assert row.endswith("| ok |")
-
-
-def test_tracing_alone_keeps_captures(one_capture, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# Stability\n\nrays of before\n\n## Captures on which reconstructions fail\n\nkept\n", encoding="utf-8"
-    )
-    assert run("--only", "tracing", "--out", page, "--quiet") == 0
-    text = page.read_text(encoding="utf-8")
-    assert "| broken rows |" in text
-    assert "rays of before" not in text
-    assert text.endswith("\n## Captures on which reconstructions fail\n\nkept\n")
-
-
-def test_captures_of_another_device_stand_below(one_capture, tmp_path, capsys):
-    assert run("--only", "reconstruction", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
-    record["captures"][0] |= {"device": "Some GPU", "faults": ["not detected: black-image of train_03"]}
-    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
-    page = tmp_path / "page.md"
-    assert run("--only", "reconstruction", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 0
-    text = page.read_text(encoding="utf-8")
+    assert "black-image of train_03 | 1 of 6 cameras left out, told |" in text  # told: six cameras are few
     assert text.index("cpu: 6 cameras of 64 x 64 pixels") < text.index("Some GPU: 6 cameras of 64 x 64 pixels")
-    assert "| not detected: black-image of train_03 |" in text
+    assert f"| {fault} |" in text
 
 
 def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
@@ -163,40 +142,18 @@ def one_light(monkeypatch):
     return case
 
 
-def test_materials_alone(one_light, tmp_path, capsys):
+def test_materials_alone_of_two_devices(one_light, tmp_path, capsys):
     page = tmp_path / "page.md"
     captures = "## Captures on which reconstructions fail\n\nkept\n"
     page.write_text(f"# Stability\n\nrays\n\n{captures}", encoding="utf-8")
-    assert run("--only", "materials", "--out", page) == 0
-    out, _ = capsys.readouterr()
-    assert "materials on cpu" in out
-    assert "coaxial disc" not in out
-    text = page.read_text(encoding="utf-8")
+    fault = "must be refused, and was not"
+    _, said, text = run_beside(page, capsys, "--only", "materials", faults=[fault])
+    assert "materials on cpu" in said.out
+    assert "coaxial disc" not in said.out
     assert text.startswith(f"# Stability\n\nrays\n\n{captures}\n## Materials\n")
-    row = next(line for line in text.splitlines() if line.startswith("| black environment |"))
-    assert "refused: environment must shed light" in row
-    assert row.endswith("| ok |")
-
-
-def test_other_parts_keep_materials(one_light, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text("# Stability\n\nrays of before\n\n## Materials\n\nkept\n", encoding="utf-8")
-    assert run("--only", "tracing", "--out", page, "--quiet") == 0
-    text = page.read_text(encoding="utf-8")
-    assert "rays of before" not in text
-    assert text.endswith("| ok |\n\n## Materials\n\nkept\n")
-
-
-def test_materials_of_another_device_stand_below(one_light, tmp_path, capsys):
-    assert run("--only", "materials", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
-    record["materials"][0] |= {"device": "Some GPU", "faults": ["must be refused, and was not"]}
-    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
-    page = tmp_path / "page.md"
-    assert run("--only", "materials", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 0
-    text = page.read_text(encoding="utf-8")
+    assert "refused: environment must shed light" in text
     assert text.index("cpu: 42 Gaussians") < text.index("Some GPU: 42 Gaussians")
-    assert "| must be refused, and was not |" in text
+    assert f"| {fault} |" in text
 
 
 def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
@@ -217,43 +174,20 @@ def leaking_front(monkeypatch):
     return case
 
 
-def test_relighting_alone(leaking_front, tmp_path, capsys):
+def test_relighting_alone_of_two_devices(leaking_front, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text("# Stability\n\nrays\n\n## Materials\n\nkept\n", encoding="utf-8")
-    assert run("--only", "relighting", "--out", page) == 1
-    out, err = capsys.readouterr()
-    assert "relighting on cpu" in out
-    assert "coaxial disc" not in out
-    assert err.startswith("failed: a leaking front before a dark inside on cpu, deferred: radiance, of the front's own")
-    assert err.count("\n") == 1
-    text = page.read_text(encoding="utf-8")
+    record, said, text = run_beside(page, capsys, "--only", "relighting", code=1)
+    assert [row["renderer"] for row in record["relighting"]] == ["deferred", "path"]
+    assert "relighting on cpu" in said.out
+    assert "coaxial disc" not in said.out
+    failed = "failed: a leaking front before a dark inside on cpu, deferred: radiance, of the front's own"
+    assert said.err.startswith(failed)
+    assert said.err.count("\n") == 1
     assert text.startswith("# Stability\n\nrays\n\n## Materials\n\nkept\n\n## Relighting\n")
-    assert "1 of 2 hold." in text
     by_paths = next(line for line in text.splitlines() if "| path |" in line)
     assert by_paths.startswith("| a leaking front before a dark inside |")
     assert by_paths.endswith("| ok |")
-
-
-def test_other_parts_keep_relighting(tmp_path, capsys):
-    page = tmp_path / "page.md"
-    after = "## Materials\n\nkept\n\n## Relighting\n\nkept too\n"
-    page.write_text(f"# Stability\n\nrays of before\n\n{after}", encoding="utf-8")
-    assert run("--only", "tracing", "--out", page, "--quiet") == 0
-    text = page.read_text(encoding="utf-8")
-    assert "rays of before" not in text
-    assert text.endswith(f"\n\n{after}")
-
-
-def test_relighting_of_another_device_stands_below(leaking_front, tmp_path, capsys):
-    assert run("--only", "relighting", "--json") == 1
-    record = json.loads(capsys.readouterr().out)
-    assert [row["renderer"] for row in record["relighting"]] == ["deferred", "path"]
-    for row in record["relighting"]:
-        row["device"] = "Some GPU"
-    (tmp_path / "gpu.json").write_text(json.dumps(record), encoding="utf-8")
-    page = tmp_path / "page.md"
-    assert run("--only", "relighting", "--beside", tmp_path / "gpu.json", "--out", page, "--quiet") == 1
-    text = page.read_text(encoding="utf-8")
     assert text.index("cpu: images of") < text.index("Some GPU: images of")
 
 
@@ -279,6 +213,5 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path, capsys):
 
 
 def test_a_device_that_is_not_there_is_refused(capsys):
-    args = tyro.cli(Stability, args=["--device", "cuda:99"], config=(FlagCreatePairsOff,))
-    assert run_command(lambda: run_stability(args)) == 2
+    assert main(["stability", "--device", "cuda:99"]) == 2
     assert "device must be one of cpu" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from support.changed_code import changed_code
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, find_ffmpeg
-from beam_warp.stage.jobs import Frame, RenderInterruptedError, RenderJob
+from beam_warp.stage.jobs import FrameRequest, RenderInterruptedError, RenderJob
 from beam_warp.stage.output import Film, FramePattern
 from beam_warp.stage.pictures import PictureOptions, PictureWriter
 from beam_warp.world.camera import Camera
@@ -63,7 +63,7 @@ class MadeUpRenderer:
 
 
 def frames(count=5, **changes):
-    return [replace(Frame(number=n, time=float(n), width=8, height=6), **changes) for n in range(count)]
+    return [replace(FrameRequest(number=n, time=float(n), width=8, height=6), **changes) for n in range(count)]
 
 
 def job(renderer, stage=None, heard=None, **options):

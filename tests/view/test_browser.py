@@ -245,9 +245,9 @@ def test_two_pages_look_from_two_sides_and_one_leaves(page, viewer, browser):
     other.close()  # in the middle of its frame
     viewer.change(rotation=120.0)
     deadline = time.monotonic() + PATIENCE
-    while viewer.page_count > 1 and time.monotonic() < deadline:
+    while len(viewer._pages) > 1 and time.monotonic() < deadline:
         page.wait_for_timeout(100)
-    assert viewer.page_count == 1
+    assert len(viewer._pages) == 1
     settled(page, viewer)
 
 

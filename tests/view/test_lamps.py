@@ -7,7 +7,7 @@ import pytest
 
 from beam_warp.view.lamps import KINDS, MOST_LAMPS, Lamps
 from beam_warp.view.server import start_server, stop_server
-from beam_warp.view.state import Subject
+from beam_warp.view.state import SubjectBox
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 
 pytest.importorskip("viser")
@@ -20,7 +20,7 @@ def placed():
     """Lamps, and the lights that they told last."""
     server = start_server("127.0.0.1", 0, "lamps")
     told = []
-    yield Lamps(server, Subject(np.zeros(3), np.ones(3)), told.append), told, server
+    yield Lamps(server, SubjectBox(np.zeros(3), np.ones(3)), told.append), told, server
     stop_server(server)
 
 

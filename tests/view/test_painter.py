@@ -12,7 +12,7 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.view.painter import CloudPainter, FrameCache, TracedPicture, ground_mesh
 from beam_warp.view.renderers import displayed
-from beam_warp.view.state import ALPHA, DEPTH, LIT, NO_ENVIRONMENT, Subject, ViewState
+from beam_warp.view.state import ALPHA, DEPTH, LIT, NO_ENVIRONMENT, SubjectBox, ViewState
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -177,7 +177,7 @@ def test_an_image_of_nothing_is_background():
 
 
 def test_the_ground_is_below_the_subject():
-    subject = Subject(np.array([-0.5, -0.3, 0.1]), np.array([0.5, 0.3, 2.0]))
+    subject = SubjectBox(np.array([-0.5, -0.3, 0.1]), np.array([0.5, 0.3, 2.0]))
     ground = ground_mesh(subject, catches_shadows=True)
     assert ground.catches_shadows.all()
     np.testing.assert_allclose(ground.surface.vertices[:, 2], 0.1, rtol=1e-6)

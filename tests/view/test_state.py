@@ -15,7 +15,7 @@ from beam_warp.view.state import (
     TRACED,
     PlacedLight,
     Playback,
-    Subject,
+    SubjectBox,
     Viewpoint,
     ViewState,
     channels_of,
@@ -155,7 +155,7 @@ def test_placed_lights_take_no_nonsense():
 
 @pytest.mark.parametrize("kind", ["point", "spot", "directional"])
 def test_a_new_light_shines_on_the_subject(kind):
-    subject = Subject(np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 2.0]))
+    subject = SubjectBox(np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 2.0]))
     placed = subject.new_light(kind)
     light = placed.light()
     offset = subject.center - np.asarray(placed.position)
@@ -166,8 +166,8 @@ def test_a_new_light_shines_on_the_subject(kind):
 
 
 def test_a_box_around_nothing():
-    assert Subject.of(np.zeros((0, 3))).extent > 0.0
-    assert Subject.of(np.zeros((1, 3))).extent > 0.0
+    assert SubjectBox.of(np.zeros((0, 3))).extent > 0.0
+    assert SubjectBox.of(np.zeros((1, 3))).extent > 0.0
 
 
 def test_channels_are_those_that_there_are():

@@ -1,0 +1,54 @@
+"""Options that several commands share; how splats are drawn, unless the user overrules what the asset states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+if TYPE_CHECKING:
+    from beam_warp.raster.records import RasterOptions
+
+ASSET_NAME = "asset.usda"
+"""Name that `beam run` gives to its result."""
+
+Antialiased = Annotated[
+    Literal["yes", "no"] | None,
+    arg(help="Whether splats keep their opacity when the pixel filter widens them; by default as the asset says."),
+]
+LowPass = Annotated[
+    float | None,
+    arg(metavar="PX2", help="Variance of the pixel filter; by default as the asset says, 0.3 if it says nothing."),
+]
+SourceAxes = Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")]
+DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")]
+Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
+Device = Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")]
+Quiet = Annotated[bool, arg(help="Print nothing but errors.")]
+Json = Annotated[bool, arg(help="Print the result as JSON.")]
+
+
+def asset_in(path: Path) -> Path:
+    """Return the asset in a folder that `beam run` wrote; any other path as it is."""
+    inner = path / ASSET_NAME
+    return inner if inner.is_file() else path
+
+
+def stated(**options: Any) -> dict[str, Any]:
+    """Return the options that were given: those that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def raster_options(metadata: Mapping[str, str], antialiased: str | None, low_pass: float | None) -> RasterOptions:
+    """Return how an asset is drawn: as its metadata say, but for what the user says.
+
+    Raises:
+        InvalidOptionError: The low-pass is out of range, or the metadata say something else than a filter.
+    """
+    from beam_warp.raster.records import RasterOptions
+
+    given = stated(antialiased=None if antialiased is None else antialiased == "yes", low_pass=low_pass)
+    return replace(RasterOptions.from_metadata(metadata), **given)

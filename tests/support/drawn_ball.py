@@ -1,0 +1,63 @@
+"""A ball of Gaussians with known materials, and captures without images around it, for commands that draw."""
+
+import json
+
+import numpy as np
+
+from beam_warp import converters
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+
+
+def drawn_ball(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
+    """Opaque flat discs on a ball of radius 0.5 m."""
+    index = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * index / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
+    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
+    return GaussianCloud(
+        positions=0.5 * normals + center,
+        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        scales=np.tile([0.015, 0.015, 1e-4], (count, 1)),
+        opacities=np.full(count, 0.99),
+        radiance=np.zeros((count, 1, 3)),
+        radiance_color_space="lin_rec709_scene",
+        base_color=np.tile(color, (count, 1)),
+        roughness=np.full(count, 0.5),
+        ambient_occlusion=np.ones(count),
+        normals=normals,
+    )
+
+
+def judged_ball(error=0.02):
+    """The ball, with errors and flags; not relightable, since it has no normals."""
+    ball = drawn_ball()
+    return ball.with_arrays(
+        normals=None,
+        ambient_occlusion_error=np.full(10_000, 0.01),
+        base_color_error=np.full((10_000, 3), 0.03),
+        roughness_error=np.full(10_000, error),
+        observability=np.where(ball.positions[:, 0] > 0.0, 32, 0),  # at the right of the image
+    )
+
+
+def save(clouds, path):
+    converters.write(GaussianSequence.from_clouds(clouds), path, converters.WriteOptions(profile="beam"))
+
+
+def write_capture(folder, cameras, **changes):
+    """A capture of one camera per (name, frame, split), without images: none are needed to draw over them."""
+    folder.mkdir()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera = Camera.orbit((0, 0, 0), 3.0, 30.0, 20.0, width=40, height=32, vertical_fov=30.0)
+    content = {
+        "w": 40, "h": 32, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 20, "cy": 16,
+        "frames": [
+            {"file_path": f"images/{name}/{frame:04d}.exr", "camera": name, "frame": frame, "split": split,
+             "transform_matrix": (camera.camera_to_world @ flip).tolist(), **changes}
+            for name, frame, split in cameras
+        ],
+    }  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return camera
