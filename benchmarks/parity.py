@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beam_warp import Camera, EnvironmentMap, Scene, ambient_occlusion, change_axes, rasterize, read, visibility
+from beam_warp import Camera, EnvironmentMap, Scene, ambient_occlusion, rasterize, read, visibility
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED
+from beam_warp.world.axes import change_axes
 from beam_warp.world.shot import Shot
 
 DEVICES = ("cpu", "cuda:0")

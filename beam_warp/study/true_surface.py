@@ -22,7 +22,7 @@ from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.mesh import vertex_normals
-from beam_warp.world.shapes import Surface, tile
+from beam_warp.world.shapes import TiledSurface, tile
 
 OPACITY = 0.99
 """Opacity of every Gaussian, the rasteriser's cap of alpha: overlapping neighbours let 0.1 % of the light through."""
@@ -87,7 +87,7 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
     flat = crossed[chosen] / np.maximum(2.0 * areas[chosen, None], 1e-300)
     normals = np.where(lengths > 1e-6, normals / np.maximum(lengths, 1e-6), flat)
     places = np.einsum("nk,nkc->nc", weights, points[corners[chosen]])
-    tiles = tile((Surface(places, normals, float(np.sqrt(reached[-1] / count))),))
+    tiles = tile((TiledSurface(places, normals, float(np.sqrt(reached[-1] / count))),))
     scales = tiles.scales.copy()
     scales[:, 2] = FLATNESS * scales[:, 0]
     return tiles.with_arrays(scales=scales, opacities=np.full(count, OPACITY, np.float32))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.shapes import cloud_of, sphere_points, tiles
 
-from beam_warp import Observability
 from beam_warp.materials.base_color import SPECULAR_PART, UNKNOWN, least_squares, solve_base_color
 from beam_warp.materials.direct import ColorEvidence
+from beam_warp.world.gaussians import Observability
 
 IRRADIANCE = 3.0
 

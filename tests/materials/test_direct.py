@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from support.shapes import cloud_of, disc_points, sphere_points, tiles
 
-from beam_warp import GaussianCloud, Observability, Scene, irradiance
+from beam_warp import GaussianCloud, Scene, irradiance
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
 from beam_warp.light.prepared import PreparedEnvironment
@@ -16,6 +16,7 @@ from beam_warp.materials.direct import MaterialOptions, measure_materials, view_
 from beam_warp.materials.exposure import estimate_exposure
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import Observability
 from beam_warp.world.harmonics import SH_C0
 
 ROUGHNESS = 0.8

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from support.shapes import cloud_of, disc_points, sphere_points, tiles
 
-from beam_warp import Observability, Scene
+from beam_warp import Scene
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
@@ -22,6 +22,7 @@ from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import Observability
 from beam_warp.world.harmonics import SH_C0
 
 ROUGHNESS = 0.5

@@ -9,10 +9,11 @@ from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
 from support.raster_clouds import around, cloud
 
-from beam_warp import Camera, GaussianCloud, rasterize, rasterize_backward
+from beam_warp import Camera, GaussianCloud, rasterize
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster import forward, rasterizer
+from beam_warp.raster.gbuffer import rasterize_backward
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians

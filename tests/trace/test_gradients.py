@@ -6,9 +6,10 @@ import warp as wp
 from reference.visibility import FrozenVisibility
 from support.shapes import random_cloud, random_rays
 
-from beam_warp import GaussianCloud, Scene, visibility, visibility_gradients
+from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.trace import gradients
+from beam_warp.trace.gradients import visibility_gradients
 from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.transmittance import TraceOptions
 

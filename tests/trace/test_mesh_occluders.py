@@ -8,8 +8,10 @@ import trimesh
 from support.estimates import require_honest, require_zero_mean
 from support.shapes import random_cloud, random_rays
 
-from beam_warp import GaussianCloud, Scene, ambient_occlusion, closest_surface, visibility, visibility_gradients
+from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
 from beam_warp.errors import InvalidArrayError
+from beam_warp.trace.first_surface import closest_surface
+from beam_warp.trace.gradients import visibility_gradients
 from beam_warp.trace.reference import FLOAT32_ROUNDOFF
 from beam_warp.trace.transmittance import TraceOptions
 
