@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_choice, require_count
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import (
     Antialiased,
     Device,
@@ -25,6 +24,7 @@ from beam_warp.cli.flags import (
     Quiet,
     SourceAxes,
     asset_in,
+    notes_of,
     raster_options,
 )
 from beam_warp.cli.render_checks import kind_of, require_capture_folder, require_one_camera, require_place
@@ -89,7 +89,7 @@ def channel(args: DrawChannel) -> int:
     capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
     sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
-    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    notes = notes_of(sequence)
     if capture is None:
         views = _numbered_views(args, sequence)
     else:
@@ -119,8 +119,7 @@ def channel(args: DrawChannel) -> int:
             }
         )
     elif not args.quiet:
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
+        print_notes(notes)
         last = f" … {views[-1].path.name}" if len(views) > 1 else ""
         images = f"{len(views)} images, " if len(views) > 1 else ""
         print(f"wrote {views[0].path}{last}: {images}{gaussian_count:,} Gaussians, {seconds:.2f} s")

@@ -256,10 +256,7 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
         cloud, name = still_life(), "the built-in still life"
     else:
         sequence = converters.read(args.scene, source_axes=args.source_axes)
-        if not (0 <= args.frame < len(sequence)):
-            raise InvalidOptionError(
-                f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
-            )
+        _require_frame(args.frame, len(sequence))
         cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
     resolve_device(args.device)  # an unknown device is refused before a folder is made
     _make_folder(args.out)
@@ -353,10 +350,7 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
             )
         return MaterialsSubject.on_true_surface(capture, environment, args.frame, name, args.device)
     sequence = converters.read(args.asset)
-    if not (0 <= args.frame < len(sequence)):
-        raise InvalidOptionError(
-            f"frame must be in [0, {len(sequence) - 1}], got {args.frame}. Choose a frame that exists."
-        )
+    _require_frame(args.frame, len(sequence))
     images = CaptureImages(capture, sequence)
     views = images.views(args.frame)
     return MaterialsSubject(
@@ -369,6 +363,11 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
         args.asset.parent.name or args.asset.name,
         images.ceiling(args.frame, views),
     )
+
+
+def _require_frame(frame: int, count: int) -> None:
+    if not (0 <= frame < count):
+        raise InvalidOptionError(f"frame must be in [0, {count - 1}], got {frame}. Choose a frame that exists.")
 
 
 def _make_folder(folder: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -35,6 +35,12 @@ def print_json(value: Any) -> None:
     print()
 
 
+def print_notes(notes: Iterable[str], warnings: Iterable[str] = ()) -> None:
+    """Print on stderr what a user should know, beside the results."""
+    for line in (*(f"note: {note}" for note in notes), *(f"warning: {warning}" for warning in warnings)):
+        print(line, file=sys.stderr)
+
+
 class ProgressCallback(Protocol):
     """Hears how far a stage is; a stage that starts over begins at less than it had."""
 
@@ -57,10 +63,12 @@ def rate_in_words(steps_per_second: float | None) -> str:
 
 
 @contextmanager
-def progress(quiet: bool) -> Iterator[ProgressCallback]:
-    """Show stages with rate and time left on a terminal, and compilation of kernels; nothing when quiet.
+def progress(quiet: bool, *, compiles: bool = True) -> Iterator[ProgressCallback]:
+    """Show stages with rate and time left on a terminal; nothing when quiet or elsewhere.
 
-    Compilation is shown where Warp has been imported by now.
+    Args:
+        quiet: Show nothing.
+        compiles: Also show compilation of kernels. False for a command without kernels, so that Warp is not imported.
     """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, done, total, note="": None
@@ -100,14 +108,12 @@ def progress(quiet: bool) -> Iterator[ProgressCallback]:
             update(COMPILING, module_count, None, f"{module_count} module{'s'[: module_count > 1]}, {seconds:.0f} s")
             bars.update(tasks[COMPILING], visible=is_running)
 
-        with _kernels_heard(compiling):
+        with _kernels_heard(compiling) if compiles else nullcontext():
             yield update
 
 
 def _kernels_heard(listener: CompilationListener) -> AbstractContextManager[None]:
-    """Tell a listener of kernels that are compiled; do nothing where Warp is not in use: importing it takes long."""
-    if "warp" not in sys.modules:
-        return nullcontext()
+    """Tell a listener of kernels that are compiled."""
     from beam_warp.device.compilation import compilation_heard
 
     return compilation_heard(listener)

@@ -14,7 +14,8 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.cli.console import print_json, progress, run_command
+from beam_warp.cli.console import print_json, print_notes, progress, run_command
+from beam_warp.cli.flags import Json, Quiet, notes_of
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
@@ -58,8 +59,8 @@ class ConvertCommand:
     ] = None
     drop_invalid: Annotated[bool, arg(help="Drop rows with NaN or zero quaternions instead of refusing them.")] = False
     full_float: Annotated[bool, arg(help="USD: single precision throughout.")] = False
-    quiet: Annotated[bool, arg(help="Print nothing but errors.")] = False
-    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+    quiet: Quiet = False
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class InspectCommand:
     """What `beam-convert inspect` was asked for."""
 
     input: Annotated[Positional[Path], arg(metavar="FILE", help="PLY or USD file, or a folder of numbered PLY files.")]
-    json: Annotated[bool, arg(help="Print the result as JSON.")] = False
+    json: Json = False
 
 
 def _require_apart(source: Path, output: Path, frame_count: int) -> None:
@@ -99,7 +100,7 @@ def convert(command: ConvertCommand) -> int:
     is_ply = command.output.suffix.lower() == ".ply"
     _require_apart(command.input, command.output, len(sequence) if is_ply else 1)
     first = sequence[0]
-    with progress(command.quiet or command.json) as report:
+    with progress(command.quiet or command.json, compiles=False) as report:
 
         def read_and_report(frame: int) -> GaussianCloud:
             cloud = sequence[frame]
@@ -108,7 +109,7 @@ def convert(command: ConvertCommand) -> int:
 
         paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
 
-    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    notes = notes_of(sequence)
     if is_ply and command.profile == "standard" and first.base_color is not None:
         notes.append("materials are not in a standard PLY: --profile beam keeps them")
     seconds = time.perf_counter() - started
@@ -124,8 +125,7 @@ def convert(command: ConvertCommand) -> int:
             }
         )
     elif not command.quiet:
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
+        print_notes(notes)
         if is_ply:
             files = f"{paths[0]}" + (f" … {paths[-1].name}" if len(paths) > 1 else "")
         else:

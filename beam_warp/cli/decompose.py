@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
@@ -122,7 +121,7 @@ def decompose(args: Decompose) -> int:
     if args.json:
         print_json(result.report)
     elif not args.quiet:
-        print_warnings(result.report["input"]["notes"], result.report["warnings"])
+        print_notes(result.report["input"]["notes"], result.report["warnings"])
         print(outcome(result, time.perf_counter() - started))
     return 0
 
@@ -196,12 +195,6 @@ def overview_options(measuring: Measuring) -> OverviewOptions:
         azimuth=measuring.orbit[0],
         elevation=measuring.orbit[1],
     )
-
-
-def print_warnings(notes: list[str], warnings: list[str]) -> None:
-    """Say what a user should know, beside the results."""
-    for line in [f"note: {note}" for note in notes] + [f"warning: {warning}" for warning in warnings]:
-        print(line, file=sys.stderr)
 
 
 def outcome(result: RunResult, seconds: float) -> str:

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in
 
 if TYPE_CHECKING:
@@ -98,8 +98,7 @@ def evaluate(args: Evaluate) -> int:
     if args.json:
         print_json({**found.report, "asset": str(args.asset), "asset_notes": notes})
     elif not args.quiet:
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
+        print_notes(notes)
         _say(args, found)
     return 0
 

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 if TYPE_CHECKING:
     from beam_warp.raster.records import RasterOptions
+    from beam_warp.world.gaussians import GaussianSequence
 
 ASSET_NAME = "asset.usda"
 """Name that `beam run` gives to its result."""
@@ -35,6 +36,11 @@ def asset_in(path: Path) -> Path:
     """Return the asset in a folder that `beam run` wrote; any other path as it is."""
     inner = path / ASSET_NAME
     return inner if inner.is_file() else path
+
+
+def notes_of(sequence: GaussianSequence) -> list[str]:
+    """Return the notes of an asset's reader: assumptions, and rows left out."""
+    return [line for line in sequence.metadata.get("notes", "").splitlines() if line]
 
 
 def stated(**options: Any) -> dict[str, Any]:

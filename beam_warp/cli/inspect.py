@@ -43,7 +43,7 @@ def inspect(args: Inspect) -> int:
     if args.out is not None:
         for package in ("matplotlib", "plotly"):
             require_package(package)
-    with progress(args.quiet or args.json) as advance:
+    with progress(args.quiet or args.json, compiles=False) as advance:
         report = inspect_capture(Capture.read(args.capture), max_images=args.max_images, progress=advance)
     files = []
     if args.out is not None:

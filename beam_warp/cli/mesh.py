@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +16,18 @@ from tyro.conf import Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
-from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes, raster_options
+from beam_warp.cli.console import print_json, print_notes, progress
+from beam_warp.cli.flags import (
+    Antialiased,
+    Device,
+    DropInvalid,
+    Json,
+    LowPass,
+    Quiet,
+    SourceAxes,
+    notes_of,
+    raster_options,
+)
 from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.files import replacing, write_png
@@ -99,7 +108,7 @@ def mesh(args: Mesh) -> int:
     sequence = converters.read(args.sequence, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
     frames = _frames(args, len(sequence))
     options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
-    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    notes = notes_of(sequence)
     numbers = numbers_of_frames(sequence.metadata, len(sequence))
     cameras_of = {} if capture is None else {n: _capture_cameras(args, capture, numbers[n]) for n in frames}
     make_folders(args.out)
@@ -114,8 +123,7 @@ def mesh(args: Mesh) -> int:
     if args.json:
         print_json({"frames": reports, "notes": notes, "seconds": round(seconds, 3)})
     elif not args.quiet:
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
+        print_notes(notes)
         for entry in reports:
             print(_line(entry))
         print(f"{len(reports)} meshes in {args.out}, {seconds:.1f} s")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import Device, Json, Quiet, Seed
 from beam_warp.errors import InvalidOptionError
 
@@ -87,8 +86,7 @@ def reconstruct(args: Reconstruct) -> int:
     if args.json:
         print_json(result.report)
     elif not args.quiet:
-        for warning in result.report["warnings"]:
-            print(f"warning: {warning}", file=sys.stderr)
+        print_notes((), result.report["warnings"])
         print(f"wrote {result.asset}: {summary(result.report)}\nlook at {args.out / 'previews'}")
     return 0
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import raster_options, stated
 from beam_warp.cli.render_checks import require_consistent
 from beam_warp.cli.render_flags import Render
@@ -193,8 +192,7 @@ def _say(args: Render, plan: RenderPlan, tally: RenderTally, notes: list[str], d
         return
     if args.quiet:
         return
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(notes)
     last = f" … {outputs[-1].name}" if len(outputs) > 1 else ""
     count = len(tally.rendered) + len(tally.kept)
     images = f"{count} images, " if count > 1 else ""

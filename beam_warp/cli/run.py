@@ -12,13 +12,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
-from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.cli.console import ProgressCallback, print_json, print_notes, progress
 from beam_warp.cli.decompose import (
     Measuring,
     light_of,
     outcome,
     overview_options,
-    print_warnings,
     run_options,
 )
 from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
@@ -91,7 +90,7 @@ def run(args: Run) -> int:
         print_json(result.report if reconstruction is None else {**result.report, "reconstruction": reconstruction})
     elif not args.quiet:
         warnings = [] if reconstruction is None else reconstruction["warnings"]
-        print_warnings(result.report["input"]["notes"], [*warnings, *result.report["warnings"]])
+        print_notes(result.report["input"]["notes"], [*warnings, *result.report["warnings"]])
         if reconstruction is not None:
             print(f"reconstructed {args.input}: {summary(reconstruction)}")
         print(outcome(result, time.perf_counter() - started))

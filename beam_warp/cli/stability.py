@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -140,19 +141,14 @@ def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
 
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
+    named = [
+        *((outcome, f", {outcome.hierarchy}") for outcome in result.outcomes),
+        *((outcome, "") for outcome in (*result.captures, *result.materials)),
+        *((outcome, f", {outcome.renderer}") for outcome in result.relighting),
+    ]
     lines = [
-        f"failed: {outcome.case} on {outcome.device}, {outcome.hierarchy}: {'; '.join(outcome.faults)}"
-        for outcome in result.outcomes
-        if not outcome.passed
-    ]
-    lines += [
-        f"failed: {outcome.case} on {outcome.device}: {'; '.join(outcome.faults)}"
-        for outcome in (*result.captures, *result.materials)
-        if not outcome.passed
-    ]
-    lines += [
-        f"failed: {outcome.case} on {outcome.device}, {outcome.renderer}: {'; '.join(outcome.faults)}"
-        for outcome in result.relighting
+        f"failed: {outcome.case} on {outcome.device}{how}: {'; '.join(outcome.faults)}"
+        for outcome, how in named
         if not outcome.passed
     ]
     return lines + [
@@ -163,61 +159,33 @@ def _faults(result: StabilityResult) -> list[str]:
 
 
 def _print_tables(result: StabilityResult) -> None:
-    """Print what was run."""
+    """Print a table of every part that was run; how others fail is on the page."""
+    from beam_warp.stability import captures, materials, relighting
+
     if result.outcomes:
         _print_tracing(result)
     if result.captures:
-        _print_captures(result)
+        rows = [(o, captures.cells(o, result.captures)) for o in result.captures]
+        _print_table("stress captures", (captures.TITLES[0], *captures.TITLES[3:]), rows)
     if result.materials:
-        _print_materials(result)
+        rows = [(o, materials.cells(o)) for o in result.materials]
+        _print_table("materials", (materials.TITLES[0], *materials.TITLES[3:]), rows)
     if result.relighting:
-        _print_relighting(result)
+        cells = ((o, relighting.cells(o)) for o in result.relighting)
+        rows = [(o, (renderer, measured, verdict)) for o, (renderer, measured, _, verdict) in cells]
+        titles = (relighting.TITLES[0], *relighting.TITLES[3:5], relighting.TITLES[-1])
+        _print_table("relighting", titles, rows)
 
 
-def _print_materials(result: StabilityResult) -> None:
-    """Print one row a case."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from beam_warp.stability.materials import TITLES, cells
-    from beam_warp.stability.page import devices_of
-
-    titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
-    table = Table(*titles, title=f"materials on {', '.join(devices_of(result.materials))}")
-    for outcome in result.materials:
-        *found, verdict = cells(outcome)
-        table.add_row(outcome.case, *found, verdict if outcome.passed else f"[red]{verdict}[/red]")
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
-
-
-def _print_relighting(result: StabilityResult) -> None:
-    """Print one row a case and renderer."""
+def _print_table(name: str, titles: Sequence[str], rows: Sequence[tuple[Any, Sequence[str]]]) -> None:
+    """Print one row for each outcome: its case, and its cells, of which the last one is the verdict."""
     from rich.console import Console
     from rich.table import Table
 
     from beam_warp.stability.page import devices_of
-    from beam_warp.stability.relighting import TITLES, cells
 
-    titles = (TITLES[0], *TITLES[3:5], TITLES[-1])  # how others fail and what is asked is on the page
-    table = Table(*titles, title=f"relighting on {', '.join(devices_of(result.relighting))}")
-    for outcome in result.relighting:
-        renderer, measured, _, verdict = cells(outcome)
-        table.add_row(outcome.case, renderer, measured, verdict if outcome.passed else f"[red]{verdict}[/red]")
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
-
-
-def _print_captures(result: StabilityResult) -> None:
-    """Print one row a capture."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from beam_warp.stability.captures import TITLES, cells
-    from beam_warp.stability.page import devices_of
-
-    titles = (TITLES[0], *TITLES[3:])  # how others fail is on the page
-    table = Table(*titles, title=f"stress captures on {', '.join(devices_of(result.captures))}")
-    for outcome in result.captures:
-        *found, verdict = cells(outcome, result.captures)
+    table = Table(*titles, title=f"{name} on {', '.join(devices_of([outcome for outcome, _ in rows]))}")
+    for outcome, (*found, verdict) in rows:
         table.add_row(outcome.case, *found, verdict if outcome.passed else f"[red]{verdict}[/red]")
     Console(width=None if sys.stdout.isatty() else 200).print(table)
 

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number
-from beam_warp.cli.console import print_json, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import (
     Antialiased,
     Device,
@@ -24,6 +24,7 @@ from beam_warp.cli.flags import (
     Quiet,
     SourceAxes,
     asset_in,
+    notes_of,
     raster_options,
 )
 from beam_warp.demo.lights import stage, studio, sunset
@@ -144,13 +145,12 @@ def _unused(name: str, taken: dict[str, Callable[[], EnvironmentMap]]) -> str:
 
 def _say(args: ViewCommand, sequence: GaussianSequence, url: str, device: str) -> None:
     """Say where the page is."""
-    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if line]
+    notes = notes_of(sequence)
     if args.json:
         print_json({"url": url, "device": device, "frames": len(sequence), "notes": notes})
         sys.stdout.flush()
     elif not args.quiet:
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
+        print_notes(notes)
         print(f"{args.asset} is at {url} ({device}); Ctrl-C ends it", flush=True)
 
 

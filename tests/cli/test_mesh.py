@@ -4,33 +4,20 @@ import json
 
 import numpy as np
 import pytest
+from support.drawn_ball import drawn_ball
 
 from beam_warp import converters
 from beam_warp.cli.main import main
 from beam_warp.mesh.files import read_mesh
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 
 FAST = ("--size", "48", "--voxel", "0.05", "--device", "cpu")
 
 
 def ball(center, count=3000):
-    """Opaque flat discs on a ball of radius 0.5 m."""
-    index = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * index / count
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
-    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    return GaussianCloud(
-        positions=0.5 * normals + center,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
-        scales=np.tile([0.025, 0.025, 1e-4], (count, 1)),
-        opacities=np.full(count, 0.99),
-        radiance=np.zeros((count, 1, 3)),
-        radiance_color_space="lin_rec709_scene",
-        base_color=np.full((count, 3), 0.5),
-    )
+    return drawn_ball(center, (0.5, 0.5, 0.5), count).with_arrays(scales=np.tile([0.025, 0.025, 1e-4], (count, 1)))
 
 
 @pytest.fixture(scope="module")

@@ -110,9 +110,3 @@ def test_lights_that_are_none(lights, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(MissingFileError, match="folder with"):
         environments((tmp_path / "empty",))
-
-
-def test_the_help_has_an_example(capsys):
-    with pytest.raises(SystemExit):
-        beam("view", "--help")
-    assert "Example: beam view person" in capsys.readouterr().out

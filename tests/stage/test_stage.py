@@ -141,10 +141,7 @@ class TestPlacing:
                 r"rotate must be an angle about z, or three angles about x, y and z, got \(0.0, 1.0\)",
             ),
             ({"rotate": np.nan}, "rotate must be a number in"),
-            ({"scale": 0.0}, "scale must be a number in"),
-            ({"speed": 0.0}, "speed must be a number in"),
             ({"start": np.inf}, "start must be a number in"),
-            ({"blend": "no"}, "blend must be one of identified, rows, nearest, got 'no'"),
         ],
     )
     def test_mistakes(self, options, message):
@@ -529,23 +526,15 @@ class TestMistakes:
         ("place", "value", "message"),
         [
             (("beam-stage",), ..., "stage.json: beam-stage must be 1, got nothing. State the version"),
-            (("beam-stage",), "1", "stage.json: beam-stage must be 1, got '1'."),
             (("beam-stage",), True, "stage.json: beam-stage must be 1, got true."),
             (("asets",), [], "stage.json: must have no field but beam-stage, fps, duration, assets,"),
             (("fps",), "30", "stage.json: fps must be a finite number, got '30'. Write one."),
             (("fps",), -3, "stage.json: fps must be a number in [0.001, 1e+06], got -3.0."),
             (("duration",), 0, "stage.json: duration must be a number in [1e-06, 1e+09], got 0.0."),
-            (("duration",), [1], "stage.json: duration must be a finite number, got [1]."),
             (("assets",), {}, "stage.json: assets must be a list, got {}. Put it in [ ]."),
             (("assets", 1), 5, "stage.json: assets[1] must be an object, got 5. Write it in { }."),
-            (("assets", 1, "path"), ..., "stage.json: assets[1].path must be a text, got nothing."),
             (("assets", 1, "path"), 3, "stage.json: assets[1].path must be a text, got 3. Write it in quotes."),
             (("assets", 1, "translat"), 3, "stage.json: assets[1] must have no field but path, name,"),
-            (
-                ("assets", 1, "translate"),
-                [1, 2],
-                "stage.json: assets[1].translate must be 3 finite numbers, got [1, 2].",
-            ),
             (
                 ("assets", 1, "translate"),
                 [1, 2, "3"],
