@@ -7,6 +7,7 @@ from reference.harmonics import sh_color
 from scipy.spatial.transform import Rotation
 
 from beam_warp.errors import AssetFormatError, MissingFileError, SchemaVersionError
+from beam_warp.schema.layout import to_vt
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
 
@@ -14,7 +15,7 @@ TURN = Rotation.from_euler("xyz", [30, -50, 110], degrees=True)
 
 
 def author(path, *, up="Z", meters=0.01, prim_path="/World/Scan/Points", **values):
-    """Write a splat prim with the attributes given by name (``__`` stands for the namespace separator)."""
+    """Write a splat prim with attributes by name, where ``__`` stands for the namespace separator."""
     stage = Usd.Stage.CreateNew(str(path))
     if up:
         UsdGeom.SetStageUpAxis(stage, up)
@@ -23,7 +24,8 @@ def author(path, *, up="Z", meters=0.01, prim_path="/World/Scan/Points", **value
     UsdGeom.Xform.Define(stage, Sdf.Path(prim_path).GetParentPath())
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path).GetPrim()
     for name, value in values.items():
-        prim.GetAttribute(name.replace("__", ":")).Set(value)
+        attribute = prim.GetAttribute(name.replace("__", ":"))
+        attribute.Set(to_vt(str(attribute.GetTypeName()), value) if isinstance(value, np.ndarray) else value)
     return stage
 
 
@@ -37,11 +39,11 @@ def test_half_positions_in_centimetres_below_a_transform(tmp_path, rng):
     stage = author(
         tmp_path / "a.usda",
         positionsh=Vt.Vec3hArray.FromNumpy(p.astype(np.float16)),
-        orientationsh=Vt.QuathArray.FromNumpy(q),
-        scales=Vt.Vec3fArray.FromNumpy(np.full((5, 3), 2.0, np.float32)),
-        opacities=Vt.FloatArray.FromNumpy(np.full(5, 0.25, np.float32)),
+        orientationsh=q,
+        scales=np.full((5, 3), 2.0, np.float32),
+        opacities=np.full(5, 0.25, np.float32),
         radiance__sphericalHarmonicsDegree=1,
-        radiance__sphericalHarmonicsCoefficients=Vt.Vec3fArray.FromNumpy(harmonics.reshape(-1, 3)),
+        radiance__sphericalHarmonicsCoefficients=harmonics.reshape(-1, 3),
     )
     x, y, z, w = TURN.as_quat()
     parent = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan"))
@@ -73,10 +75,10 @@ def test_a_mirror_keeps_ellipsoids_and_colours(tmp_path, rng):
     stage = author(
         tmp_path / "a.usdc",
         meters=1.0,
-        positions=Vt.Vec3fArray.FromNumpy(p),
-        orientations=Vt.QuatfArray.FromNumpy(q.as_quat().astype(np.float32)),
-        scales=Vt.Vec3fArray.FromNumpy(np.tile(sigma, (5, 1)).astype(np.float32)),
-        radiance__sphericalHarmonicsCoefficients=Vt.Vec3fArray.FromNumpy(harmonics.reshape(-1, 3)),
+        positions=p,
+        orientations=q.as_quat().astype(np.float32),
+        scales=np.tile(sigma, (5, 1)).astype(np.float32),
+        radiance__sphericalHarmonicsCoefficients=harmonics.reshape(-1, 3),
     )
     UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan/Points")).AddScaleOp().Set((-1.0, 1.0, 1.0))
     stage.GetRootLayer().Save()
@@ -93,7 +95,7 @@ def test_a_mirror_keeps_ellipsoids_and_colours(tmp_path, rng):
 
 
 def test_absent_arrays_take_the_defaults_of_usd(tmp_path, rng):
-    author(tmp_path / "a.usda", up=None, meters=None, positions=Vt.Vec3fArray.FromNumpy(points(rng))).Save()
+    author(tmp_path / "a.usda", up=None, meters=None, positions=points(rng)).Save()
     found = read_asset(tmp_path / "a.usda", trusted=True)
     cloud = found[0]
     assert cloud.axes == "rub"
@@ -109,9 +111,9 @@ def test_float_is_preferred_and_long_arrays_are_cut(tmp_path, rng):
     author(
         tmp_path / "a.usda",
         meters=1.0,
-        positions=Vt.Vec3fArray.FromNumpy(p),
+        positions=p,
         positionsh=Vt.Vec3hArray.FromNumpy(np.zeros((5, 3), np.float16)),
-        opacities=Vt.FloatArray.FromNumpy(np.linspace(0, 1, 9).astype(np.float32)),
+        opacities=np.linspace(0, 1, 9).astype(np.float32),
     ).Save()
     cloud = read_asset(tmp_path / "a.usda", trusted=True)[0]
     assert np.array_equal(cloud.positions, p)
@@ -120,11 +122,7 @@ def test_float_is_preferred_and_long_arrays_are_cut(tmp_path, rng):
 
 def test_quaternions_are_normalised(tmp_path, rng):
     q = np.tile(np.float32([0, 0, 3, 4]), (5, 1))
-    author(
-        tmp_path / "a.usda",
-        positions=Vt.Vec3fArray.FromNumpy(points(rng)),
-        orientations=Vt.QuatfArray.FromNumpy(q),
-    ).Save()
+    author(tmp_path / "a.usda", positions=points(rng), orientations=q).Save()
     assert np.allclose(read_asset(tmp_path / "a.usda", trusted=True)[0].orientations, [0, 0, 0.6, 0.8])
 
 
@@ -143,7 +141,7 @@ def test_time_samples_are_frames(tmp_path, rng):
 
 
 def test_a_moving_transform_makes_frames(tmp_path, rng):
-    stage = author(tmp_path / "a.usda", meters=1.0, positions=Vt.Vec3fArray.FromNumpy(points(rng)))
+    stage = author(tmp_path / "a.usda", meters=1.0, positions=points(rng))
     op = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan")).AddTranslateOp()
     op.Set((0.0, 0.0, 0.0), 1.0)
     op.Set((1.0, 0.0, 0.0), 2.0)
@@ -161,9 +159,9 @@ def test_a_moving_transform_makes_frames(tmp_path, rng):
 def test_colour_space_comes_from_an_ancestor(tmp_path, rng, name, space):
     stage = author(
         tmp_path / "a.usda",
-        positions=Vt.Vec3fArray.FromNumpy(points(rng)),
+        positions=points(rng),
         radiance__sphericalHarmonicsDegree=0,
-        radiance__sphericalHarmonicsCoefficients=Vt.Vec3fArray.FromNumpy(np.zeros((5, 3), np.float32)),
+        radiance__sphericalHarmonicsCoefficients=np.zeros((5, 3), np.float32),
     )
     Usd.ColorSpaceAPI.Apply(stage.GetPrimAtPath("/World/Scan")).CreateColorSpaceNameAttr(name)
     stage.Save()
@@ -177,7 +175,7 @@ def broken(match, error=AssetFormatError):
 
 
 def test_several_prims_are_named(tmp_path, rng):
-    stage = author(tmp_path / "a.usda", positions=Vt.Vec3fArray.FromNumpy(points(rng)))
+    stage = author(tmp_path / "a.usda", positions=points(rng))
     UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Other")
     stage.Save()
     with broken(r"must hold one Gaussian-splat prim, got /World/Scan/Points, /World/Other\. Pass one of them"):
@@ -189,7 +187,7 @@ def test_several_prims_are_named(tmp_path, rng):
 
 @pytest.mark.parametrize(("scale", "shear"), [((1.0, 1.0, 1.0), 0.5), ((0.0, 0.0, 0.0), 0.0)])
 def test_only_similarities_are_applied(tmp_path, rng, scale, shear):
-    stage = author(tmp_path / "a.usda", positions=Vt.Vec3fArray.FromNumpy(points(rng)))
+    stage = author(tmp_path / "a.usda", positions=points(rng))
     matrix = Gf.Matrix4d(1.0)
     matrix.SetScale(scale)
     matrix[1, 0] = shear
