@@ -7,7 +7,6 @@ from skimage.metrics import structural_similarity
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
-from beam_warp.image.metrics import block_means
 from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
@@ -141,15 +140,6 @@ class TestViews:
     def test_no_views_are_refused(self, discs):
         with pytest.raises(InvalidArrayError, match="records must hold at least one view"):
             score_frame(discs, [], device="cpu")
-
-
-@pytest.mark.parametrize("tail", [(), (3,)])
-def test_means_of_squares(rng, tail):
-    image = rng.uniform(size=(6, 9, *tail))
-    found = block_means(image, 3)
-    assert found.shape == (2, 3, *tail)
-    np.testing.assert_allclose(found[1, 2], image[3:6, 6:9].mean(axis=(0, 1)), rtol=1e-14)
-    assert block_means(image, 1) is image
 
 
 class TestSurface:
