@@ -75,6 +75,12 @@ BUSY_SECONDS = 0.05
 """Work queued before a frame on CUDA; the host launches a frame in a tenth of it."""
 
 
+def stage_launchers() -> dict[str, Any]:
+    """Return every launcher that the rasteriser's modules import, with the module that calls it."""
+    modules = (forward, backward, rasterizer)
+    return {name: module for module in modules for name in vars(module) if name.startswith("launch_")}
+
+
 class StageClock:
     """Marks when stages begin and end."""
 
@@ -86,9 +92,8 @@ class StageClock:
     def watching(self) -> Iterator[None]:
         """Wrap the rasteriser's launchers, sorts and scans."""
         with ExitStack() as patches:
-            for name, stage in STAGES.items():
-                owner = next(module for module in (forward, backward, rasterizer) if hasattr(module, name))
-                self._wrap(patches, owner, name, stage)
+            for name, owner in stage_launchers().items():
+                self._wrap(patches, owner, name, STAGES[name])
             self._wrap(patches, wp.utils, "radix_sort_pairs", None)
             self._wrap(patches, wp.utils, "array_scan", SCAN)
             self._wrap(patches, backward.BackwardBuffers, "begin", CLEAR)

@@ -1,4 +1,4 @@
-"""Drawing with gsplat's arguments: a function that takes and returns what ``gsplat.rasterization`` does.
+"""Drawing with gsplat's arguments: a function with the arguments and results of ``gsplat.rasterization``.
 
 Facts of the interface are from gsplat 1.5's documentation; the drawing and its gradients are this package's own.
 """
@@ -31,7 +31,7 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
 HINTS = ("packed", "tile_size", "channel_chunk", "segmented")
-"""gsplat's arguments that say how it works, not what it draws: accepted, and without effect here."""
+"""gsplat's arguments that change how it works and not the image: accepted, and without effect here."""
 
 _UNDISTORT = "Undistort the images first, see beam_warp.capture.undistort"
 
@@ -172,7 +172,7 @@ def _rasterizer(
     options: RasterOptions,
     device: Any,
 ) -> TorchRasterizer:
-    """Return what draws such Gaussians for such cameras, kept from an earlier call if there is one."""
+    """Return a rasteriser of such Gaussians and cameras, kept from an earlier call if there is one."""
     value_count = 0 if values is None else values.shape[1]
     coefficient_count = 0 if radiance is None else radiance.shape[1]
     sizes = tuple((camera.width, camera.height) for camera in cameras)
@@ -195,7 +195,7 @@ def _rasterizer(
 
 
 def _refuse(others: dict[str, Any]) -> None:
-    """Refuse what would change the image, and is not drawn here."""
+    """Refuse arguments that would change the image and have no counterpart here."""
     for name, value in others.items():
         if name in HINTS:
             continue
@@ -210,7 +210,7 @@ def _refuse(others: dict[str, Any]) -> None:
 
 
 def _require_tensor(name: str, tensor: Any, shape: tuple[int, ...], device: Any) -> None:
-    """Refuse what is no float32 tensor of a shape, on a device."""
+    """Refuse anything but a float32 tensor of a shape on a device."""
     fits = isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == shape
     if not (fits and tensor.dtype == torch.float32 and tensor.device == device):
         raise InvalidArrayError(
@@ -259,7 +259,7 @@ def _colors_of(images: TorchImages) -> torch.Tensor:
 
 
 def _background(backgrounds: Any, rgb: torch.Tensor) -> torch.Tensor:
-    """Return what is seen through every pixel."""
+    """Return the background behind every pixel."""
     _require_tensor("backgrounds", backgrounds, (rgb.shape[0], rgb.shape[3]), rgb.device)
     return backgrounds[:, None, None, :]
 
@@ -311,7 +311,7 @@ def _camera(width: int, height: int, matrices: bytes) -> Camera:
 
 
 def _describe(value: Any) -> str:
-    """Say what came."""
+    """Describe an argument in an error."""
     if isinstance(value, torch.Tensor):
         return f"a tensor of {value.dtype} of shape {tuple(value.shape)} on {value.device}"
     return repr(value) if isinstance(value, (bool, int, float, str)) else type(value).__name__

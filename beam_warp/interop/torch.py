@@ -84,7 +84,7 @@ class TorchRasterizer:
         options: RasterOptions | None = None,
         device: Any = None,
     ) -> None:
-        """Allocate what every draw needs.
+        """Allocate the arrays of every draw.
 
         Args:
             gaussian_count: N.
@@ -132,7 +132,7 @@ class TorchRasterizer:
             )
 
     def __del__(self) -> None:
-        """Wait for what is queued on a stream of the caller's: Warp frees memory without looking at those."""
+        """Wait for work queued on a stream of the caller's: Warp does not wait for those before it frees memory."""
         stream = getattr(self, "_stream", None)
         if stream is not None and stream.cuda_stream != 0:
             stream.synchronize()
@@ -178,7 +178,7 @@ class TorchRasterizer:
         return TorchImages(*_Draw.apply(self, _Ticket(views), *tensors))
 
     def view_images(self) -> list[ViewImages]:
-        """Return what each camera saw last, in the rasteriser's own memory: no copy, no gradient.
+        """Return each camera's last images in the rasteriser's own memory: no copy, no gradient.
 
         ``torch.from_dlpack(view.alpha)`` shares it until the next draw, or the way back of another, overwrites it.
         """
@@ -188,7 +188,7 @@ class TorchRasterizer:
 
     @contextmanager
     def _torch_stream(self) -> Iterator[None]:
-        """Queue Warp's work on torch's current stream, behind what was queued here on another."""
+        """Queue Warp's work on torch's current stream, behind work that was queued here on another."""
         if not self._warp_device.is_cuda:
             yield
             return
@@ -214,7 +214,7 @@ class TorchRasterizer:
         return images
 
     def _forward(self, ticket: _Ticket, given: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor | None, ...]:
-        """Draw, and copy what was drawn."""
+        """Draw, and copy the images."""
         with self._torch_stream():
             images = self._render(ticket, given)
             arrays = (images.alpha, images.depth, images.median_depth, self._rasterizer.gaussian_ids, *images.channels)

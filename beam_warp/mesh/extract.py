@@ -50,12 +50,12 @@ def mesh_of_gaussians(
 
     Args:
         cloud: Gaussians, in the world's axes.
-        cameras: From where its depth is drawn; what none of them sees stays open.
+        cameras: Cameras that draw its depth; the surface stays open where none of them sees it.
         voxel: Edge of a voxel [m]; None takes the median width of a pixel at the surface (see `fuse_depths`).
         depth: ``"median"`` of a pixel's splats, which stays on one surface at edges, or the ``"mean"``.
         color: What vertices carry, as display sRGB: nothing, base colour, or the captured colour as the cameras see it.
         confirmations: Pixels that fewer other views confirm, or that more contradict, are left out (see
-            `depth_consistency`); with one camera there is nobody to ask, and none is.
+            `depth_consistency`); with one camera, none is left out.
         smallest_part: See `fuse_depths`.
         options: How splats are drawn.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -86,7 +86,7 @@ def draw_depths(
     options: RasterOptions | None = None,
     device: Any = None,
 ) -> DepthImages:
-    """Draw a cloud's depth and normals for one camera after the other, and keep what fusion reads of them.
+    """Draw a cloud's depth and normals for one camera after the other, as input of fusion.
 
     Raises:
         InvalidArrayError: The cloud lacks the colour that was asked for.

@@ -121,7 +121,7 @@ class Adam:
         self._corrections = wp.empty(self._row_count, dtype=wp.vec2, device=self.device)
 
     def step(self, visible: wp.array | None = None) -> None:
-        """Move the values by what the gradients hold now.
+        """Move the values by one step along the present gradients.
 
         Args:
             visible: Which rows take part, ``(N,)`` warp array of bool; all of them without.

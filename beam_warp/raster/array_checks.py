@@ -14,7 +14,7 @@ from beam_warp.world.camera import Camera
 
 
 def require_cameras(cameras: Any) -> None:
-    """Refuse what is not a sequence of at least one camera."""
+    """Refuse anything but a sequence of at least one camera."""
     if not isinstance(cameras, Sequence):
         raise InvalidOptionError(
             f"cameras must be a sequence of cameras, got {type(cameras).__name__}. Put a single one in a list."
@@ -37,7 +37,7 @@ def require_sizes(cameras: Sequence[Camera], like: Sequence[Camera]) -> None:
 
 
 def require_gaussians(gaussians: GaussianArrays, count: int, channels: ChannelRanges, device: wp.Device) -> None:
-    """Refuse Gaussians of another number, type or place, or without what is drawn of them."""
+    """Refuse Gaussians of another number, type or place, or without the channels that are drawn."""
     rows, values = (count,), (len(channels.values),)
     # The type of each array, and the lengths that each of its sides may have.
     wanted: dict[str, tuple[Any, tuple[tuple[int, ...], ...]]] = {
@@ -65,7 +65,7 @@ def require_gaussians(gaussians: GaussianArrays, count: int, channels: ChannelRa
 
 
 def require_matrix(name: str, array: Any, count: int, lengths: tuple[int, ...], device: wp.Device) -> None:
-    """Refuse what is not a compact matrix of float32 with ``count`` rows of one of ``lengths``, or of any if empty."""
+    """Refuse anything but a compact matrix of float32 with ``count`` rows of one of ``lengths``, or of any if empty."""
     if not isinstance(array, wp.array):
         got = type(array).__name__
     elif not array.is_contiguous:

@@ -1,4 +1,4 @@
-"""The way back: from derivatives to images, and from what pixels hold, to the Gaussians that were drawn."""
+"""The way back to Gaussians: derivatives of a loss to the images, and the contents of pixels, carried back."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BackwardBuffers:
     """
 
     def __init__(self, drawn: FrameBuffers) -> None:
-        """Allocate for what a frame draws."""
+        """Allocate for a frame."""
         self._drawn = drawn
         count, splat_count, pixel_count = drawn.gaussian_count, drawn.splat_count, drawn.pixel_count
         with wp.ScopedDevice(drawn.device):
@@ -63,7 +63,7 @@ class BackwardBuffers:
                 array.zero_()
 
     def add_band(self) -> None:
-        """Add what the band listed last says to the gradients of splats and of their rows."""
+        """Add the part of the band listed last to the gradients of splats and of their rows."""
         drawn = self._drawn
         if not drawn.pair_capacity:
             return
@@ -102,7 +102,7 @@ class BackwardBuffers:
 
 
 def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> None:
-    """Add what pixels hold to the rows of the splats of the band listed last, weighted as they were blended."""
+    """Add the contents of pixels, with the weights of blending, to the rows of the splats of the band listed last."""
     if not drawn.pair_capacity:
         return
     back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu

@@ -34,7 +34,7 @@ class FrameBuffers:
         keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs.
         order: The splats in depth order, and where each one's pairs end.
         pairs: The (tile, splat) pairs of a band.
-        frame: What compositing reads, for kernels.
+        frame: Input of compositing, for kernels.
         drawn: Images besides channels, for kernels.
         channel_images: Images of channels, a pass each.
         images: The same images for callers.
@@ -150,7 +150,7 @@ class FrameBuffers:
         )
 
     def _describe_frame(self, options: RasterOptions) -> None:
-        """Tell kernels how splats are made and what is composited."""
+        """Fill in the structs that kernels read: views, projection and frame."""
         self.views = wp.array(self.layout.views, dtype=RasterView)
         self.projection = Projection()
         self.projection.low_pass = options.low_pass

@@ -1,4 +1,4 @@
-"""The channels that a cloud is drawn with: their names, their widths, and what layers of image files call them."""
+"""The channels that a cloud is drawn with: names, widths, and layers of image files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RADIANCE = "radiance"
 """The channel that is evaluated towards the camera before it is composited."""
 
 SURFACE_NORMALS = "surface_normals"
-"""The channel of normals that geometry alone gives: of the surface of largest response, towards the camera."""
+"""The channel of normals from geometry alone: those of the surface of largest response, towards the camera."""
 
 CHANNELS = (
     RADIANCE,
@@ -27,7 +27,7 @@ CHANNELS = (
 """Every channel that `rasterize` knows; a cloud may lack some."""
 
 ERROR_CHANNELS = tuple(name for name in CHANNELS if name.endswith("_error"))
-"""The channels of standard errors: their mean over what a pixel sees, as if all of it were wrong the same way."""
+"""The channels of standard errors; a pixel shows their mean, as if all Gaussians that it sees erred the same way."""
 
 UNIT_CHANNELS = ("normals", SURFACE_NORMALS)
 """Channels of directions: their mean is brought to unit length."""

@@ -30,7 +30,7 @@ MAX_ROW_PAIRS = 2**29
 list's length is still a 32-bit integer."""
 
 SPARE_CAPACITY = 1.25
-"""Room for pairs over what the first frame needs: the next ones need a little more."""
+"""Room for pairs, over the need of the first frame: the next ones need a little more."""
 
 
 def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:

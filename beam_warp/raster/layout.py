@@ -72,7 +72,7 @@ class ChannelRanges(NamedTuple):
 
     @classmethod
     def of(cls, *, radiance: bool, normals: bool, value_count: int) -> ChannelRanges:
-        """Lay out what is drawn: colour first, then normals, then values."""
+        """Lay out channels: colour first, then normals, then values."""
         colors_end = 3 * radiance
         normals_end = colors_end + 3 * normals
         return cls(range(colors_end), range(colors_end, normals_end), range(normals_end, normals_end + value_count))

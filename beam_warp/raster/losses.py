@@ -60,7 +60,7 @@ class _Term:
         self._allocate(height, width, channels)
 
     def _allocate(self, height: int, width: int, channels: int) -> None:
-        """Allocate what the threads of the term write: one number a pixel."""
+        """Allocate the threads' output: one number a pixel."""
         self._terms = wp.empty(height * width, dtype=float, device=self.device)
 
     def _input(self, name: str, value: Any) -> wp.array:
@@ -87,9 +87,9 @@ class L1Loss(_Term):
 
         Args:
             image: ``(H, W, C)`` float32.
-            target: What it should be, like ``image``.
+            target: The image to match, like ``image``.
             weight: The factor of the term, at least 0.
-            mask: What each pixel counts, ``(H, W)`` float32, usually in [0, 1]; 1 without. It has no gradient.
+            mask: Weight of each pixel, ``(H, W)`` float32, usually in [0, 1]; 1 without. It has no gradient.
             gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32; 0 where the
                 images are equal.
 
@@ -133,9 +133,9 @@ class SsimLoss(_Term):
 
         Args:
             image: ``(H, W, C)`` float32.
-            target: What it should be, like ``image``.
+            target: The image to match, like ``image``.
             weight: The factor of the term, at least 0.
-            mask: What the window around each pixel counts, ``(H, W)`` float32; 1 without. It has no gradient. A window
+            mask: Weight of the window around each pixel, ``(H, W)`` float32; 1 without. It has no gradient. A window
                 that counts sees all its pixels, masked or not.
             gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32.
 
@@ -191,7 +191,7 @@ class NormalLoss(_Term):
             rendered: Normals as composited, of any length, ``(H, W, 3)`` float32.
             expected: Unit normals or 0, such as `DepthNormals` writes, in the same axes.
             weight: The factor of the term, at least 0.
-            mask: What each pixel counts, ``(H, W)`` float32, such as alpha; 1 without. It has no gradient.
+            mask: Weight of each pixel, ``(H, W)`` float32, such as alpha; 1 without. It has no gradient.
             rendered_gradient: The derivative with respect to ``rendered``, through its normalisation, is added to it.
             expected_gradient: The derivative with respect to ``expected``, taken as it is, is added to it.
 

@@ -1,4 +1,4 @@
-"""The rasteriser: draws Gaussians for some cameras again and again, and differentiates what it drew."""
+"""The rasteriser: draws Gaussians for some cameras again and again, and differentiates the images."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ class Rasterizer:
         return self._backward_buffers().images
 
     def backward(self) -> GaussianGradients:
-        """Return the derivatives to the Gaussians of what was drawn last, from those in `adjoints`.
+        """Return a loss's derivatives to the Gaussians of the last frame, from those to the images in `adjoints`.
 
         Discrete decisions are held still: which splats count, their order, the cap of alpha, the pick of the median.
 

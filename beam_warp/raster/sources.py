@@ -41,7 +41,7 @@ class DrawnCloud:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, channels: Sequence[str], device: Any) -> DrawnCloud:
-        """Bring to the device what is drawn of a cloud.
+        """Upload a cloud's geometry and the channels to draw.
 
         Raises:
             InvalidOptionError: A channel is unknown, or the cloud is in other axes.
@@ -65,7 +65,7 @@ class DrawnCloud:
     def draw_groups(
         self, cameras: Sequence[Camera], options: RasterOptions | None
     ) -> Iterator[tuple[Rasterizer, range]]:
-        """Draw groups of cameras: yield what drew each group, and the places of its cameras."""
+        """Draw groups of cameras: yield each group's rasteriser and the places of its cameras."""
         if cameras:
             require_cameras(cameras)
         first = 0
@@ -103,7 +103,7 @@ class DrawnCloud:
         return {name: places[name] for name in self.channels}
 
     def gradients(self, found: GaussianGradients) -> dict[str, NDArray[np.float32]]:
-        """Bring gradients back, by name of the cloud's array."""
+        """Copy gradients to the host, by name of the cloud's array."""
         arrays = {name: getattr(found, name).numpy() for name in GEOMETRY}
         values = np.empty((0, 0), np.float32) if found.values is None else found.values.numpy()
         start = 0
@@ -123,7 +123,7 @@ def upload_gaussians(
     values: NDArray[np.float32] | None = None,
     radiance: NDArray[np.float32] | None = None,
 ) -> GaussianArrays:
-    """Bring a cloud's geometry, and what of it is drawn, to a device.
+    """Upload a cloud's geometry, and values or colour to draw.
 
     Args:
         cloud: Gaussians.

@@ -86,7 +86,7 @@ def is_near(camera: DepthCamera, inverse_depth: float, other: float) -> bool:
 
 @wp.func
 def sample_pixels(pixels: wp.array[wp.vec3], camera: DepthCamera, x: float, y: float) -> wp.vec3:
-    """What is seen at a place on the image; zeros outside it and where no pixel is to be trusted.
+    """The pixel at a place on the image; zeros outside it and where no pixel is to be trusted.
 
     Bilinear where the four pixels around see one surface, the nearest one elsewhere; its weight in any case.
     """

@@ -120,7 +120,7 @@ def trace_outgoing_kernel(
     bounce_count: int,
     out_radiance: wp.array2d[wp.vec3],
 ):
-    """A point's directions share one sample set, so that what is averaged over them is stratified as a whole."""
+    """A point's directions share one sample set, so that an average over them is stratified as a whole."""
     index = first + wp.tid()
     stream = stream_of(seed, wp.uint32(1), wp.uint32(index))
     point = surface_point(lit.surface, faces[index], weights[index])
@@ -132,7 +132,7 @@ def trace_outgoing_kernel(
 
 
 def lit_mesh(surface, environment, albedo_table) -> LitMesh:
-    """Put together what paths read."""
+    """Put together the input of paths."""
     lit = LitMesh()
     lit.surface, lit.environment, lit.albedo_table = surface, environment, albedo_table
     return lit

@@ -68,7 +68,7 @@ def lifted(position: wp.vec3, corner: wp.vec3, normal: wp.vec3) -> wp.vec3:
 
 @wp.func
 def surface_point(surface: MeshSurface, face: int, weights: wp.vec3) -> SurfacePoint:
-    """Interpolate what the corners of a face hold."""
+    """Interpolate the attributes of a face's corners."""
     corners = surface.faces[face]
     i = corners[0]
     j = corners[1]

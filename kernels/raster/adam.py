@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ParameterGroup:
-    """Some columns of every row, with what Adam keeps for them; each ``(N, K)``."""
+    """Some columns of every row, with their moments; each ``(N, K)``."""
 
     parameters: wp.array2d[float]
     gradients: wp.array2d[float]

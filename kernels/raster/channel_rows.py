@@ -48,7 +48,7 @@ def normal_channels(blocks: ChannelBlocks) -> int:
 
 @wp.kernel(enable_backward=False)
 def gather_channels_kernel(first: int, blocks: ChannelBlocks, start: int, out_rows: wp.array2d[float]):
-    """Channels from ``start`` on, as many as a row is long; what is beyond the last is 0."""
+    """Channels from ``start`` on, as many as a row is long; 0 beyond the last."""
     splat = first + wp.tid()
     colors_end = color_channels(blocks)
     normals_end = colors_end + normal_channels(blocks)
@@ -103,7 +103,7 @@ def launch_evaluate_colors(positions, radiance, views, colors, device):
 def launch_evaluate_colors_adjoint(
     positions, radiance, views, colors, color_gradients, position_gradients, radiance_gradients, device
 ):
-    """Add what the gradients of colours say to those of positions and coefficients."""
+    """Add to the gradients of positions and coefficients, from those of colours."""
     count = len(positions)
     for view in range(len(views)):  # one view at a time: each Gaussian is then added to once a launch, in this order
         launch_adjoint(
@@ -123,7 +123,7 @@ def launch_gather_channels(blocks, start, rows, device):
 
 
 def launch_scatter_channels(rows, columns, start, view_count, gradients, device):
-    """Write what gradients of channels say to those of the blocks.
+    """Write the gradients of the blocks, from those of the rows.
 
     The channels from ``start`` on are in the ``columns`` of ``rows``, one row a splat.
     """

@@ -1,4 +1,4 @@
-"""Normals of a depth image by central differences, and what their gradients are to the depth.
+"""Normals of a depth image by central differences, and the way back of their gradients to the depth.
 
 The surface points of the four neighbours of a pixel are P = z r, with r = (u, v, 1) on the plane z = 1, and the normal
 is the step down times the step to the right. Written out, with every factor that is common to the three components
@@ -177,7 +177,7 @@ def launch_write_depth_normals(depth: Any, alpha: Any, view: DepthNormalCamera, 
 def launch_add_depth_gradients(
     depth: Any, alpha: Any, view: DepthNormalCamera, normal_gradients: Any, out_depth_gradients: Any, device: Any
 ) -> None:
-    """Add what gradients of the normals are to every pixel's depth."""
+    """Add to the gradients of every pixel's depth, from those of the normals."""
     launch(
         add_depth_gradients_kernel,
         depth.size,

@@ -18,7 +18,7 @@ a shorter sum is of normals that cancel, and its gradient, which grows as 1/leng
 
 @wp.func
 def pixel_weight(mask: wp.array2d[float], y: int, x: int) -> float:
-    """What a pixel counts: 1 without a mask."""
+    """Weight of a pixel: 1 without a mask."""
     weight = float(1.0)
     if mask:
         weight = mask[y, x]

@@ -1,4 +1,4 @@
-"""The gradient of each splat: moments summed over its pairs in a fixed order, and what they say of its rows."""
+"""The gradient of each splat: moments summed over its pairs in a fixed order, and resolved to its rows."""
 
 import warp as wp
 
@@ -32,7 +32,7 @@ def sum_pairs_kernel(first: int, pair_rows: wp.array2d[float], order: SplatOrder
 def resolve_sums_kernel(
     first: int, sums: wp.array2d[float], splats: Splats, channel_count: int, exact: int, out_gradients: Splats
 ):
-    """Add what the moments of `kernels.composite_adjoint`, summed over a splat, say to the gradients of its rows."""
+    """Add to the gradients of a splat's rows, from its summed moments (see `kernels.raster.composite_adjoint`)."""
     splat = first + wp.tid()
     if not (splats.centers[splat][2] > -wp.inf):
         return
@@ -73,7 +73,7 @@ def launch_sum_pairs(pair_rows, order, out_sums, device):
 
 
 def launch_resolve_sums(sums, splats, channel_count, exact, gradients, device):
-    """Add what all sums say to the gradients of the splats' rows."""
+    """Add to the gradients of all splats' rows, from their summed moments."""
     launch(
         resolve_sums_kernel,
         sums.shape[0],

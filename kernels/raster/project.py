@@ -164,7 +164,7 @@ def launch_project(gaussians, views, projection, out_splats, device):
 
 
 def launch_project_adjoint(gaussians, views, projection, splats, out_gradients, device):
-    """Add to ``out_gradients``, of the four ``gaussians``, what the gradients of ``splats`` say.
+    """Add to ``out_gradients``, those of the four ``gaussians``, from the gradients of ``splats``.
 
     The arrays of ``splats`` carry their gradients as Warp's ``grad``: Warp reads none from a struct of its own.
     """

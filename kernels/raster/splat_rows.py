@@ -152,7 +152,7 @@ def offset_from(center: wp.vec4, position: wp.vec2) -> wp.vec2:
 
 @wp.func
 def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
-    """An offset in standard deviations: (e0, e1) of `kernels.project.Splats`."""
+    """An offset in standard deviations: (e0, e1) of `kernels.raster.project.Splats`."""
     return wp.vec2(offset[0] * shape[0], (offset[1] - shape[1] * offset[0]) * shape[2])
 
 
@@ -174,19 +174,19 @@ def sight_of(center: wp.vec4, shape: wp.vec4, position: wp.vec2) -> Sight:
 
 @wp.func
 def alpha_of(log_alpha: float) -> float:
-    """Alpha of what passes the cut."""
+    """Alpha of a splat that passes the cut."""
     return wp.min(quick_exp(log_alpha), ALPHA_CAP)
 
 
 @wp.func
 def facing_at(slope: wp.vec4, offset: wp.vec2) -> float:
-    """The factor l of `kernels.project` at an offset from the centre."""
+    """The factor l of `kernels.raster.project` at an offset from the centre."""
     return 1.0 + slope[0] * offset[0] + slope[1] * offset[1]
 
 
 @wp.func
 def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
-    """The form e of `kernels.project` at an offset from the centre."""
+    """The form e of `kernels.raster.project` at an offset from the centre."""
     x = offset[0]
     y = offset[1]
     return slope[2] * x * x + 2.0 * slope[3] * x * y + bend * y * y
