@@ -256,6 +256,7 @@ class TestWithACapture:
         cosine = (cloud.normals * figure[0].normals[::4]).sum(axis=1)[measured]
         assert np.median(cosine) > np.cos(np.radians(20.0))
 
+    @pytest.mark.slow
     def test_a_stopped_job_continues_to_identical_bytes(self, discs, studio, tiny_capture, tmp_path):
         self.run(discs, studio, tmp_path / "whole", tiny_capture)
 
@@ -272,6 +273,7 @@ class TestWithACapture:
         )
         assert whole == continued
 
+    @pytest.mark.slow
     def test_threads_do_not_change_a_byte(self, discs, studio, tiny_capture, tmp_path, monkeypatch):
         found = []
         for threads in ("1", "3"):
