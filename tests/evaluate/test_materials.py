@@ -269,7 +269,7 @@ class TestWhatIsThere:
         }  # fmt: skip
 
     def test_relighters_are_told_how_to_draw(self, asset, mirror):
-        """Relighters draw as the asset states, with the samples asked for, for all cameras of a frame, under each light."""
+        """Relighters draw as the asset states, with the samples asked for, all cameras of a frame under each light."""
         told = []
 
         def relighter(cloud, environment, cameras, *, raster, samples, device):
