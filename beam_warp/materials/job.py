@@ -1,14 +1,14 @@
 """The main job: Gaussians with captured radiance in, a relightable asset out, frame by frame and resumable.
 
-    read      `beam_warp.materials.source`          frames and their images
-    see       `beam_warp.materials.seen`            what views show, and where light is gathered
-    light     `beam_warp.materials.capture_light`   the light's exposure, and whether it fits
-    measure   `beam_warp.materials.measure`         occlusion and evidence of each frame
-    solve     `beam_warp.materials.solve`           base colour from the evidence
-    write     `beam_warp.materials.result`          asset, contact sheet and report
+    read      `beam_warp.materials.steps.source`          frames and their images
+    see       `beam_warp.materials.steps.seen`            what views show, and where light is gathered
+    light     `beam_warp.materials.steps.capture_light`   the light's exposure, and whether it fits
+    measure   `beam_warp.materials.steps.measure`         occlusion and evidence of each frame
+    solve     `beam_warp.materials.steps.solve`           base colour from the evidence
+    write     `beam_warp.materials.steps.result`          asset, contact sheet and report
 
 Records go from each step to the next. What is finished is also kept in a folder
-(`beam_warp.materials.archive`), with which a stopped job continues.
+(`beam_warp.materials.steps.archive`), with which a stopped job continues.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.progress import JobLog, Progress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
-from beam_warp.materials.archive import FrameArchive
-from beam_warp.materials.capture_images import CaptureImages
-from beam_warp.materials.capture_light import light_findings, prepare_light
 from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.measure import FrameMeasurement
 from beam_warp.materials.options import OverviewOptions, RunOptions
-from beam_warp.materials.plan import JobPlan
-from beam_warp.materials.result import draw_overview, relightable_sequence, run_report
-from beam_warp.materials.roughness_finder import RoughnessFinder
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.materials.solve import solve_each, solve_jointly, take
-from beam_warp.materials.source import Source
+from beam_warp.materials.steps.archive import FrameArchive
+from beam_warp.materials.steps.capture_images import CaptureImages
+from beam_warp.materials.steps.capture_light import light_findings, prepare_light
+from beam_warp.materials.steps.measure import FrameMeasurement
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.result import draw_overview, relightable_sequence, run_report
+from beam_warp.materials.steps.roughness_finder import RoughnessFinder
+from beam_warp.materials.steps.solve import solve_each, solve_jointly, take
+from beam_warp.materials.steps.source import Source
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 

@@ -16,10 +16,10 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
-from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.job import OverviewOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
+from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
 from beam_warp.world.camera import Camera

@@ -10,9 +10,9 @@ from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.direct import MaterialOptions
-from beam_warp.materials.seen import SeenFrame
+from beam_warp.materials.steps.capture_images import CaptureImages
+from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
 

@@ -11,11 +11,11 @@ from beam_warp._version import __version__
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.light.prepared import MaterialLight
-from beam_warp.materials.measure import FrameMeasurement
 from beam_warp.materials.options import ESTIMATE, OverviewOptions
-from beam_warp.materials.plan import JobPlan
-from beam_warp.materials.solve import SolvedFrames
-from beam_warp.materials.tally import warnings_about
+from beam_warp.materials.steps.measure import FrameMeasurement
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.solve import SolvedFrames
+from beam_warp.materials.steps.tally import warnings_about
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera, bulk

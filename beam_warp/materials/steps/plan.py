@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.archive import FrameArchive
-from beam_warp.materials.capture_light import CaptureLight
 from beam_warp.materials.options import RunOptions
-from beam_warp.materials.source import Source
+from beam_warp.materials.steps.archive import FrameArchive
+from beam_warp.materials.steps.capture_light import CaptureLight
+from beam_warp.materials.steps.source import Source
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
