@@ -93,14 +93,7 @@ class ViewScorer:
 
     def score(self, cloud: GaussianCloud, record: CaptureRecord, relit: RelitViews) -> ScoredView:
         """Draw a cloud for a record, and score its channels and its relit images."""
-        drawn = draw_materials(
-            cloud,
-            record.camera,
-            radiance=cloud.radiance is not None,
-            raster=self.raster,
-            samples=self.samples,
-            device=self.device,
-        )
+        drawn = self._draw(cloud, record, radiance=cloud.radiance is not None)
         truth = record.truth()
         truth_alpha = truth.channels["A"]
         solid = truth_alpha > SOLID_ALPHA
@@ -161,14 +154,7 @@ class ViewScorer:
         self, cloud: GaussianCloud, record: CaptureRecord, truth: Image, scale: Scales
     ) -> ImageScore:
         """Score base colour times a factor per channel, cut at 1; the truth must have base colour."""
-        drawn = draw_materials(
-            cloud,
-            record.camera,
-            channels=("base_color",),
-            raster=self.raster,
-            samples=self.samples,
-            device=self.device,
-        )
+        drawn = self._draw(cloud, record, channels=("base_color",))
         known = true_channel(truth, "base_color")
         assert known is not None
         compared = as_compared(
@@ -185,9 +171,14 @@ class ViewScorer:
         """Return the coverage that a cloud shares with the truth of some records, mean over them, in [0, 1]."""
         overlaps = []
         for record in records:
-            drawn = draw_materials(cloud, record.camera, channels=(), raster=self.raster, samples=1, device=self.device)
+            drawn = self._draw(cloud, record, channels=(), samples=1)
             overlaps.append(overlap(drawn.alpha, record.truth().channels["A"]))
         return float(np.mean(overlaps))
+
+    def _draw(self, cloud: GaussianCloud, record: CaptureRecord, **how: Any) -> DrawnMaterials:
+        """Draw a cloud for a record."""
+        how = {"raster": self.raster, "samples": self.samples, "device": self.device} | how
+        return draw_materials(cloud, record.camera, **how)
 
     def conditions(self) -> dict[str, Any]:
         """Return how views are drawn and compared, JSON-able."""

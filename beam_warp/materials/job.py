@@ -1,14 +1,14 @@
 """The main job: Gaussians with captured radiance in, a relightable asset out, frame by frame and resumable.
 
-    read      `beam_warp.materials.source`          frames and their images
-    see       `beam_warp.materials.seen`            what views show, and where light is gathered
-    light     `beam_warp.materials.capture_light`   the light's exposure, and whether it fits
-    measure   `beam_warp.materials.measure`         occlusion and evidence of each frame
-    solve     `beam_warp.materials.solve`           base colour from the evidence
-    write     `beam_warp.materials.result`          asset, contact sheet and report
+    read      `beam_warp.materials.steps.source`          frames and their images
+    see       `beam_warp.materials.steps.seen`            what views show, and where light is gathered
+    light     `beam_warp.materials.steps.capture_light`   the light's exposure, and whether it fits
+    measure   `beam_warp.materials.steps.measure`         occlusion and evidence of each frame
+    solve     `beam_warp.materials.steps.solve`           base colour from the evidence
+    write     `beam_warp.materials.steps.result`          asset, contact sheet and report
 
 Records go from each step to the next. What is finished is also kept in a folder
-(`beam_warp.materials.archive`), with which a stopped job continues.
+(`beam_warp.materials.steps.archive`), with which a stopped job continues.
 """
 
 from __future__ import annotations
@@ -22,23 +22,25 @@ from typing import Any
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.digests import CaptureDigests
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.progress import JobLog, Progress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
-from beam_warp.materials.archive import FrameArchive
-from beam_warp.materials.capture_images import CaptureImages
-from beam_warp.materials.capture_light import light_findings, prepare_light
 from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.measure import FrameMeasurement
 from beam_warp.materials.options import OverviewOptions, RunOptions
-from beam_warp.materials.result import draw_overview, relightable_sequence, run_report
-from beam_warp.materials.roughness_finder import RoughnessFinder
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.materials.solve import FrameSolver, SolvedFrames
-from beam_warp.materials.source import Source
+from beam_warp.materials.steps.archive import FrameArchive
+from beam_warp.materials.steps.capture_images import CaptureImages
+from beam_warp.materials.steps.capture_light import light_findings, prepare_light
+from beam_warp.materials.steps.measure import FrameMeasurement
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.result import draw_overview, relightable_sequence, run_report
+from beam_warp.materials.steps.roughness_finder import RoughnessFinder
+from beam_warp.materials.steps.solve import solve_each, solve_jointly, take
+from beam_warp.materials.steps.source import Source
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -108,29 +110,34 @@ def run(
         )
     folder, digests = make_folders(out, "frames", "digests")
     log = JobLog(progress, len(sequence), device)
-    persistent = chosen.persistent or sequence.topology == "constant"
-
-    source = Source(sequence, images, chosen.materials, digests=digests, device=str(device), log=log)
-    described = _described(chosen, images, is_cuda=device.is_cuda)
-    light = prepare_light(environment, source, chosen, described, folder, log)
-    key = array_digest(light.environment.radiance, text=described)
-    first_key = source.key(key, source.first)
-    findings = light_findings(source.first, light.environment, folder / "findings.json", first_key, log)
-    roughness = RoughnessFinder(source, light.prepared, chosen, persistent=persistent, key=key, folder=folder, log=log)
-    archive = FrameArchive(folder, source.first.cloud.radiance_color_space)
-    frames = FrameMeasurement(
-        source,
-        light.prepared,
-        roughness,
-        archive,
-        options=chosen.images or chosen.materials,
-        persistent=persistent,
-        key=key,
+    source = Source(
+        sequence=sequence,
+        images=images,
+        options=chosen.materials,
+        digests=CaptureDigests(digests),
+        device=str(device),
         log=log,
     )
-    solver = FrameSolver(archive, key, light.prepared.mean_irradiance, log)
-    solved = _solve(solver, frames, is_solved=chosen.images is not None, persistent=persistent)
-    relightable = relightable_sequence(source, solved, chosen, light.stops, persistent=persistent)
+    described = _described(chosen, images, is_cuda=device.is_cuda)
+    light = prepare_light(environment, source, chosen, described, folder, log)
+    plan = JobPlan(
+        source=source,
+        light=light,
+        options=chosen,
+        persistent=chosen.persistent or sequence.topology == "constant",
+        key=array_digest(light.environment.radiance, text=described),
+        archive=FrameArchive(folder, source.first.cloud.radiance_color_space),
+        log=log,
+    )
+    first_key = source.key(plan.key, source.first)
+    findings = light_findings(source.first, light.environment, folder / "findings.json", first_key, log)
+    roughness = RoughnessFinder(plan)
+    frames = FrameMeasurement(plan, roughness)
+    if chosen.images is not None:
+        solved = take(plan, frames)
+    else:
+        solved = solve_jointly(plan, frames) if plan.persistent else solve_each(plan, frames)
+    relightable = relightable_sequence(plan, solved)
     asset, picture = out / ASSET_NAME, out / "overview.png"
     with log.timer("write asset"):
         converters.write(relightable, asset)
@@ -138,26 +145,10 @@ def run(
         progress("overview", 0, 1)
         draw_overview(picture, relightable, light.prepared, overview or OverviewOptions())
         progress("overview", 1, 1)
-    report = run_report(
-        source,
-        light,
-        frames,
-        solved,
-        chosen,
-        persistent=persistent,
-        findings=findings,
-        roughness=roughness.report,
-        seconds=log.timer.seconds | {"total": time.perf_counter() - started},
-    )
+    seconds = time.perf_counter() - started
+    report = run_report(plan, frames, solved, findings=findings, roughness=roughness.report, seconds=seconds)
     write_report(out, report)
     return RunResult(asset, picture, relightable, light.environment, report)
-
-
-def _solve(solver: FrameSolver, frames: FrameMeasurement, *, is_solved: bool, persistent: bool) -> SolvedFrames:
-    """Measure all frames and solve what is left to solve."""
-    if is_solved:
-        return solver.take(frames)
-    return solver.solve_jointly(frames) if persistent else solver.solve_each(frames)
 
 
 def _described(options: RunOptions, images: CaptureImages | None, *, is_cuda: bool) -> str:

@@ -25,6 +25,8 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 from beam_warp.world.harmonics import SH_C0
 
+pytestmark = pytest.mark.slow  # test_color_errors.py and TestErrorBars of test_direct.py guard the parts
+
 ROUGHNESS = 0.5
 WALL, WALL_RADIUS = -1.3, 1.6
 VIEWS = 10

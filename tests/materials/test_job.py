@@ -16,11 +16,10 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
-from beam_warp.materials.capture_images import CaptureImages
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.job import OverviewOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
+from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
 from beam_warp.world.camera import Camera
@@ -258,6 +257,7 @@ class TestWithACapture:
         cosine = (cloud.normals * figure[0].normals[::4]).sum(axis=1)[measured]
         assert np.median(cosine) > np.cos(np.radians(20.0))
 
+    @pytest.mark.slow
     def test_a_stopped_job_continues_to_identical_bytes(self, discs, studio, tiny_capture, tmp_path):
         self.run(discs, studio, tmp_path / "whole", tiny_capture)
 
@@ -274,6 +274,7 @@ class TestWithACapture:
         )
         assert whole == continued
 
+    @pytest.mark.slow
     def test_threads_do_not_change_a_byte(self, discs, studio, tiny_capture, tmp_path, monkeypatch):
         found = []
         for threads in ("1", "3"):

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.digests import array_digest
-from beam_warp.jobs.progress import JobLog
-from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.archive import FrameArchive, MeasuredFrame
-from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
+from beam_warp.materials.direct import ColorEvidence, measure_materials
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
-from beam_warp.materials.roughness_finder import RoughnessFinder
-from beam_warp.materials.seen import SeenFrame
-from beam_warp.materials.source import Source
+from beam_warp.materials.steps.archive import MeasuredFrame
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.roughness_finder import RoughnessFinder
+from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.gaussians import Observability
 
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
@@ -30,64 +28,41 @@ class FrameMeasurement:
         notes: What a reader of the result should know.
     """
 
-    def __init__(
-        self,
-        source: Source,
-        light: PreparedEnvironment,
-        roughness: RoughnessFinder,
-        archive: FrameArchive,
-        *,
-        options: MaterialOptions | ImagePathOptions,
-        persistent: bool,
-        key: str,
-        log: JobLog,
-    ) -> None:
-        """Take what frames are measured with.
-
-        Args:
-            source: The frames.
-            light: The light of the capture.
-            roughness: Finds their roughness.
-            archive: Where finished frames are.
-            options: Of the direct path, or of the image path.
-            persistent: Whether row i is the same Gaussian in every frame.
-            key: Key of the job.
-            log: Told how far and how long steps take.
-        """
+    def __init__(self, plan: JobPlan, roughness: RoughnessFinder) -> None:
+        """Start with no frame; ``roughness`` finds that of each."""
         self.resumed = 0
         self.notes: list[str] = []
-        self._source, self._light, self._roughness, self._archive = source, light, roughness, archive
-        self._options, self._persistent, self._key, self._log = options, persistent, key, log
+        self._plan, self._roughness = plan, roughness
 
     def __iter__(self) -> Iterator[MeasuredFrame]:
         """Measure the frames in their order; each is stored before it is given out."""
-        total = len(self._source.sequence)
+        plan = self._plan
+        total = len(plan.source.sequence)
         previous: MeasuredFrame | None = None
         for number in range(total):
-            frame = self._source.frame(number)
-            key = self._source.key(self._key, frame)
+            frame = plan.source.frame(number)
+            key = plan.source.key(plan.key, frame)
             if previous is not None:  # what is found then depends on what was found before
                 key = array_digest(text=f"{key} {previous.key}")
-            measured = self._archive.find(number, key)
+            measured = plan.archive.find(number, key)
             if measured is None:
                 measured = self._measure(frame, key, previous)
-                with self._log.timer("store"):
-                    self._archive.keep(measured)
+                with plan.log.timer("store"):
+                    plan.archive.keep(measured)
                 frame.forget()
             else:
                 self.resumed += 1
-            self._log.report("decompose", number + 1, total)
-            follows = self._persistent and isinstance(self._options, ImagePathOptions)
-            previous = measured if follows else None
+            plan.log.report("decompose", number + 1, total)
+            previous = measured if plan.persistent and plan.options.images is not None else None
             yield measured
 
     def _measure(self, frame: SeenFrame, key: str, previous: MeasuredFrame | None) -> MeasuredFrame:
         """Measure one frame."""
-        options, evidence = self._options, None
-        if isinstance(options, ImagePathOptions):
-            arrays = self._by_images(frame, options, previous)
+        images, evidence = self._plan.options.images, None
+        if images is not None:
+            arrays = self._by_images(frame, images, previous)
         else:
-            arrays, evidence = self._by_rays(frame, options)
+            arrays, evidence = self._by_rays(frame)
         surface, report = frame.surface, frame.scene.report
         return MeasuredFrame(
             number=frame.number,
@@ -98,23 +73,23 @@ class FrameMeasurement:
             report=np.array([report.traced, report.dropped, report.raised_scales]),
         )
 
-    def _by_rays(self, frame: SeenFrame, options: MaterialOptions) -> tuple[dict[str, NDArray[Any]], ColorEvidence]:
+    def _by_rays(self, frame: SeenFrame) -> tuple[dict[str, NDArray[Any]], ColorEvidence]:
         """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
         scene, points, views = frame.scene, frame.points, frame.views
         roughness = self._roughness.arrays(frame)
-        with self._log.timer("materials"):
+        with self._plan.log.timer("materials"):
             measured = measure_materials(
                 frame.cloud,
                 scene,
                 points,
                 roughness["roughness"],
-                self._light,
-                options=options,
+                self._plan.light.prepared,
+                options=self._plan.options.materials,
                 views=views,
                 frame=frame.number,
-                progress=self._log.within("materials", frame.number),
+                progress=self._plan.log.within("materials", frame.number),
             )
-        with self._log.timer("fill"):
+        with self._plan.log.timer("fill"):
             occlusion, error = frame.filled_occlusion(measured.ambient_occlusion, measured.ambient_occlusion_error)
         arrays = {"ambient_occlusion": occlusion, "ambient_occlusion_error": error, **roughness}
         return arrays, measured.evidence
@@ -126,18 +101,18 @@ class FrameMeasurement:
         assert frame.capture is not None
         scene, roughness = frame.scene, self._roughness.arrays(frame)
         views = frame.images()
-        with self._log.timer("materials"):
+        with self._plan.log.timer("materials"):
             found = decompose_by_images(
                 frame.cloud,
                 scene,
                 views,
                 roughness["roughness"],
-                self._light,
+                self._plan.light.prepared,
                 options,
                 raster_options=frame.capture.raster,
                 previous=None if previous is None else previous.cloud.base_color,
                 frame=frame.number,
-                progress=self._log.within("materials", frame.number),
+                progress=self._plan.log.within("materials", frame.number),
             )
         self.notes += [note for note in found.notes if note not in self.notes]
         return {

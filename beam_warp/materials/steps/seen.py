@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,49 +11,35 @@ from numpy.typing import NDArray
 from beam_warp.capture.views import CapturedView
 from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.base_color import fill_from_neighbors
-from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints, estimate_normals
+from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
 
 
+@dataclass(frozen=True, eq=False)
 class SeenFrame:
     """One frame and what its views show of it. Each part is worked out when it is first asked for, and once.
 
     Attributes:
         number: Number of the frame in the sequence.
         original: The Gaussians in the axes of the input.
-        cloud: The Gaussians in the world's axes.
+        cloud: The Gaussians in the world's axes, with captured radiance.
         capture: Images of the capture; None without one.
+        options: Offset of ray origins, and seed.
+        device: Warp device.
+        log: Told how far and how long steps take.
     """
 
-    def __init__(
-        self,
-        number: int,
-        original: GaussianCloud,
-        cloud: GaussianCloud,
-        capture: CaptureImages | None,
-        options: MaterialOptions,
-        *,
-        device: str,
-        log: JobLog,
-    ) -> None:
-        """Take a frame; nothing is worked out yet.
-
-        Args:
-            number: Number of the frame in the sequence.
-            original: The Gaussians in the axes of the input.
-            cloud: The Gaussians in the world's axes, with captured radiance.
-            capture: Images of the capture; None to do without.
-            options: Offset of ray origins, and seed.
-            device: Warp device.
-            log: Told how far and how long steps take.
-        """
-        self.number, self.original, self.cloud, self.capture = number, original, cloud, capture
-        self.device = device
-        self._options, self._log = options, log
+    number: int
+    original: GaussianCloud
+    cloud: GaussianCloud
+    capture: CaptureImages | None
+    options: MaterialOptions
+    device: str
+    log: JobLog
 
     def forget(self) -> None:
         """Free what was worked out, which lies on the device; it is worked out again when it is asked for."""
@@ -62,14 +49,14 @@ class SeenFrame:
     @cached_property
     def scene(self) -> Scene:
         """The Gaussians as occluders."""
-        with self._log.timer("upload and build"):
+        with self.log.timer("upload and build"):
             return Scene.from_gaussians(self.cloud, self.device)
 
     def images(self) -> list[CapturedView]:
         """Read what the cameras saw; nothing without a capture."""
         if self.capture is None:
             return []
-        with self._log.timer("read images"):
+        with self.log.timer("read images"):
             return self.capture.views(self.number)
 
     @cached_property
@@ -78,7 +65,7 @@ class SeenFrame:
         if self.capture is None:
             return None
         images = self.images()
-        with self._log.timer("views"):
+        with self.log.timer("views"):
             return view_evidence(
                 self.cloud,
                 [image.camera for image in images],
@@ -86,17 +73,17 @@ class SeenFrame:
                 options=self.capture.raster,
                 ceiling=self.capture.ceiling(self.number, images),
                 device=self.device,
-                progress=self._log.within("views", self.number),
+                progress=self.log.within("views", self.number),
             )
 
     @cached_property
     def points(self) -> SurfacePoints:
         """Points where light is gathered: where views show the surface, or the Gaussians' own centres."""
-        views, offset = self.views, self._options.offset
+        views, offset = self.views, self.options.offset
         if views is None:
             return SurfacePoints.at_centers(self.cloud, self.scene, self.surface, offset)
         scene = self.scene
-        with self._log.timer("surface"):
+        with self.log.timer("surface"):
             return SurfacePoints.seen_by(self.cloud, views, scene, offset)
 
     @cached_property
@@ -104,9 +91,9 @@ class SeenFrame:
         """Normals of all Gaussians: as views show them, those of neighbours where none does; or estimated."""
         if self.views is None:
             scene = self.scene
-            with self._log.timer("normals"):
+            with self.log.timer("normals"):
                 return estimate_normals(
-                    self.cloud, scene, seed=self._options.seed, progress=self._log.within("normals", self.number)
+                    self.cloud, scene, seed=self.options.seed, progress=self.log.within("normals", self.number)
                 )
         points = self.points
         normals = points.normals.numpy()

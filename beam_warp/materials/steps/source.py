@@ -2,57 +2,45 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
+from functools import cached_property
 
 from beam_warp.capture.digests import CaptureDigests
 from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.capture_images import CaptureImages
 from beam_warp.materials.direct import MaterialOptions
-from beam_warp.materials.seen import SeenFrame
+from beam_warp.materials.steps.capture_images import CaptureImages
+from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Source:
     """Input of a job, read one frame at a time.
 
     Attributes:
-        sequence: The sequence as it was given.
-        images: Images of the capture; None without one.
-        first: Frame 0, which the light is judged by.
+        sequence: Frames with captured radiance, in any axes.
+        images: Images of the capture; None to do without.
+        options: Offset and seed, for what frames show.
+        digests: Digests of image files.
+        device: Warp device.
+        log: Told how far and how long steps take.
     """
 
-    def __init__(
-        self,
-        sequence: GaussianSequence,
-        images: CaptureImages | None,
-        options: MaterialOptions,
-        *,
-        digests: Path,
-        device: str,
-        log: JobLog,
-    ) -> None:
-        """Read the first frame.
+    sequence: GaussianSequence
+    images: CaptureImages | None
+    options: MaterialOptions
+    digests: CaptureDigests
+    device: str
+    log: JobLog
 
-        Args:
-            sequence: Frames with captured radiance, in any axes.
-            images: Images of the capture; None to do without.
-            options: Offset and seed, for what frames show.
-            digests: Folder of the digests of image files.
-            device: Warp device.
-            log: Told how far and how long steps take.
-
-        Raises:
-            InvalidArrayError: As `frame`.
-        """
-        self.sequence = sequence
-        self.images = images
-        self._options, self._device, self._log = options, device, log
-        self._digests = CaptureDigests(digests)
-        self.first = self._read(0)
+    @cached_property
+    def first(self) -> SeenFrame:
+        """Frame 0, which the light is judged by; see `frame`."""
+        return self._read(0)
 
     def frame(self, number: int) -> SeenFrame:
         """Read a frame and bring it to the world's axes.
@@ -74,7 +62,7 @@ class Source:
                 "Import Gaussians with captured colour."
             )
         cloud = change_axes(original, WORLD_AXES)
-        return SeenFrame(number, original, cloud, self.images, self._options, device=self._device, log=self._log)
+        return SeenFrame(number, original, cloud, self.images, self.options, self.device, self.log)
 
     def is_display_referred(self) -> bool:
         """Return whether the captured colour has no scale: that of the first frame's images, if there are any."""
@@ -84,7 +72,7 @@ class Source:
 
     def image_digest(self, number: int) -> str:
         """Return the digest of a frame's images; empty without a capture."""
-        return "" if self.images is None else self.images.digest(number, self._digests)
+        return "" if self.images is None else self.images.digest(number, self.digests)
 
     def key(self, job: str, frame: SeenFrame) -> str:
         """Return the key of everything that the measurements of a frame depend on.

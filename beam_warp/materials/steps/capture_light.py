@@ -21,8 +21,8 @@ from beam_warp.materials.exposure import estimate_exposure
 from beam_warp.materials.light import check_light
 from beam_warp.materials.options import ESTIMATE, RunOptions
 from beam_warp.materials.roughness_source import stated_roughness
-from beam_warp.materials.seen import SeenFrame
-from beam_warp.materials.source import Source
+from beam_warp.materials.steps.seen import SeenFrame
+from beam_warp.materials.steps.source import Source
 from beam_warp.world.environment import EnvironmentMap
 
 EXPOSURE_ROUGHNESS = 0.5

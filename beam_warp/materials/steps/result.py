@@ -11,12 +11,11 @@ from beam_warp._version import __version__
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.capture_light import CaptureLight
-from beam_warp.materials.measure import FrameMeasurement
-from beam_warp.materials.options import ESTIMATE, OverviewOptions, RunOptions
-from beam_warp.materials.solve import SolvedFrames
-from beam_warp.materials.source import Source
-from beam_warp.materials.tally import warnings_about
+from beam_warp.materials.options import ESTIMATE, OverviewOptions
+from beam_warp.materials.steps.measure import FrameMeasurement
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.solve import SolvedFrames
+from beam_warp.materials.steps.tally import warnings_about
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera
@@ -24,38 +23,28 @@ from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 
-def relightable_sequence(
-    source: Source, solved: SolvedFrames, options: RunOptions, stops: float, *, persistent: bool
-) -> GaussianSequence:
-    """Return the frames that were solved as a sequence, read lazily, in the world's axes.
-
-    Args:
-        source: What was decomposed.
-        solved: Its relightable frames.
-        options: How roughness was found.
-        stops: Exposure of the light.
-        persistent: Whether row i is the same Gaussian in every frame.
-    """
-    sequence = source.sequence
+def relightable_sequence(plan: JobPlan, solved: SolvedFrames) -> GaussianSequence:
+    """Return the frames that were solved as a sequence, read lazily, in the world's axes."""
+    sequence, options = plan.source.sequence, plan.options
     shared = sequence.constant & set(ATTRIBUTES) - {"normals"}
     if not solved.is_varying:
         shared |= {"base_color", "base_color_error", "observability"}
-    if persistent:
+    if plan.persistent:
         shared |= {"roughness", "roughness_error"} if options.roughness == ESTIMATE else {"roughness"}
     return GaussianSequence(
         frame_count=len(sequence),
         read_frame=solved.cloud,
         frames_per_second=sequence.frames_per_second,
         constant=frozenset(shared),
-        topology="constant" if persistent else "perFrame",
+        topology="constant" if plan.persistent else "perFrame",
         metadata={
             **sequence.metadata,
             "generator": f"beam-warp {__version__}",
             "normal_source": "shortestAxis" if solved.statistics["normals_from_shape"] > 0.5 else "authored",
             "roughness_source": options.roughness_source,
             "radiance_meaning": "captured",
-            "source_axes": source.first.original.axes,
-            "exposure_stops": f"{stops:.4f}",
+            "source_axes": plan.source.first.original.axes,
+            "exposure_stops": f"{plan.light.stops:.4f}",
         },
     )
 
@@ -82,46 +71,40 @@ def draw_overview(path: Path, sequence: GaussianSequence, light: PreparedEnviron
 
 
 def run_report(
-    source: Source,
-    light: CaptureLight,
+    plan: JobPlan,
     measurement: FrameMeasurement,
     solved: SolvedFrames,
-    options: RunOptions,
     *,
-    persistent: bool,
     findings: list[dict[str, Any]],
     roughness: dict[str, Any],
-    seconds: dict[str, float],
+    seconds: float,
 ) -> dict[str, Any]:
     """Return what was done, found and spent, JSON-able.
 
     Args:
-        source: What was decomposed.
-        light: The light of the capture.
-        measurement: What measured its frames.
+        plan: The job.
+        measurement: How its frames were measured.
         solved: Its relightable frames.
-        options: How they were measured.
-        persistent: Whether row i is the same Gaussian in every frame.
-        findings: What was wrong with the light and the images.
+        findings: Findings about the light and the images.
         roughness: How an estimate of roughness came about.
-        seconds: By stage.
+        seconds: Duration of the whole job.
     """
-    sequence, count = source.sequence, len(source.first.cloud)
+    sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.log.timer.seconds
     measured = len(sequence) - measurement.resumed
-    traced = seconds.get("materials", 0.0)
-    rays = measured * count * options.materials.sample_count * 2
+    traced = stages.get("materials", 0.0)
+    rays = measured * count * plan.options.materials.sample_count * 2
     notes = [*sequence.metadata.get("notes", "").splitlines(), *measurement.notes, *_lines(findings, "note")]
     return {
         "input": {"frames": len(sequence), "gaussians": count, "notes": notes},
-        "device": device_facts(light.prepared.device),
+        "device": device_facts(plan.light.prepared.device),
         "versions": versions(),
-        "options": options.as_dict(),
-        "exposure_stops": light.stops,
+        "options": plan.options.as_dict(),
+        "exposure_stops": plan.light.stops,
         "resumed_frames": measurement.resumed,
-        "persistent": persistent,
+        "persistent": plan.persistent,
         "materials": solved.statistics,
         "roughness": roughness,
-        "seconds": dict(seconds),
+        "seconds": {**stages, "total": seconds},
         "light_and_occlusion_rays_per_second": rays / traced if traced > 0.0 and measured else None,
         "findings": findings,
         "warnings": [*_lines(findings, "warning"), *warnings_about(solved.statistics)],

@@ -1,0 +1,97 @@
+"""Fifth step of the main job: base colour from the evidence of all frames, or of each by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from beam_warp.materials.base_color import BaseColor, solve_base_color
+from beam_warp.materials.changes import ChangeTest, with_changes
+from beam_warp.materials.direct import ColorEvidence
+from beam_warp.materials.steps.archive import FrameArchive, MeasuredFrame
+from beam_warp.materials.steps.plan import JobPlan
+from beam_warp.materials.steps.tally import MaterialTally
+from beam_warp.world.gaussians import GaussianCloud
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedFrames:
+    """Relightable frames, read one at a time.
+
+    Attributes:
+        archive: Where their measurements and solutions are.
+        has_solutions: Whether base colour was solved; on the image path it was measured with everything else.
+        is_varying: Whether frames have base colours of their own.
+        statistics: See `beam_warp.materials.steps.tally.MaterialTally.summary`.
+    """
+
+    archive: FrameArchive
+    has_solutions: bool
+    is_varying: bool
+    statistics: dict[str, Any]
+
+    def cloud(self, number: int) -> GaussianCloud:
+        """Read a frame."""
+        cloud = self.archive.read(number).cloud
+        if not self.has_solutions:
+            return cloud
+        return cloud.with_arrays(**self.archive.solution(number if self.is_varying else 0))
+
+
+def take(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
+    """Take frames of the image path as they are."""
+    tally = MaterialTally()
+    for frame in frames:
+        tally.add(frame, frame.cloud)
+    return SolvedFrames(plan.archive, False, True, tally.summary())
+
+
+def solve_each(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
+    """Solve every frame by itself: its Gaussians are those of no other. Solutions are stored."""
+    tally = MaterialTally()
+    for frame in frames:
+        with plan.log.timer("solve"):
+            solved = _solve(plan, frame, _evidence(frame))
+            plan.archive.keep_solution(frame.number, plan.key, solved)
+            tally.add(frame, frame.cloud.with_arrays(**solved.arrays()), solved.clipped_part)
+    return SolvedFrames(plan.archive, True, True, tally.summary())
+
+
+def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
+    """Solve one base colour for all frames, and one a frame for Gaussians on which frames disagree.
+
+    Solutions are stored. Memory does not grow with the number of frames: if some Gaussian changes, they are read again.
+    """
+    first, joint, test, count = None, None, ChangeTest(), 0
+    for frame in frames:
+        with plan.log.timer("solve"):
+            evidence = _evidence(frame)
+            first = first or frame
+            joint = evidence if joint is None else joint + evidence
+            test.add(evidence)
+            count += 1
+    assert first is not None
+    assert joint is not None
+    tally = MaterialTally()
+    with plan.log.timer("solve"):
+        change = test.result()
+        constant = _solve(plan, first, joint, dispersion=change.dispersion)
+        is_varying = bool(change.changing.any())
+        for number in range(count if is_varying else 1):
+            frame = first if number == 0 else plan.archive.read(number)
+            solved = with_changes(constant, change, _evidence(frame))
+            plan.archive.keep_solution(number, plan.key, solved)
+            if number == 0:
+                tally.add(first, first.cloud.with_arrays(**solved.arrays()), constant.clipped_part)
+    tally.count_changes(change)
+    return SolvedFrames(plan.archive, True, is_varying, tally.summary())
+
+
+def _solve(plan: JobPlan, frame: MeasuredFrame, evidence: ColorEvidence, *, dispersion: float = 1.0) -> BaseColor:
+    return solve_base_color(frame.cloud, evidence, plan.light.prepared.mean_irradiance, dispersion=dispersion)
+
+
+def _evidence(frame: MeasuredFrame) -> ColorEvidence:
+    assert frame.evidence is not None
+    return frame.evidence
