@@ -196,18 +196,6 @@ class LitPoints:
     views: Observations
     rows: NDArray[np.int64]
 
-    def without_views(self) -> LitPoints:
-        """Return the same points, towards no view."""
-        none = Observations()
-        device = self.surface.normals.device
-        for name, variable in Observations.vars.items():
-            setattr(none, name, wp.empty((0, len(self.rows)), dtype=variable.type.dtype, device=device))
-        return LitPoints(self.light, self.surface, none, self.rows)
-
-
-def without_report(done: int, total: int) -> None:
-    """Report to nobody."""
-
 
 def view_set() -> NDArray[np.float32]:
     """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
@@ -340,35 +328,14 @@ def lit_points(
     else:
         observed.colors = views.colors[:, at].contiguous()
         observed.directions = views.directions[:, at].contiguous()
-    return make_points(points, roughness, light, rows, observed)
-
-
-def make_points(
-    points: SurfacePoints,
-    roughness: NDArray[np.float32],
-    light: PreparedEnvironment,
-    rows: NDArray[np.integer[Any]],
-    views: Observations,
-) -> LitPoints:
-    """Make room for the light of some Gaussians and its residues towards views.
-
-    Args:
-        points: Of all Gaussians.
-        roughness: Of all Gaussians, ``(N,)``.
-        light: The light.
-        rows: Which Gaussians, ``(M,)``.
-        views: Colours and directions of views, ``(V, M)``; the residues are allocated here.
-    """
-    device = light.device
-    at = upload(np.asarray(rows, np.int32), int, device)
     surface = ShadedPoints()
     surface.normals = points.normals[at].contiguous()
     surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
-    views.specular = wp.zeros(views.directions.shape, dtype=wp.vec3, device=device)
-    views.diffuse_share = wp.zeros(views.directions.shape, dtype=float, device=device)
+    observed.specular = wp.zeros(observed.directions.shape, dtype=wp.vec3, device=device)
+    observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
     arriving = _empty(GatheredLight, len(rows), device)
     launch_sum_unshadowed(light.moments, surface.normals, arriving.unshadowed, device)
-    return LitPoints(arriving, surface, views, np.asarray(rows, np.int64))
+    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64))
 
 
 def light_batches(

@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 from beam_warp.checks import require_array, require_finite, require_same_length
 from beam_warp.device.arrays import download_like, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.trace.hit_gradients import CloudGradients, HitMoments, HitRecords
+from beam_warp.kernels.trace.hit_gradients import HitGradients, HitMoments, HitRecords
+from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.visibility_adjoint import (
     SUM_BLOCK,
+    HitTallies,
+    RayGradients,
+    WeightedRays,
     launch_add_moments,
     launch_count_hits,
     launch_resolve_moments,
@@ -92,58 +96,71 @@ def visibility_gradients(
 
     Source: closed forms in ``kernels/trace/hit_gradients.py``, derived there.
     """
-    device = scene.device
-    starts = upload_vectors("origins", origins, device)
-    ways = upload_vectors("directions", directions, device, unit_length=True)
-    require_same_length("directions", ways, "origins", len(starts))
-    weights = _upload_adjoints(adjoints, len(starts), device)
-    reaches = ray_reaches(t_max, len(starts), device)
+    device, rays = scene.device, WeightedRays()
+    rays.origins = upload_vectors("origins", origins, device)
+    rays.directions = upload_vectors("directions", directions, device, unit_length=True)
+    require_same_length("directions", rays.directions, "origins", len(rays.origins))
+    rays.adjoints = _upload_adjoints(adjoints, len(rays.origins), device)
+    rays.reaches = ray_reaches(t_max, len(rays.origins), device)
     if options.acceptance != "product":
         raise InvalidOptionError(
             f"options.acceptance must be 'product' for gradients, got {options.acceptance!r}. A Bernoulli sample of V "
             "is 0 or 1 and has no derivative; the product is what its mean estimates."
         )
-    settings = options.settings(scene)
-    gaussian_count, ray_count, degree = len(scene), len(starts), scene.occluders.gaussians.degree
+    moments, to_rays = _summed_hits(scene, options.settings(scene), rays)
+    gradients = _resolved(scene, moments)
+    results = (
+        gradients.positions,
+        gradients.orientations,
+        gradients.scales,
+        gradients.opacities,
+        to_rays.origins,
+        to_rays.directions,
+    )
+    return VisibilityGradients(*(download_like(result, origins, directions, adjoints) for result in results))
+
+
+def _summed_hits(scene: Scene, settings: TraceSettings, rays: WeightedRays) -> tuple[wp.array, RayGradients]:
+    """Return the moments of every Gaussian's hits, and the gradients with respect to the rays."""
+    device, gaussian_count, ray_count = scene.device, len(scene), len(rays.origins)
+    degree = scene.occluders.gaussians.degree
     moments = wp.zeros(gaussian_count, dtype=HitMoments, device=device)
-    to_origins = wp.zeros(ray_count, dtype=wp.vec3, device=device)
-    to_directions = wp.zeros(ray_count, dtype=wp.vec3, device=device)
-    transmittances = wp.empty(ray_count, dtype=float, device=device)
-    counts = wp.empty(ray_count, dtype=int, device=device)
-    launch_count_hits(scene.occluders, settings, starts, ways, reaches, weights, transmittances, counts, device)
-    for part, hit_count in _parts(counts.numpy()):
+    to_rays, tallies = RayGradients(), HitTallies()
+    to_rays.origins = wp.zeros(ray_count, dtype=wp.vec3, device=device)
+    to_rays.directions = wp.zeros(ray_count, dtype=wp.vec3, device=device)
+    tallies.transmittance = wp.empty(ray_count, dtype=float, device=device)
+    tallies.count = wp.empty(ray_count, dtype=int, device=device)
+    launch_count_hits(scene.occluders, settings, rays, tallies, device)
+    for part, hit_count in _parts(tallies.count.numpy()):
         ends = wp.empty(part.stop - part.start, dtype=int, device=device)
-        wp.utils.array_scan(counts[part], ends, inclusive=True)
+        wp.utils.array_scan(tallies.count[part], ends, inclusive=True)
         hits = HitRecords()
         hits.gaussian = wp.empty(2 * hit_count, dtype=int, device=device)  # the sort wants room for as many again
         hits.record = wp.empty(hit_count, dtype=wp.vec4, device=device)
         order = wp.empty(2 * hit_count, dtype=int, device=device)
-        launch_store_hits(
-            scene.occluders,
-            settings,
-            starts[part],
-            ways[part],
-            reaches[part] if len(reaches) > 1 else reaches,
-            weights[part],
-            transmittances[part],
-            counts[part],
-            ends,
-            gaussian_count,
-            hits,
-            order,
-            to_origins[part],
-            to_directions[part],
-            device,
-        )
+        some, their_tallies, to_some = (_rows_of(arrays, part) for arrays in (rays, tallies, to_rays))
+        launch_store_hits(scene.occluders, settings, some, their_tallies, ends, hits, order, to_some, device)
         wp.utils.radix_sort_pairs(hits.gaussian, order, hit_count, end_bit=gaussian_count.bit_length())
         sums = wp.empty(hit_count // SUM_BLOCK, dtype=HitMoments, device=device)
         launch_sum_blocks(degree, hits, order, sums, device)
         launch_add_moments(degree, hits, order, hit_count, sums, moments, device)
-    gradients = CloudGradients()
-    gradients.positions = wp.empty(gaussian_count, dtype=wp.vec3, device=device)
-    gradients.orientations = wp.empty(gaussian_count, dtype=wp.vec4, device=device)
-    gradients.scales = wp.empty(gaussian_count, dtype=wp.vec3, device=device)
-    gradients.opacities = wp.empty(gaussian_count, dtype=float, device=device)
+    return moments, to_rays
+
+
+def _rows_of(arrays: Any, part: slice) -> Any:
+    """Return a structure of arrays with some of its rows; an array of one number for all rows stays whole."""
+    some = arrays._cls()
+    for name in arrays._cls.vars:
+        array = getattr(arrays, name)
+        setattr(some, name, array if name == "reaches" and len(array) == 1 else array[part])
+    return some
+
+
+def _resolved(scene: Scene, moments: wp.array) -> HitGradients:
+    """Return the gradients with respect to the cloud's arrays."""
+    gradients = HitGradients()
+    for name, dtype in (("positions", wp.vec3), ("orientations", wp.vec4), ("scales", wp.vec3), ("opacities", float)):
+        setattr(gradients, name, wp.empty(len(scene), dtype=dtype, device=scene.device))
     launch_resolve_moments(
         scene.occluders.gaussians,
         scene.packed.orientations,
@@ -152,17 +169,9 @@ def visibility_gradients(
         SMALLEST_SCALE_RATIO,
         moments,
         gradients,
-        device,
+        scene.device,
     )
-    results = (
-        gradients.positions,
-        gradients.orientations,
-        gradients.scales,
-        gradients.opacities,
-        to_origins,
-        to_directions,
-    )
-    return VisibilityGradients(*(download_like(result, origins, directions, adjoints) for result in results))
+    return gradients
 
 
 def _upload_adjoints(adjoints: Any, count: int, device: Any) -> wp.array:

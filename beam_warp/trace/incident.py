@@ -144,7 +144,19 @@ def irradiance(
         )
     value = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
     error = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
-    _gather(scene, at, up, environment, parts, ratio, offset, options, (seed, frame), value, error)
+    _gather(
+        scene,
+        at,
+        up,
+        environment,
+        parts,
+        ratio=ratio,
+        offset=offset,
+        options=options,
+        stream=(seed, frame),
+        out_value=value,
+        out_error=error,
+    )
     return Irradiance(download_like(value, points, normals), download_like(error, points, normals))
 
 
@@ -154,6 +166,7 @@ def _gather(
     normals: wp.array,
     environment: PreparedEnvironment,
     parts: list[Technique],
+    *,
     ratio: bool,
     offset: float | Literal["auto"],
     options: TraceOptions,
@@ -188,4 +201,15 @@ def _gather(
             launch_draw_light(technique, environment, cumulative, batch, stream, rays, weights, device)
         visibility = wp.empty(len(rays.origins), dtype=float, device=device)
         trace_rays(scene, options, rays, visibility)
-        launch_reduce_light(batch, weights, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device)
+        launch_reduce_light(
+            batch,
+            weights,
+            visibility,
+            counts=counts,
+            paired=paired,
+            ratio=ratio,
+            unshadowed=unshadowed,
+            out_value=out_value,
+            out_error=out_error,
+            device=device,
+        )

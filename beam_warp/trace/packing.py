@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.device.arrays import upload
-from beam_warp.kernels.trace.bounds import launch_count_fates, launch_pack_gaussians
+from beam_warp.kernels.trace.bounds import CloudArrays, GaussianBounds, launch_count_fates, launch_pack_gaussians
 from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -31,7 +31,7 @@ class PackedGaussians:
         positions, orientations, scales: As given, to which gradients refer, ``(N,)`` vec3, quat and vec3.
         opacities: ``(N,)``.
         lowers, uppers: Bounds relative to ``origin``, ``(N,)`` vec3; a point where nothing can be seen.
-        fates: What becomes of each Gaussian (see `kernels.bounds`), ``(N,)`` int32.
+        fates: What becomes of each Gaussian (see `beam_warp.kernels.trace.bounds`), ``(N,)`` int32.
         takes_part: 1 for what is traced, ``(N,)`` int32.
         origin: World position of the device's coordinates [m]: the middle of what can be seen.
         extent: Largest side of the bounding box of those centres [m].
@@ -97,24 +97,23 @@ class PackedGaussians:
         wp.copy(self.positions, positions)
         wp.copy(self.orientations, orientations)
         wp.copy(self.scales, scales)
+        cloud, bounds = CloudArrays(), GaussianBounds()
+        cloud.positions, cloud.orientations, cloud.scales = positions, orientations, scales
+        cloud.opacities = self.opacities
+        bounds.lower, bounds.upper = self.lowers, self.uppers
+        bounds.fate, bounds.takes_part = self.fates, self.takes_part
         launch_pack_gaussians(
-            positions,
-            orientations,
-            scales,
-            self.opacities,
+            cloud,
             wp.vec3(*self.origin.tolist()),
             self.smallest_scale,
             SMALLEST_SCALE_RATIO,
             self.gaussians,
-            self.lowers,
-            self.uppers,
-            self.fates,
-            self.takes_part,
+            bounds,
             self.device,
         )
 
     def fate_counts(self) -> list[int]:
-        """Return how many Gaussians met each fate of `kernels.bounds`."""
+        """Return how many Gaussians met each fate of `beam_warp.kernels.trace.bounds`."""
         counts = wp.zeros(4, dtype=int, device=self.device)
         launch_count_fates(self.fates, counts, self.device)
         return counts.numpy().tolist()

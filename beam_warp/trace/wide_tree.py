@@ -149,7 +149,17 @@ def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method
                 if bound == 0:
                     break
             launch_open_level(
-                binary, items, count, method != "fast", level, queue, bound, level_sizes, following, layout, device
+                binary,
+                items,
+                count,
+                by_area=method != "fast",
+                level=level,
+                queue=queue,
+                bound=bound,
+                level_sizes=level_sizes,
+                out_queue=following,
+                out_layout=layout,
+                device=device,
             )
             queue, following = following, queue
         sizes = level_sizes.numpy()

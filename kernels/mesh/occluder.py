@@ -20,7 +20,9 @@ class MeshOccluder:
 
 
 @wp.struct
-class MeshHit:
+class NearestTriangle:
+    """The first triangle on a ray."""
+
     t: float  # the reach given, where nothing is hit
     face: int  # -1 where nothing is hit
     normal: wp.vec3  # geometric, of the face's counter-clockwise side
@@ -38,8 +40,8 @@ def mesh_blocks(occluder: MeshOccluder, origin: wp.vec3, direction: wp.vec3, t_m
 
 
 @wp.func
-def nearest_on_mesh(occluder: NoMesh, origin: wp.vec3, direction: wp.vec3, t_max: float) -> MeshHit:
-    hit = MeshHit()
+def nearest_on_mesh(occluder: NoMesh, origin: wp.vec3, direction: wp.vec3, t_max: float) -> NearestTriangle:
+    hit = NearestTriangle()
     hit.t = t_max
     hit.face = -1
     return hit
@@ -48,9 +50,9 @@ def nearest_on_mesh(occluder: NoMesh, origin: wp.vec3, direction: wp.vec3, t_max
 @wp.func
 def nearest_on_mesh(  # noqa: F811
     occluder: MeshOccluder, origin: wp.vec3, direction: wp.vec3, t_max: float
-) -> MeshHit:
+) -> NearestTriangle:
     """The first triangle before ``t_max``."""
-    hit = MeshHit()
+    hit = NearestTriangle()
     hit.t = t_max
     hit.face = -1
     query = wp.mesh_query_ray(occluder.mesh, origin, direction, t_max)

@@ -15,28 +15,42 @@ LARGEST_LENGTH = wp.constant(1.0e18)
 """Beyond it squares overflow float32."""
 
 
+@wp.struct
+class CloudArrays:
+    """A cloud as it was given, in world space."""
+
+    positions: wp.array[wp.vec3]
+    orientations: wp.array[wp.quat]
+    scales: wp.array[wp.vec3]
+    opacities: wp.array[float]
+
+
+@wp.struct
+class GaussianBounds:
+    """What trees are built from, relative to the scene's origin."""
+
+    lower: wp.array[wp.vec3]
+    upper: wp.array[wp.vec3]
+    fate: wp.array[int]  # one of the four above
+    takes_part: wp.array[int]  # 1 for what is traced
+
+
 @wp.kernel
 def pack_gaussians_kernel(
     first: int,
-    positions: wp.array[wp.vec3],
-    orientations: wp.array[wp.quat],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
+    cloud: CloudArrays,
     origin: wp.vec3,
     smallest_scale: float,
     largest_ratio: float,
     out_gaussians: Gaussians,
-    out_lower: wp.array[wp.vec3],
-    out_upper: wp.array[wp.vec3],
-    out_fate: wp.array[int],
-    out_takes_part: wp.array[int],
+    out_bounds: GaussianBounds,
 ):
-    """Pack one Gaussian; what cannot be traced gets radius -1 and a point for bounds, and ``out_fate`` says why."""
+    """Pack one Gaussian; what cannot be traced gets radius -1 and a point for bounds, and its fate says why."""
     i = first + wp.tid()
-    center = positions[i] - origin
-    scale = scales[i]
-    orientation = orientations[i]
-    opacity = opacities[i]
+    center = cloud.positions[i] - origin
+    scale = cloud.scales[i]
+    orientation = cloud.orientations[i]
+    opacity = cloud.opacities[i]
     norm = wp.length(orientation)
     fate = int(TRACED)
     # Comparisons are phrased so that NaN and infinity fail them; minima and maxima would pass over NaN.
@@ -83,10 +97,10 @@ def pack_gaussians_kernel(
         row = wp.vec3(rotation[k, 0] * scale[0], rotation[k, 1] * scale[1], rotation[k, 2] * scale[2])
         # Rounding must not lose the ellipsoid: a relative 1e-5 of the extent plus two ulp of the coordinate.
         half[k] = radius * wp.length(row) * 1.00001 + 2.4e-7 * wp.abs(center[k])
-    out_lower[i] = center - half
-    out_upper[i] = center + half
-    out_fate[i] = fate
-    out_takes_part[i] = wp.where(fate == TRACED or fate == RAISED, 1, 0)
+    out_bounds.lower[i] = center - half
+    out_bounds.upper[i] = center + half
+    out_bounds.fate[i] = fate
+    out_bounds.takes_part[i] = wp.where(fate == TRACED or fate == RAISED, 1, 0)
 
 
 FATES_A_THREAD = wp.constant(256)
@@ -109,26 +123,12 @@ def launch_count_fates(fates, out_counts, device):
     launch(count_fates_kernel, groups, inputs=[fates], outputs=[out_counts], device=device, in_order=True)
 
 
-def launch_pack_gaussians(
-    positions,
-    orientations,
-    scales,
-    opacities,
-    origin,
-    smallest_scale,
-    largest_ratio,
-    gaussians,
-    lower,
-    upper,
-    fates,
-    takes_part,
-    device,
-):
-    """Pack every Gaussian and its bounds; ``positions`` are world space, the outputs relative to ``origin``."""
+def launch_pack_gaussians(cloud, origin, smallest_scale, largest_ratio, out_gaussians, out_bounds, device):
+    """Pack every Gaussian and its bounds; ``cloud`` is in world space, the outputs relative to ``origin``."""
     launch(
         pack_gaussians_kernel,
-        len(positions),
-        inputs=[positions, orientations, scales, opacities, origin, smallest_scale, largest_ratio],
-        outputs=[gaussians, lower, upper, fates, takes_part],
+        len(cloud.positions),
+        inputs=[cloud, origin, smallest_scale, largest_ratio],
+        outputs=[out_gaussians, out_bounds],
         device=device,
     )

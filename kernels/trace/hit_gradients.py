@@ -38,7 +38,7 @@ class HitMoments:
 
 
 @wp.struct
-class CloudGradients:
+class HitGradients:
     """Gradients with respect to the arrays of a cloud."""
 
     positions: wp.array[wp.vec3]

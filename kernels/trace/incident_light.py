@@ -238,7 +238,7 @@ def launch_draw_light(technique, environment, cumulative, batch, stream, out_ray
     )
 
 
-def launch_reduce_light(batch, weights, visibility, counts, paired, ratio, unshadowed, out_value, out_error, device):
+def launch_reduce_light(batch, weights, visibility, *, counts, paired, ratio, unshadowed, out_value, out_error, device):
     """Add up each point's samples, in its own row; ``unshadowed`` is by row too."""
     launch(
         reduce_light_kernel,

@@ -212,7 +212,7 @@ def bound_nodes_kernel(
 
 
 def launch_open_level(
-    tree, items, leaf_count, by_area, level, queue, bound, level_sizes, out_queue, out_layout, device
+    tree, items, leaf_count, *, by_area, level, queue, bound, level_sizes, out_queue, out_layout, device
 ):
     """Open a level of at most ``bound`` nodes."""
     launch(

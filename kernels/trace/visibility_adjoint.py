@@ -17,7 +17,7 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.mesh.occluder import mesh_blocks
 from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.hit_gradients import (
-    CloudGradients,
+    HitGradients,
     HitMoments,
     HitRecords,
     add_hits,
@@ -161,41 +161,55 @@ def store_hits(
     return store_all(tree, gaussians, settings, ray, start)
 
 
+@wp.struct
+class WeightedRays:
+    """A batch of rays, and the gradient of the loss with respect to each one's visibility."""
+
+    origins: wp.array[wp.vec3]
+    directions: wp.array[wp.vec3]
+    reaches: wp.array[float]  # one number, or one for each ray
+    adjoints: wp.array[float]
+
+
+@wp.struct
+class HitTallies:
+    """A `HitTally` for each ray."""
+
+    transmittance: wp.array[float]
+    count: wp.array[int]
+
+
+@wp.struct
+class RayGradients:
+    """Gradients with respect to the rays of a batch."""
+
+    origins: wp.array[wp.vec3]
+    directions: wp.array[wp.vec3]
+
+
 @wp.kernel
-def count_hits_kernel(
-    first: int,
-    occluders: Any,
-    settings: TraceSettings,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    reaches: wp.array[float],
-    adjoints: wp.array[float],
-    out_transmittance: wp.array[float],
-    out_count: wp.array[int],
-):
+def count_hits_kernel(first: int, occluders: Any, settings: TraceSettings, rays: WeightedRays, out_tallies: HitTallies):
     """First traversal. A ray with adjoint 0 has no gradient to hand on and is not traced."""
     i = first + wp.tid()
     tally = HitTally()
-    if adjoints[i] != 0.0:
-        t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
-        origin = origins[i] - occluders.origin
-        if not mesh_blocks(occluders.mesh, origin, directions[i], t_max):
-            tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max)
-    out_transmittance[i] = tally.transmittance
-    out_count[i] = tally.count
+    if rays.adjoints[i] != 0.0:
+        t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
+        origin = rays.origins[i] - occluders.origin
+        if not mesh_blocks(occluders.mesh, origin, rays.directions[i], t_max):
+            tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, rays.directions[i], t_max)
+    out_tallies.transmittance[i] = tally.transmittance
+    out_tallies.count[i] = tally.count
 
 
-def launch_count_hits(
-    occluders, settings, origins, directions, reaches, adjoints, out_transmittance, out_count, device
-):
+def launch_count_hits(occluders, settings, rays, out_tallies, device):
     """Trace one ray a thread and count the hits that have gradients."""
     launch(
         count_hits_kernel,
-        len(origins),
-        inputs=[occluders, settings, origins, directions, reaches, adjoints],
-        outputs=[out_transmittance, out_count],
+        len(rays.origins),
+        inputs=[occluders, settings, rays],
+        outputs=[out_tallies],
         device=device,
-        block_dim=64,  # as `launch_trace_visibility`
+        block_dim=64,  # as `launch_trace_rays`
     )
 
 
@@ -204,76 +218,43 @@ def store_hits_kernel(
     first: int,
     occluders: Any,
     settings: TraceSettings,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    reaches: wp.array[float],
-    adjoints: wp.array[float],
-    transmittances: wp.array[float],
-    hit_counts: wp.array[int],
+    rays: WeightedRays,
+    tallies: HitTallies,
     slot_ends: wp.array[int],
-    gaussian_count: int,
     out_hits: HitRecords,
     out_order: wp.array[int],
-    out_origins: wp.array[wp.vec3],
-    out_directions: wp.array[wp.vec3],
+    out_rays: RayGradients,
 ):
-    """Second traversal. ``slot_ends`` is the inclusive scan of ``hit_counts``; ``out_order`` numbers the slots."""
+    """Second traversal. ``slot_ends`` is the inclusive scan of the tallies' counts; ``out_order`` numbers the slots."""
     i = first + wp.tid()
     ray = RayReturn()
-    ray.weight = -adjoints[i] * transmittances[i]
+    ray.weight = -rays.adjoints[i] * tallies.transmittance[i]
     ray.end = slot_ends[i]
-    begin = ray.end - hit_counts[i]
+    begin = ray.end - tallies.count[i]
     ray.hits = out_hits
     ray.slot = begin
     if begin < ray.end:
-        t_max = reaches[wp.min(i, reaches.shape[0] - 1)]
-        origin = origins[i] - occluders.origin
-        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, directions[i], t_max, ray)
+        t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
+        origin = rays.origins[i] - occluders.origin
+        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, rays.directions[i], t_max, ray)
     # The compiler may round a tie differently in the two traversals; then a slot stays free, and none overflows.
     for slot in range(ray.slot, ray.end):
-        out_hits.gaussian[slot] = gaussian_count
+        out_hits.gaussian[slot] = occluders.gaussians.center_opacity.shape[0]
     for slot in range(begin, ray.end):
         out_order[slot] = slot
-    out_origins[i] = ray.origin
-    out_directions[i] = ray.direction
+    out_rays.origins[i] = ray.origin
+    out_rays.directions[i] = ray.direction
 
 
-def launch_store_hits(
-    occluders,
-    settings,
-    origins,
-    directions,
-    reaches,
-    adjoints,
-    transmittances,
-    hit_counts,
-    slot_ends,
-    gaussian_count,
-    out_hits,
-    out_order,
-    out_origins,
-    out_directions,
-    device,
-):
+def launch_store_hits(occluders, settings, rays, tallies, slot_ends, out_hits, out_order, out_rays, device):
     """Trace one ray a thread and store its hits."""
     launch(
         store_hits_kernel,
-        len(origins),
-        inputs=[
-            occluders,
-            settings,
-            origins,
-            directions,
-            reaches,
-            adjoints,
-            transmittances,
-            hit_counts,
-            slot_ends,
-            gaussian_count,
-        ],
-        outputs=[out_hits, out_order, out_origins, out_directions],
+        len(rays.origins),
+        inputs=[occluders, settings, rays, tallies, slot_ends],
+        outputs=[out_hits, out_order, out_rays],
         device=device,
-        block_dim=64,  # as `launch_trace_visibility`
+        block_dim=64,  # as `launch_trace_rays`
     )
 
 
@@ -360,7 +341,7 @@ def resolve_moments_kernel(
     smallest_scale: float,
     largest_ratio: float,
     moments: wp.array[HitMoments],
-    out_gradients: CloudGradients,
+    out_gradients: HitGradients,
 ):
     """From moments to gradients of the cloud's arrays; 0 for Gaussians that take no part."""
     i = first + wp.tid()

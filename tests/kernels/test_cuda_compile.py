@@ -16,6 +16,8 @@ import pytest
 
 from beam_warp import kernels
 
+pytestmark = pytest.mark.slow
+
 MODULES = sorted(
     entry.name.removeprefix("beam_warp.kernels.")
     for entry in pkgutil.walk_packages(kernels.__path__, "beam_warp.kernels.")

@@ -16,6 +16,7 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
+from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.job import OverviewOptions
 from beam_warp.materials.roughness_source import RoughnessTexture

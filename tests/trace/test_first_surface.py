@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from reference.closest_surface import closest_surface_reference
 from support.shapes import random_cloud, random_rays
 
 from beam_warp import GaussianCloud, Scene, visibility
@@ -10,7 +11,7 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE
 from beam_warp.stability.tracing import traced_cloud
 from beam_warp.trace.first_surface import closest_surface
-from beam_warp.trace.reference import FLOAT32_ROUNDOFF, closest_surface_reference, rotation_matrices
+from beam_warp.trace.reference import FLOAT32_ROUNDOFF, rotation_matrices
 from beam_warp.trace.transmittance import TraceOptions
 
 WHOLE = TraceOptions(stop=0.0)

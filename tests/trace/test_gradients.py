@@ -411,10 +411,10 @@ class TestBits:
 
         def count_differently(*arguments):
             launch_count_hits(*arguments)
-            counts = arguments[-2].numpy()
+            counts = arguments[-2].count.numpy()
             changed.append(counts.copy())
             counts[10:20] += more * (counts[10:20] > 0)
-            arguments[-2].assign(counts)
+            arguments[-2].count.assign(counts)
 
         monkeypatch.setattr(gradients, "launch_count_hits", count_differently)
         result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
