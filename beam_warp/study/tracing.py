@@ -191,7 +191,7 @@ class _Bench:
         self,
         plan: TracingPlan,
         references: References,
-        scene: dict[str, Scene],
+        scene: Scene,
         light: PreparedEnvironment,
         count: int,
     ) -> None:
