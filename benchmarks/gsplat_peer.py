@@ -72,11 +72,7 @@ class Seconds(NamedTuple):
 
 def arguments(cloud: GaussianCloud, camera: Camera, values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
     """Return gsplat's arrays by its names: quaternions wxyz, world to camera and K with OpenCV's axes, as ours are."""
-    intrinsics = [
-        [camera.focal_x, 0.0, camera.center_x],
-        [0.0, camera.focal_y, camera.center_y],
-        [0.0, 0.0, 1.0],
-    ]
+    intrinsics = [[camera.focal_x, 0.0, camera.center_x], [0.0, camera.focal_y, camera.center_y], [0.0, 0.0, 1.0]]
     arrays = {
         "means": cloud.positions,
         "quats": cloud.orientations[:, [3, 0, 1, 2]],

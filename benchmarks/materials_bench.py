@@ -9,10 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from materials_cost import Scale
-from materials_truth import (
-    Materials,
-    TruthViews,
-)
+from materials_truth import Materials, TruthViews
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture

@@ -9,16 +9,7 @@ from typing import Any
 
 import numpy as np
 from materials_bench import TARGETS, Bench
-from materials_truth import (
-    SHARP,
-    Materials,
-    PerfectFrame,
-    Row,
-    TruthViews,
-    light_errors,
-    light_reference,
-    row_of,
-)
+from materials_truth import SHARP, Materials, PerfectFrame, Row, TruthViews, light_errors, light_reference, row_of
 
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color

@@ -16,14 +16,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.evaluate.relighters import Relighter
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.files import read_image, write_png
-from beam_warp.image.metrics import (
-    SOLID_ALPHA,
-    Score,
-    block_means,
-    bounding_box,
-    compare,
-    mean_scores,
-)
+from beam_warp.image.metrics import SOLID_ALPHA, Score, block_means, bounding_box, compare, mean_scores
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfacePoints

@@ -170,10 +170,7 @@ def compare(
     images: DepthImages, truth: trimesh.Trimesh | None, low: np.ndarray, high: np.ndarray, voxel: float, repeats: int
 ) -> dict[str, Any]:
     """Time both ways in turn, and measure what each made."""
-    ways = {
-        "sparse": lambda: fuse_depths(images, voxel=voxel),
-        "dense": lambda: fuse_dense(images, voxel, low, high),
-    }
+    ways = {"sparse": lambda: fuse_depths(images, voxel=voxel), "dense": lambda: fuse_dense(images, voxel, low, high)}
     times = take_turns({name: Task(work) for name, work in ways.items()}, repeats, images.device)
     found: dict[str, Any] = {
         name: {"seconds": float(np.median(times[name].alone)), **errors(work(), truth)} for name, work in ways.items()

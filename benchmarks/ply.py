@@ -100,10 +100,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         ours, theirs = Path(folder) / "ours.ply", Path(folder) / "theirs.ply"
         writing = fastest(
-            {
-                "beam": lambda: converters.write(sequence, ours),
-                "plyfile": lambda: write_with_plyfile(cloud, theirs),
-            },
+            {"beam": lambda: converters.write(sequence, ours), "plyfile": lambda: write_with_plyfile(cloud, theirs)},
             max(1, arguments.repeats // 2),
         )
         reading = fastest(

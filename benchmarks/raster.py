@@ -29,16 +29,7 @@ from gsplat_peer import VERSION as GSPLAT_VERSION
 from gsplat_peer import GsplatPeer, GsplatUnavailableError
 from gsplat_peer import Images as PeerImages
 from numpy.typing import NDArray
-from raster_contenders import (
-    Clocked,
-    Drawing,
-    Measured,
-    Seen,
-    captured,
-    digits,
-    measure_in_turn,
-    random_adjoints,
-)
+from raster_contenders import Clocked, Drawing, Measured, Seen, captured, digits, measure_in_turn, random_adjoints
 from raster_scenes import RasterScene, cube, figure, growth
 from raster_stages import measure_stages
 from raster_truth import Truth, brute_force
@@ -419,10 +410,7 @@ def threads_agree(scene: RasterScene, device: Any) -> Row:
             drawing = Drawing(scene, device)
             images.append(drawing.seen())
             gradients.append(drawing.gradients().values())
-    return {
-        "images": all(map(np.array_equal, *images)),
-        "gradients": all(map(np.array_equal, *gradients)),
-    }
+    return {"images": all(map(np.array_equal, *images)), "gradients": all(map(np.array_equal, *gradients))}
 
 
 def compare_devices(scene: RasterScene, there: Seen, drawing: Drawing) -> Row:

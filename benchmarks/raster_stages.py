@@ -17,15 +17,7 @@ from unittest.mock import patch
 
 import numpy as np
 import warp as wp
-from raster_contenders import (
-    Clocked,
-    Drawing,
-    captured,
-    digits,
-    measure_in_turn,
-    record_event,
-    seconds_between,
-)
+from raster_contenders import Clocked, Drawing, captured, digits, measure_in_turn, record_event, seconds_between
 
 from beam_warp.raster import backward, forward, rasterizer
 

@@ -120,12 +120,7 @@ def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> 
         loaded.append((name, light, subject["lights"][light], images))
     heights = [2.2 * images[0].shape[0] / images[0].shape[1] + 0.45 for *_, images in loaded]
     figure, axes = plt.subplots(
-        len(loaded),
-        4,
-        figsize=(8.8, sum(heights)),
-        height_ratios=heights,
-        layout="constrained",
-        squeeze=False,
+        len(loaded), 4, figsize=(8.8, sum(heights)), height_ratios=heights, layout="constrained", squeeze=False
     )
     for line, (name, light, found, images) in zip(axes, loaded, strict=True):
         rows = {(row["method"], row["setting"]): row for row in found["rows"]}

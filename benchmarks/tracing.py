@@ -42,10 +42,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.jobs.report import versions
 from beam_warp.trace.transmittance import ACCEPTANCES, TraceOptions
 
-SCENE_BUILDS: dict[str, dict[str, Any]] = {
-    "wide": {},
-    "wide fast": {"build": "fast"},
-}
+SCENE_BUILDS: dict[str, dict[str, Any]] = {"wide": {}, "wide fast": {"build": "fast"}}
 """Scenes that are compared, as arguments of `Scene.from_gaussians`; the first is what users get."""
 
 MOVES = ("refit", "fast", "quality")

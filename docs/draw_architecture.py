@@ -229,14 +229,7 @@ def draw_way(axes: Any) -> None:
         else:
             path = _smooth([(right, y0), (left, y1)], sideways=True)
         axes.add_patch(
-            FancyArrowPatch(
-                path=path,
-                arrowstyle="-|>",
-                mutation_scale=10.0,
-                linewidth=1.3,
-                color=ARROW,
-                zorder=1,
-            )
+            FancyArrowPatch(path=path, arrowstyle="-|>", mutation_scale=10.0, linewidth=1.3, color=ARROW, zorder=1)
         )
     for name, text, package, _, _ in WAY:
         x, y = places[name]

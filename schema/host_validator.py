@@ -11,10 +11,7 @@ def _asset_rules(stage: Usd.Stage, _time_range: object) -> list[UsdValidation.Va
     kinds = {"error": UsdValidation.ValidationErrorType.Error, "warning": UsdValidation.ValidationErrorType.Warn}
     return [
         UsdValidation.ValidationError(
-            found.rule,
-            kinds[found.severity],
-            [UsdValidation.ValidationErrorSite(stage, found.prim)],
-            found.message,
+            found.rule, kinds[found.severity], [UsdValidation.ValidationErrorSite(stage, found.prim)], found.message
         )
         for found in check_rules(stage).findings
     ]

@@ -33,11 +33,7 @@ from beam_warp.schema.stage_queries import (
     stage_meters,
 )
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, Topology
-from beam_warp.world.metadata import (
-    UNSTATED_RASTER,
-    capture_frames_metadata,
-    raster_metadata,
-)
+from beam_warp.world.metadata import UNSTATED_RASTER, capture_frames_metadata, raster_metadata
 
 _MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"})
 """Arrays that a moving transform changes."""

@@ -38,11 +38,7 @@ USDZ_LIMIT = 2**32
 
 
 def write_asset(
-    sequence: GaussianSequence,
-    path: str | Path,
-    *,
-    full_float: bool = False,
-    segment_length: int = 30,
+    sequence: GaussianSequence, path: str | Path, *, full_float: bool = False, segment_length: int = 30
 ) -> list[Path]:
     """Write a relightable 4D Gaussian asset.
 

@@ -53,12 +53,7 @@ MODELS = {
 }
 """Camera models that `Lens` can express: COLMAP's number and parameters of each."""
 
-OTHER_MODELS = {
-    6: "FULL_OPENCV",
-    7: "FOV",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-}
+OTHER_MODELS = {6: "FULL_OPENCV", 7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
 """Camera models that are refused by name."""
 
 MAX_NAME_BYTES = 4096

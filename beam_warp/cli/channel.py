@@ -61,8 +61,7 @@ class DrawChannel:
         arg(metavar="ASSET", help="PLY or USD file, a folder with asset.usda, or a folder of numbered PLY files."),
     ]
     name: Annotated[
-        Positional[str],
-        arg(metavar="NAME", help="Array: base_color, roughness_error, observability, normals, …."),
+        Positional[str], arg(metavar="NAME", help="Array: base_color, roughness_error, observability, normals, ….")
     ]
     out: Annotated[
         Path, arg(metavar="FILE", help=".png or .exr; frames/%04d.png for numbers; a folder with --capture.")

@@ -13,13 +13,7 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.console import ProgressCallback, print_json, print_notes, progress
-from beam_warp.cli.decompose import (
-    Measuring,
-    light_of,
-    outcome,
-    overview_options,
-    run_options,
-)
+from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
 from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
 from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary

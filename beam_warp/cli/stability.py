@@ -118,9 +118,7 @@ def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     from beam_warp.stability.page import StabilityResult
 
     outcomes = run_material_cases(
-        MaterialStudio(args.device),
-        MATERIAL_CASES,
-        progress=lambda done, total: report("materials", done, total),
+        MaterialStudio(args.device), MATERIAL_CASES, progress=lambda done, total: report("materials", done, total)
     )
     return StabilityResult(materials=tuple(outcomes))
 

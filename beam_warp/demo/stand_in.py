@@ -85,13 +85,7 @@ def trained_gaussians(
     count = len(points)
     outward = _seen_directions(normals)
     radiance = outgoing_radiance(
-        traced,
-        samples.faces,
-        samples.weights,
-        outward,
-        light,
-        sample_count=PATHS_PER_DIRECTION,
-        seed=seed,
+        traced, samples.faces, samples.weights, outward, light, sample_count=PATHS_PER_DIRECTION, seed=seed
     )
     return GaussianCloud(
         positions=points + normals * (samples.lift * FLATNESS * sigma)[:, None],

@@ -16,13 +16,7 @@ from beam_warp.kernels.light.shading import EnvironmentLight
 from beam_warp.kernels.trace.incident_light import LightMoments
 from beam_warp.light.prefiltered import blurred_environment
 from beam_warp.light.regions import EnvironmentRegions
-from beam_warp.light.sampled import (
-    environment_blocks,
-    environment_distribution,
-    fitted,
-    light_moments,
-    product_tree,
-)
+from beam_warp.light.sampled import environment_blocks, environment_distribution, fitted, light_moments, product_tree
 from beam_warp.world.environment import EnvironmentMap
 
 NO_LIGHT = EnvironmentMap.constant((0.0, 0.0, 0.0), height=4)

@@ -264,11 +264,7 @@ class _BlendedImages:
         # All groups draw into the same images: what one drew is used up before the next one draws.
         first = max(parts, key=lambda part: sum(views[i].camera.width * views[i].camera.height for i in part))
         room = Rasterizer(
-            self.count,
-            [views[i].camera for i in first],
-            value_count=self.width,
-            options=raster_options,
-            device=device,
+            self.count, [views[i].camera for i in first], value_count=self.width, options=raster_options, device=device
         )
         self.groups = []
         for part in parts:

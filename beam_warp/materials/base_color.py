@@ -171,10 +171,7 @@ def _has_evidence(evidence: ColorEvidence) -> NDArray[np.bool_]:
 
 
 def fill_from_neighbors(
-    positions: NDArray[np.float32],
-    values: NDArray[Any],
-    errors: NDArray[Any],
-    missing: NDArray[np.bool_],
+    positions: NDArray[np.float32], values: NDArray[Any], errors: NDArray[Any], missing: NDArray[np.bool_]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Give what was not observed the mean of its nearest observed neighbours.
 

@@ -187,10 +187,7 @@ def view_evidence(
 
 
 def _groups(
-    count: int,
-    views: Iterator[tuple[Camera, CapturedView | None]],
-    options: RasterOptions | None,
-    device: wp.Device,
+    count: int, views: Iterator[tuple[Camera, CapturedView | None]], options: RasterOptions | None, device: wp.Device
 ) -> Iterator[tuple[Rasterizer, range, list[CapturedView | None]]]:
     """Rasterise some views at a time; views of the same sizes share their buffers."""
     rasterizer: Rasterizer | None = None

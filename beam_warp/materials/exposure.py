@@ -63,15 +63,7 @@ def estimate_exposure(
     # Weights that depend on the light would make the sums more than linear in it.
     direct = replace(options, bounce=False, robust=False)
     full, half = (
-        measure_materials(
-            cloud,
-            scene,
-            points,
-            roughness,
-            light.scaled(factor),
-            options=direct,
-            rows=rows,
-        ).evidence
+        measure_materials(cloud, scene, points, roughness, light.scaled(factor), options=direct, rows=rows).evidence
         for factor in (1.0, 0.5)
     )
     # Where the assumed light hardly reaches the quotient is arbitrary; such Gaussians have no say.

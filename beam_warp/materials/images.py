@@ -51,14 +51,7 @@ from beam_warp.materials.residues import (
 )
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.trace.denoise import (
-    DENOISERS,
-    Denoiser,
-    NoisyImage,
-    SurfaceGuides,
-    chosen_denoiser,
-    denoise,
-)
+from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
 from beam_warp.trace.occlusion import Progress
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
@@ -306,12 +299,7 @@ def _measure_view(
         occlusion = surface_occlusion(scene, surfaces, sample_count=options.occlusion_samples, **stream)
     with stages("light rays"):
         residues = surface_residues(
-            scene,
-            surfaces,
-            light,
-            sample_count=options.light_samples,
-            diffuse_weight=options.diffuse_weight,
-            **stream,
+            scene, surfaces, light, sample_count=options.light_samples, diffuse_weight=options.diffuse_weight, **stream
         )
     with stages("denoise"):
         noisy = [

@@ -153,12 +153,7 @@ class LightCheck:
 
 
 def check_light(
-    scene: Scene,
-    points: SurfacePoints,
-    views: ViewEvidence,
-    environment: EnvironmentMap,
-    *,
-    subset: int = 1024,
+    scene: Scene, points: SurfacePoints, views: ViewEvidence, environment: EnvironmentMap, *, subset: int = 1024
 ) -> LightCheck:
     """Ask well-seen Gaussians whether an environment is the light that they were captured under.
 

@@ -59,12 +59,7 @@ class Adam:
     """
 
     def __init__(
-        self,
-        parameters: Mapping[str, Parameters],
-        *,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        epsilon: float = 1e-15,
+        self, parameters: Mapping[str, Parameters], *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
     ) -> None:
         """Begin without moments; 8 bytes for every float, and 12 for every row.
 

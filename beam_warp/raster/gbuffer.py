@@ -127,12 +127,7 @@ def rasterize(
 
 
 def rasterize_values(
-    cloud: GaussianCloud,
-    camera: Camera,
-    values: ArrayLike,
-    *,
-    options: RasterOptions | None = None,
-    device: Any = None,
+    cloud: GaussianCloud, camera: Camera, values: ArrayLike, *, options: RasterOptions | None = None, device: Any = None
 ) -> ValueImages:
     """Draw any per-Gaussian values: the linear map from values to pixels that `rasterize` rests on.
 

@@ -249,14 +249,7 @@ class _Cones:
         """Return the states of a grid of blocks."""
         states = wp.empty(int(np.prod(count)), dtype=int, device=self.device)
         launch_judge_blocks(
-            wp.vec3(*lower),
-            size,
-            wp.vec3i(*count),
-            self.views,
-            self.distances,
-            self.quorum,
-            states,
-            self.device,
+            wp.vec3(*lower), size, wp.vec3i(*count), self.views, self.distances, self.quorum, states, self.device
         )
         return states.numpy().reshape(count)
 
@@ -274,15 +267,7 @@ class _Cones:
         depths = wp.empty(len(blocks) * BLOCK_POINTS, dtype=float, device=device)
         origin = wp.vec3(*lower)
         launch_fill_blocks(
-            subscripts,
-            origin,
-            voxel,
-            wp.vec3i(*count),
-            self.views,
-            self.distances,
-            self.quorum,
-            depths,
-            device,
+            subscripts, origin, voxel, wp.vec3i(*count), self.views, self.distances, self.quorum, depths, device
         )
         crossed = wp.empty(len(blocks) * BLOCK_CELLS, dtype=int, device=device)
         launch_find_cells(depths, crossed, device)

@@ -123,9 +123,7 @@ def initial_gaussians(
         require_finite("point_colors", table)
         colors = table[rows]
     return shapes.with_arrays(
-        normals=None,
-        radiance=((colors - 0.5) / SH_C0)[:, None, :],
-        radiance_color_space=LINEAR_REC709,
+        normals=None, radiance=((colors - 0.5) / SH_C0)[:, None, :], radiance_color_space=LINEAR_REC709
     )
 
 

@@ -179,9 +179,7 @@ class ViewTargets:
         self._to_encoded.zero_()
         launch_encode(self._color, self._samples, self._encoded, self.device)
         target = self._colors[index]
-        terms = [
-            self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded),
-        ]
+        terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded)]
         if weights.ssim > 0.0:
             terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
         launch_add_sample_gradients(self._color, self._samples, self._to_encoded, self._to_color, self.device)

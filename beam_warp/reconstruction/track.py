@@ -23,15 +23,7 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reconstruction.fit import (
-    FIT_RASTER,
-    NO_PSNR,
-    PRESETS,
-    FitOptions,
-    Fitter,
-    LearningRates,
-    mean_psnr,
-)
+from beam_warp.reconstruction.fit import FIT_RASTER, NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
 from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
 from beam_warp.reconstruction.initial import DISC_WIDTH
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
@@ -204,11 +196,7 @@ def begin_track(
     joints = cloud.positions[rows]
     graph = JointGraph.build(joints, normals=normals[rows], smallest_cosine=SMALLEST_COSINE)
     anchors = Anchors.fit(
-        cloud.positions,
-        joints,
-        normals=normals,
-        joint_normals=normals[rows],
-        smallest_cosine=SMALLEST_COSINE,
+        cloud.positions, joints, normals=normals, joint_normals=normals[rows], smallest_cosine=SMALLEST_COSINE
     )
     still = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (len(joints), 1))
     baseline = np.array([mean_psnr(psnr), targets.gaps(gaussians).max()])

@@ -198,13 +198,7 @@ class ArrivingLight:
         """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
-        launch_light_gaussians(
-            gaussians,
-            self.scene_light(),
-            self._arriving,
-            self._lit,
-            self._device,
-        )
+        launch_light_gaussians(gaussians, self.scene_light(), self._arriving, self._lit, self._device)
         radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
             gaussians.positions, self._arriving, self._clusters, radiosity, gaussians.values, self._device

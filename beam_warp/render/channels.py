@@ -131,12 +131,7 @@ class SeenChannel:
 
 
 def see_channel(
-    cloud: GaussianCloud,
-    camera: Camera,
-    name: str,
-    *,
-    options: RasterOptions | None = None,
-    device: str | None = None,
+    cloud: GaussianCloud, camera: Camera, name: str, *, options: RasterOptions | None = None, device: str | None = None
 ) -> SeenChannel:
     """Draw one channel of a cloud.
 

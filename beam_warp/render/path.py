@@ -350,13 +350,7 @@ class PathProgress:
         """
         arrays = {name: getattr(self._images, name).numpy() for name in IMAGES}
         with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(
-                file,
-                digest=self.digest(),
-                sample_count=self.sample_count,
-                pixels=self._pixels.numpy(),
-                **arrays,
-            )
+            np.savez(file, digest=self.digest(), sample_count=self.sample_count, pixels=self._pixels.numpy(), **arrays)
 
     def resume(self, path: Path) -> bool:
         """Go on from what `save` wrote, if it is of this very shot and these options; tell whether it was."""

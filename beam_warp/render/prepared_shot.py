@@ -193,14 +193,7 @@ class DeferredFrame:
     def _shade(self) -> None:
         """Light what was drawn."""
         light, images = self._light.scene_light(), self._rasterizer.images
-        launch_shade_gaussians(
-            self._views,
-            images,
-            self._options.lights_gaussians,
-            light,
-            self.samples,
-            self._device,
-        )
+        launch_shade_gaussians(self._views, images, self._options.lights_gaussians, light, self.samples, self._device)
         if self._traced is not None:
             launch_shade_mesh(
                 self._views,

@@ -157,10 +157,7 @@ class Bench:
 
 
 def run_material_cases(
-    studio: MaterialStudio,
-    cases: Sequence[MaterialCase],
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    studio: MaterialStudio, cases: Sequence[MaterialCase], *, progress: Callable[[int, int], None] | None = None
 ) -> Iterator[MaterialOutcome]:
     """Run case after case.
 

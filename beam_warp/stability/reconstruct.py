@@ -29,11 +29,7 @@ from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.captures import Reconstruct, Reconstructed
 from beam_warp.world.gaussians import GaussianSequence
 
-TOLD = {
-    FRAME_LACKS_CAMERAS: "reconstructed from the cameras that there are",
-    FEW_CAMERAS: "told",
-    FAST_MOTION: "told",
-}
+TOLD = {FRAME_LACKS_CAMERAS: "reconstructed from the cameras that there are", FEW_CAMERAS: "told", FAST_MOTION: "told"}
 """What is done about findings after which the input stays as it is."""
 
 

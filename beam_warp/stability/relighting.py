@@ -167,10 +167,7 @@ class RelightingBench:
 
 
 def run_relighting_cases(
-    bench: RelightingBench,
-    cases: Sequence[RelightingCase],
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    bench: RelightingBench, cases: Sequence[RelightingCase], *, progress: Callable[[int, int], None] | None = None
 ) -> Iterator[RelightingOutcome]:
     """Run case after case with every renderer.
 

@@ -24,12 +24,7 @@ from beam_warp.stability.tracing_cases import Stress, StressCase
 from beam_warp.trace.first_surface import closest_surface
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.packing import SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO
-from beam_warp.trace.reference import (
-    FLOAT32_ROUNDOFF,
-    Enclosure,
-    visibility_enclosure,
-    visibility_reference,
-)
+from beam_warp.trace.reference import FLOAT32_ROUNDOFF, Enclosure, visibility_enclosure, visibility_reference
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.gaussians import GaussianCloud

@@ -344,11 +344,7 @@ def _chain() -> Stress:
     rng = np.random.default_rng(18)
     place = np.repeat(2.0 ** -np.arange(100.0), 8)
     cloud = _cloud(
-        rng,
-        800,
-        (place * 0.2)[:, None],
-        positions=place[:, None] * np.array([1.0, 0.5, 0.25]),
-        opacities=(0.02, 0.2),
+        rng, 800, (place * 0.2)[:, None], positions=place[:, None] * np.array([1.0, 0.5, 0.25]), opacities=(0.02, 0.2)
     )
     origins, directions = aimed_rays(rng, cloud, 200)
     return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 800})

@@ -188,12 +188,7 @@ class _Bench:
     """Everything that settings are measured on."""
 
     def __init__(
-        self,
-        plan: TracingPlan,
-        references: References,
-        scene: Scene,
-        light: PreparedEnvironment,
-        count: int,
+        self, plan: TracingPlan, references: References, scene: Scene, light: PreparedEnvironment, count: int
     ) -> None:
         """Keep what is measured on; ``count`` is the number of Gaussians that times are scaled to."""
         self.plan, self.references, self.scene, self.light, self.count = plan, references, scene, light, count

@@ -81,11 +81,7 @@ class TracingPlan:
 
     def occlusion_settings(self) -> list[Settings]:
         """Return the settings of ambient occlusion without rays, the most telling first."""
-        axes = {
-            "acceptance": self.acceptances,
-            "sampler": self.samplers,
-            "offset": self.offsets,
-        }
+        axes = {"acceptance": self.acceptances, "sampler": self.samplers, "offset": self.offsets}
         return _crossed(axes, self.crossing, ({"acceptance", "sampler"}, {"offset"}))
 
     def irradiance_settings(self) -> list[Settings]:

@@ -193,12 +193,7 @@ def _filter_by_oidn(colors: wp.array, guides: SurfaceGuides, hdr: bool) -> wp.ar
     image = colors.numpy().reshape(shape).copy()
     image[~surface] = image[surface].mean(axis=0, dtype=np.float64)
     clean = package.denoise(
-        image,
-        albedo=np.ones(shape, np.float32),
-        normal=normals,
-        hdr=hdr,
-        clean_aux=True,
-        device=_oidn_device(package),
+        image, albedo=np.ones(shape, np.float32), normal=normals, hdr=hdr, clean_aux=True, device=_oidn_device(package)
     )
     return upload((np.asarray(clean) * surface[..., None]).reshape(-1, 3), wp.vec3, colors.device)
 

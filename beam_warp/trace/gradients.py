@@ -57,13 +57,7 @@ class VisibilityGradients:
 
 
 def visibility_gradients(
-    scene: Scene,
-    origins: Any,
-    directions: Any,
-    adjoints: Any,
-    *,
-    t_max: Any = math.inf,
-    options: TraceOptions = EXACT,
+    scene: Scene, origins: Any, directions: Any, adjoints: Any, *, t_max: Any = math.inf, options: TraceOptions = EXACT
 ) -> VisibilityGradients:
     """Return the gradients of L = sum over rays of adjoint V, V as `visibility` returns it for the same arguments.
 

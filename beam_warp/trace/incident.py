@@ -185,12 +185,7 @@ def _gather(
     counts = wp.vec2i(parts[0].samples.count, count - parts[0].samples.count)
     paired = wp.vec2i(int(parts[0].samples.columns > 0), int(parts[-1].samples.columns > 0))
     for batch in ray_batches(
-        scene,
-        points,
-        normals,
-        offset,
-        count,
-        points_at_once=points_for_weights(device) if is_product else None,
+        scene, points, normals, offset, count, points_at_once=points_for_weights(device) if is_product else None
     ):
         cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
         if is_product:

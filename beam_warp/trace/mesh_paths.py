@@ -9,13 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import (
-    require_array,
-    require_count,
-    require_finite,
-    require_range,
-    require_same_length,
-)
+from beam_warp.checks import require_array, require_count, require_finite, require_range, require_same_length
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.mesh.channels import MeshChannels, launch_trace_channels
@@ -130,26 +124,13 @@ def trace_radiance(
     pixels = camera.width * camera.height
     rgb = wp.zeros(pixels, dtype=wp.vec3, device=mesh.device)
     alpha = wp.zeros(pixels, dtype=float, device=mesh.device)
-    launch_trace_pixels(
-        _lit(mesh, environment),
-        pixel_rays(camera),
-        seed,
-        sample_count,
-        bounce_count,
-        rgb,
-        alpha,
-    )
+    launch_trace_pixels(_lit(mesh, environment), pixel_rays(camera), seed, sample_count, bounce_count, rgb, alpha)
     shape = (camera.height, camera.width)
     return TracedRadiance(rgb.numpy().reshape(*shape, 3), alpha.numpy().reshape(shape))
 
 
 def trace_channels(
-    mesh: TracedMesh,
-    camera: Camera,
-    *,
-    sample_count: int = 16,
-    visibility_count: int = 8,
-    seed: int = 0,
+    mesh: TracedMesh, camera: Camera, *, sample_count: int = 16, visibility_count: int = 8, seed: int = 0
 ) -> TracedChannels:
     """Trace what a pixel sees besides light.
 

@@ -166,12 +166,7 @@ class Scene:
         return self._count
 
     def move(
-        self,
-        positions: Any,
-        orientations: Any,
-        scales: Any,
-        *,
-        tree: Literal["refit", "fast", "quality"] = "refit",
+        self, positions: Any, orientations: Any, scales: Any, *, tree: Literal["refit", "fast", "quality"] = "refit"
     ) -> None:
         """Move the scene's Gaussians, in place; opacities stay.
 

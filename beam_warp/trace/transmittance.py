@@ -72,13 +72,7 @@ EXACT = TraceOptions()
 
 
 def visibility(
-    scene: Scene,
-    origins: Any,
-    directions: Any,
-    *,
-    t_max: Any = math.inf,
-    options: TraceOptions = EXACT,
-    seed: int = 0,
+    scene: Scene, origins: Any, directions: Any, *, t_max: Any = math.inf, options: TraceOptions = EXACT, seed: int = 0
 ) -> Any:
     """Return the transmittance along each ray.
 

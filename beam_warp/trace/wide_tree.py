@@ -18,12 +18,7 @@ from beam_warp.kernels.trace.tree_build import (
     launch_merge_clusters,
     launch_start_clusters,
 )
-from beam_warp.kernels.trace.tree_collapse import (
-    WideLayout,
-    launch_bound_nodes,
-    launch_fill_leaves,
-    launch_open_level,
-)
+from beam_warp.kernels.trace.tree_collapse import WideLayout, launch_bound_nodes, launch_fill_leaves, launch_open_level
 from beam_warp.kernels.trace.wide_tree import LARGEST_DEPTH, LARGEST_NODE_COUNT, LEAF_ROWS, NODE_ROWS, WideTree
 from beam_warp.trace.packing import PackedGaussians
 

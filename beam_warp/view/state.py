@@ -31,12 +31,7 @@ NO_ENVIRONMENT = "none"
 NO_GROUND, GREY_GROUND, SHADOW_GROUND = "none", "grey", "shadows"
 """What the subject stands on: nothing, a grey square, or what catches its shadow and is not seen itself."""
 
-LIMITS = {
-    "rotation": (-360.0, 360.0),
-    "exposure": (-16.0, 16.0),
-    "samples": (1, 1_000_000),
-    "frame": (0, 2**31 - 1),
-}
+LIMITS = {"rotation": (-360.0, 360.0), "exposure": (-16.0, 16.0), "samples": (1, 1_000_000), "frame": (0, 2**31 - 1)}
 """Least and most of every number."""
 
 SPOT_CORE = 0.7

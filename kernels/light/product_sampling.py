@@ -70,10 +70,7 @@ def entry_before(cumulative: wp.array2d[float], row: int, begin: int, index: int
 
 @wp.kernel
 def accumulate_block_weights_kernel(
-    first: int,
-    blocks: EnvironmentBlocks,
-    normals: wp.array[wp.vec3],
-    out_cumulative: wp.array2d[float],
+    first: int, blocks: EnvironmentBlocks, normals: wp.array[wp.vec3], out_cumulative: wp.array2d[float]
 ):
     """Cumulative block weights of one point in row-major block order, not normalised."""
     i = first + wp.tid()

@@ -32,11 +32,7 @@ class PixelGuards:
 
 @wp.kernel
 def write_bake_targets_kernel(
-    first: int,
-    pixels: ShownPixels,
-    guards: PixelGuards,
-    out_targets: wp.array2d[float],
-    out_weights: wp.array2d[float],
+    first: int, pixels: ShownPixels, guards: PixelGuards, out_targets: wp.array2d[float], out_weights: wp.array2d[float]
 ):
     """Base colour (3) and ambient occlusion, times coverage, and 1 for each that counts; NaN counts as nothing."""
     pixel = first + wp.tid()

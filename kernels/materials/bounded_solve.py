@@ -229,13 +229,7 @@ class SolveSums:
 def launch_take_step(problem: Any, state: Any, sums: SolveSums, device: Any) -> None:
     """Choose every column's step along the direction that A was applied to, and take it."""
     columns = problem.x.shape[1]
-    launch(
-        sum_direction_kernel,
-        LANES * columns,
-        inputs=[problem],
-        outputs=[sums.direction, sums.rooms],
-        device=device,
-    )
+    launch(sum_direction_kernel, LANES * columns, inputs=[problem], outputs=[sums.direction, sums.rooms], device=device)
     launch(choose_step_kernel, columns, inputs=[sums.direction, sums.rooms], outputs=[state], device=device)
     launch(take_step_kernel, LANES * columns, inputs=[problem, state], outputs=[sums.step], device=device)
 
@@ -245,10 +239,6 @@ def launch_choose_direction(
 ) -> None:
     """Choose what every column does next, and the direction that A must be applied to for it."""
     launch(
-        choose_mode_kernel,
-        problem.x.shape[1],
-        inputs=[sums.step, round],
-        outputs=[state, out_residuals],
-        device=device,
+        choose_mode_kernel, problem.x.shape[1], inputs=[sums.step, round], outputs=[state, out_residuals], device=device
     )
     launch(write_direction_kernel, problem.x.size, inputs=[problem, state], outputs=[], device=device)

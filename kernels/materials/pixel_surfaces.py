@@ -110,11 +110,7 @@ def launch_gather_surfaces(
 ) -> None:
     """Write the point of every marked pixel to its row; ``ends`` are the inclusive sums of ``marks``."""
     launch(
-        gather_surfaces_kernel,
-        len(marks),
-        inputs=[images, view, marks, ends],
-        outputs=[out_surfaces],
-        device=device,
+        gather_surfaces_kernel, len(marks), inputs=[images, view, marks, ends], outputs=[out_surfaces], device=device
     )
 
 

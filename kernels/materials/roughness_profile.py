@@ -19,13 +19,7 @@ from beam_warp.kernels.light.brdf import (
     specular_albedo,
 )
 from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
-from beam_warp.kernels.materials.residues import (
-    GatheredLight,
-    LightRays,
-    Observations,
-    brightness,
-    facing_weight,
-)
+from beam_warp.kernels.materials.residues import GatheredLight, LightRays, Observations, brightness, facing_weight
 from beam_warp.kernels.trace.surface_rays import RayBatch
 
 wp.set_module_options({"enable_backward": False})

@@ -84,11 +84,7 @@ def flag_agreed_kernel(
 def launch_flag_agreed(confirmed, contradicted, confirmations, flags, device):
     """Flag the pixels that enough views confirm, and no more contradict."""
     launch(
-        flag_agreed_kernel,
-        len(flags),
-        inputs=[confirmed, contradicted, confirmations],
-        outputs=[flags],
-        device=device,
+        flag_agreed_kernel, len(flags), inputs=[confirmed, contradicted, confirmations], outputs=[flags], device=device
     )
 
 

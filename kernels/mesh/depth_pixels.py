@@ -257,11 +257,7 @@ def launch_write_depth_pixels(depth, alpha, normals, camera, minimum_alpha, out_
 def launch_write_pixel_colors(color, alpha, first_pixel, out_colors, device):
     """Write the colours of one view among those of all."""
     launch(
-        write_pixel_colors_kernel,
-        len(alpha),
-        inputs=[color, alpha, first_pixel],
-        outputs=[out_colors],
-        device=device,
+        write_pixel_colors_kernel, len(alpha), inputs=[color, alpha, first_pixel], outputs=[out_colors], device=device
     )
 
 

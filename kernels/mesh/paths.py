@@ -36,12 +36,7 @@ class LitMesh:
 
 @wp.func
 def path_radiance(
-    lit: LitMesh,
-    start: SurfacePoint,
-    start_view: wp.vec3,
-    stream: wp.uint32,
-    sample: int,
-    bounce_count: int,
+    lit: LitMesh, start: SurfacePoint, start_view: wp.vec3, stream: wp.uint32, sample: int, bounce_count: int
 ) -> wp.vec3:
     """One sample of the radiance that leaves ``start`` towards ``start_view``."""
     total = wp.vec3(0.0)

@@ -27,11 +27,7 @@ class SeeingCameras:
 
 @wp.kernel
 def find_closest_points_kernel(
-    first: int,
-    mesh: wp.uint64,
-    points: wp.array[wp.vec3],
-    out_faces: wp.array[int],
-    out_weights: wp.array[wp.vec3],
+    first: int, mesh: wp.uint64, points: wp.array[wp.vec3], out_faces: wp.array[int], out_weights: wp.array[wp.vec3]
 ):
     """Triangle and barycentric weights of the point of a mesh that is closest."""
     index = first + wp.tid()

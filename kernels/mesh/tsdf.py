@@ -122,11 +122,7 @@ def flag_first_keys_kernel(first: int, keys: wp.array[wp.int64], out_flags: wp.a
 
 @wp.kernel
 def keep_keys_kernel(
-    first: int,
-    keys: wp.array[wp.int64],
-    flags: wp.array[int],
-    ends: wp.array[int],
-    out_keys: wp.array[wp.int64],
+    first: int, keys: wp.array[wp.int64], flags: wp.array[int], ends: wp.array[int], out_keys: wp.array[wp.int64]
 ):
     i = first + wp.tid()
     if flags[i] == 1:

@@ -51,8 +51,7 @@ def count_steps_kernel(
     one = wp.float64(1.0)
     count = wp.float64(step)
     out_corrections[row] = wp.vec2(
-        wp.float32(one / (one - wp.pow(options.beta1, count))),
-        wp.float32(one / (one - wp.pow(options.beta2, count))),
+        wp.float32(one / (one - wp.pow(options.beta1, count))), wp.float32(one / (one - wp.pow(options.beta2, count)))
     )
 
 

@@ -177,11 +177,7 @@ def emit_pairs_kernel(
 
 @wp.kernel
 def find_ranges_kernel(
-    first: int,
-    pairs: PairList,
-    tile_count: int,
-    out_splats: wp.array[int],
-    out_ranges: wp.array[wp.vec2i],
+    first: int, pairs: PairList, tile_count: int, out_splats: wp.array[int], out_ranges: wp.array[wp.vec2i]
 ):
     i = first + wp.tid()
     tile = pairs.tiles[i]

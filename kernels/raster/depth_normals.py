@@ -70,18 +70,14 @@ def slope(near: float, far: float) -> float:
 def surface_slopes(depth: wp.array2d[float], view: DepthNormalCamera, y: int, x: int) -> wp.vec2:
     """p and q of the module's formula."""
     return wp.vec2(
-        view.focal[0] * slope(depth[y, x - 1], depth[y, x + 1]),
-        view.focal[1] * slope(depth[y - 1, x], depth[y + 1, x]),
+        view.focal[0] * slope(depth[y, x - 1], depth[y, x + 1]), view.focal[1] * slope(depth[y - 1, x], depth[y + 1, x])
     )
 
 
 @wp.func
 def pixel_tangents(view: DepthNormalCamera, y: int, x: int) -> wp.vec2:
     """u and v of a pixel's centre."""
-    return wp.vec2(
-        (float(x) + 0.5 - view.center[0]) / view.focal[0],
-        (float(y) + 0.5 - view.center[1]) / view.focal[1],
-    )
+    return wp.vec2((float(x) + 0.5 - view.center[0]) / view.focal[0], (float(y) + 0.5 - view.center[1]) / view.focal[1])
 
 
 @wp.func

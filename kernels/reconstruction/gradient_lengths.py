@@ -11,10 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def add_gradient_lengths_kernel(
-    first: int,
-    position_gradients: wp.array[wp.vec3],
-    out_sums: wp.array[float],
-    out_counts: wp.array[float],
+    first: int, position_gradients: wp.array[wp.vec3], out_sums: wp.array[float], out_counts: wp.array[float]
 ):
     item = first + wp.tid()
     length = wp.length(position_gradients[item])

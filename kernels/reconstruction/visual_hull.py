@@ -214,14 +214,7 @@ def gather_cells_kernel(
 
 
 def launch_judge_blocks(
-    origin: Any,
-    size: float,
-    count: Any,
-    views: Any,
-    distances: Any,
-    quorum: int,
-    out_states: Any,
-    device: Any,
+    origin: Any, size: float, count: Any, views: Any, distances: Any, quorum: int, out_states: Any, device: Any
 ) -> None:
     """Write which blocks of a grid are outside, inside, or may hold surface; cubes of ``size`` from ``origin`` on."""
     launch(
@@ -262,9 +255,5 @@ def launch_find_cells(depths: Any, out_crossed: Any, device: Any) -> None:
 def launch_gather_cells(blocks: Any, depths: Any, ends: Any, out_cells: Any, out_depths: Any, device: Any) -> None:
     """Write the subscripts and corner depths of crossed cells; ``ends`` are inclusive sums of their flags."""
     launch(
-        gather_cells_kernel,
-        len(ends),
-        inputs=[blocks, depths, ends],
-        outputs=[out_cells, out_depths],
-        device=device,
+        gather_cells_kernel, len(ends), inputs=[blocks, depths, ends], outputs=[out_cells, out_depths], device=device
     )

@@ -10,12 +10,7 @@ from beam_warp.kernels.mesh.surface import MeshSurface, closest_hit, surface_poi
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_pixels import SHADE_CHUNK, arriving_radiance, pixel_ray
 from beam_warp.kernels.render.gaussian_light import SceneLight, environment_openness, luminance, random_turn
-from beam_warp.kernels.render.surface_lighting import (
-    lit_irradiance,
-    lit_radiance,
-    unshadowed_irradiance,
-    unturned,
-)
+from beam_warp.kernels.render.surface_lighting import lit_irradiance, lit_radiance, unshadowed_irradiance, unturned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -118,9 +113,5 @@ def launch_shade_mesh(views, surface, catches_shadows, light, out_image, out_sur
 def launch_blend_mesh(depth, mesh_image, mesh_surfaces, out_image, device):
     """Blend triangles into the image of Gaussians."""
     launch(
-        blend_mesh_kernel,
-        len(out_image),
-        inputs=[depth, mesh_image, mesh_surfaces],
-        outputs=[out_image],
-        device=device,
+        blend_mesh_kernel, len(out_image), inputs=[depth, mesh_image, mesh_surfaces], outputs=[out_image], device=device
     )

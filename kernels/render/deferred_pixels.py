@@ -137,15 +137,7 @@ def launch_shade_gaussians(views, images, has_arriving, light, out_image, device
     launch(
         shade_gaussians_kernel,
         len(out_image),
-        inputs=[
-            views,
-            images.channels[0],
-            images.alpha,
-            images.depth,
-            images.median_depth,
-            int(has_arriving),
-            light,
-        ],
+        inputs=[views, images.channels[0], images.alpha, images.depth, images.median_depth, int(has_arriving), light],
         outputs=[out_image],
         device=device,
         block_dim=128,

@@ -93,9 +93,7 @@ class Gathered:
 def turned(direction: wp.vec3, turn: wp.vec2) -> wp.vec3:
     """Rotated about z by the angle of (cos, sin)."""
     return wp.vec3(
-        turn[0] * direction[0] - turn[1] * direction[1],
-        turn[1] * direction[0] + turn[0] * direction[1],
-        direction[2],
+        turn[0] * direction[0] - turn[1] * direction[1], turn[1] * direction[0] + turn[0] * direction[1], direction[2]
     )
 
 

@@ -279,9 +279,5 @@ def launch_gather_texels(images, mesh_depth, out_texels, device):
 def launch_cast_mesh(surface, views, texels_of_view, out_depth, device):
     """Cast a ray through every texel of every view, all of one size."""
     launch(
-        cast_mesh_kernel,
-        len(out_depth),
-        inputs=[surface, views, texels_of_view],
-        outputs=[out_depth],
-        device=device,
+        cast_mesh_kernel, len(out_depth), inputs=[surface, views, texels_of_view], outputs=[out_depth], device=device
     )

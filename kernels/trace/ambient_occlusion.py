@@ -23,12 +23,7 @@ LARGEST_DEVIATION = wp.constant(0.5)
 
 @wp.kernel
 def draw_occlusion_kernel(
-    first: int,
-    batch: RayBatch,
-    samples: SampleSet,
-    seed: wp.uint32,
-    frame: wp.uint32,
-    out_rays: Rays,
+    first: int, batch: RayBatch, samples: SampleSet, seed: wp.uint32, frame: wp.uint32, out_rays: Rays
 ):
     """One cosine-distributed ray a thread."""
     item = first + wp.tid()

@@ -34,11 +34,7 @@ def ray_origin(batch: RayBatch, place: int) -> wp.vec3:
 
 @wp.kernel
 def local_surface_kernel(
-    first: int,
-    occluders: Any,
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    out_surface: wp.array[wp.vec2],
+    first: int, occluders: Any, points: wp.array[wp.vec3], normals: wp.array[wp.vec3], out_surface: wp.array[wp.vec2]
 ):
     """(height, thickness) of the layer of Gaussians around each point, along its normal."""
     i = first + wp.tid()

@@ -118,12 +118,7 @@ def half_area(lower: wp.vec3, upper: wp.vec3) -> float:
 
 @wp.kernel
 def choose_neighbors_kernel(
-    first: int,
-    clusters: wp.array[int],
-    count: int,
-    reach: int,
-    tree: BinaryTree,
-    out_chosen: wp.array[int],
+    first: int, clusters: wp.array[int], count: int, reach: int, tree: BinaryTree, out_chosen: wp.array[int]
 ):
     """The neighbour within ``reach`` places that makes the smallest joint box; reach 0 pairs places 0-1, 2-3 …"""
     i = first + wp.tid()
@@ -208,11 +203,7 @@ def launch_order_boxes(lowers, uppers, takes_part, bounds, out_keys, out_items, 
 def launch_start_clusters(items, count, lowers, uppers, out_tree, out_clusters, device):
     """Make every box, in Morton order, a cluster of its own."""
     launch(
-        start_clusters_kernel,
-        count,
-        inputs=[items, lowers, uppers],
-        outputs=[out_tree, out_clusters],
-        device=device,
+        start_clusters_kernel, count, inputs=[items, lowers, uppers], outputs=[out_tree, out_clusters], device=device
     )
 
 

@@ -233,9 +233,5 @@ def launch_fill_leaves(gaussians, layout, count, out_tree, device):
 def launch_bound_nodes(level_begin, count, lowers, uppers, out_layout, out_tree, device):
     """Write a level's nodes; the level below must be done."""
     launch(
-        bound_nodes_kernel,
-        count,
-        inputs=[level_begin, lowers, uppers],
-        outputs=[out_layout, out_tree],
-        device=device,
+        bound_nodes_kernel, count, inputs=[level_begin, lowers, uppers], outputs=[out_layout, out_tree], device=device
     )

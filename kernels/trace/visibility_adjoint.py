@@ -107,12 +107,7 @@ tally_all = traversal("tally_all", tally_leaf, is_done=is_tally_dark)
 
 @wp.func
 def tally_hits(
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, origin: wp.vec3, direction: wp.vec3, t_max: float
 ) -> HitTally:
     """V and the number of hits with gradients, over what `tree_transmittance` visits."""
     ray = TracedRay()
@@ -276,13 +271,7 @@ def first_not_below(sorted_values: wp.array[int], begin: int, end: int, value: i
 
 
 @wp.kernel
-def sum_blocks_kernel(
-    first: int,
-    degree: int,
-    hits: HitRecords,
-    order: wp.array[int],
-    out_sums: wp.array[HitMoments],
-):
+def sum_blocks_kernel(first: int, degree: int, hits: HitRecords, order: wp.array[int], out_sums: wp.array[HitMoments]):
     """Sum each block of `SUM_BLOCK` sorted hits that are all of one Gaussian; the other sums are not used."""
     i = first + wp.tid()
     begin = i * SUM_BLOCK

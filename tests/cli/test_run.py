@@ -102,8 +102,7 @@ class TestMistakes:
         mistake(ball, "--environment", sky, "--roughness", tmp_path / "r.png", says="roughness-mesh must be given")
 
     @pytest.mark.parametrize(
-        ("option", "says"),
-        [(("--samples", 0), "sample_count must be"), (("--fps", 0), "frames_per_second must be")],
+        ("option", "says"), [(("--samples", 0), "sample_count must be"), (("--fps", 0), "frames_per_second must be")]
     )
     def test_numbers_out_of_range(self, mistake, ball, sky, option, says):
         mistake(ball, "--environment", sky, *option, says=says)

@@ -114,8 +114,7 @@ class TestAgainstItself:
     def test_a_known_error_of_ambient_occlusion(self, asset, mirror, device):
         """0.1 everywhere, composited on black: 0.1 of the coverage, 20 dB where that is 1."""
         darker = changed(
-            asset,
-            lambda _, cloud: cloud.with_arrays(ambient_occlusion=np.full(len(cloud), OPENNESS - 0.1, np.float32)),
+            asset, lambda _, cloud: cloud.with_arrays(ambient_occlusion=np.full(len(cloud), OPENNESS - 0.1, np.float32))
         )
         found = score(darker, mirror, device)
         for view in found.views:

@@ -6,15 +6,7 @@ import pytest
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import linear_to_srgb, srgb_to_linear
 from beam_warp.image.files import display_image
-from beam_warp.image.tone import (
-    AGX_STOPS,
-    MIDDLE_GREY,
-    TRANSFORMS,
-    agx_sigmoid,
-    display,
-    display_linear,
-    display_over,
-)
+from beam_warp.image.tone import AGX_STOPS, MIDDLE_GREY, TRANSFORMS, agx_sigmoid, display, display_linear, display_over
 
 FLOAT32 = 8 * np.finfo(np.float32).eps
 """Everything is float32: the roundings of some operations on values up to 1."""

@@ -21,13 +21,7 @@ from beam_warp.kernels.materials.residues import (
     launch_view_residues,
 )
 from beam_warp.kernels.trace.surface_rays import RayBatch
-from beam_warp.light.ggx import (
-    DIELECTRIC_F0,
-    ggx_distribution,
-    schlick_weight,
-    smith_lambda,
-    specular_albedo,
-)
+from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -480,13 +474,7 @@ class TestBounce:
         batch.sample_count = self.SAMPLES
         out = wp.zeros(len(points), dtype=wp.vec3, device=device)
         launch_trace_bounce(
-            scene,
-            EXACT.settings(scene),
-            batch,
-            to_device(radiance, wp.vec3, device),
-            (seed, 0),
-            self.SAMPLES,
-            out,
+            scene, EXACT.settings(scene), batch, to_device(radiance, wp.vec3, device), (seed, 0), self.SAMPLES, out
         )
         return out.numpy()
 

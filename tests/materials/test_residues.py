@@ -107,8 +107,7 @@ class TestOcclusion:
         floor, disc = disc_points(1.2, spacing), disc_points(radius, spacing)
         up = np.tile(UP, (len(floor), 1))
         cloud = cloud_of(
-            tiles(floor, up, spacing, opacity=0.99),
-            tiles(disc + height * UP, up[: len(disc)], spacing, opacity=0.99),
+            tiles(floor, up, spacing, opacity=0.99), tiles(disc + height * UP, up[: len(disc)], spacing, opacity=0.99)
         )
         # from the side, below the disc, at a few pixels around its middle
         camera = looking_at(elevation=10.0, distance=2.0, fov=1.5, size=8)

@@ -39,10 +39,7 @@ def rigidity(graph, poses, device, weight=1.0):
     count = len(poses[0])
     out = wp.zeros(count, dtype=wp.quat, device=device), wp.zeros(count, dtype=wp.vec3, device=device)
     found = RigidityLoss(graph, device=device)(
-        *(vectors(pose, device) for pose in poses),
-        weight=weight,
-        rotation_gradients=out[0],
-        position_gradients=out[1],
+        *(vectors(pose, device) for pose in poses), weight=weight, rotation_gradients=out[0], position_gradients=out[1]
     )
     return value(found), out[0].numpy().astype(float), out[1].numpy().astype(float)
 

@@ -30,9 +30,7 @@ def camera(azimuth=0.0, size=40):
 def ball():
     points, spacing = sphere_points(400)
     return cloud_of(
-        tiles(points, points, spacing),
-        radiance=np.full((400, 1, 3), -0.5),
-        radiance_color_space=LINEAR_REC709,
+        tiles(points, points, spacing), radiance=np.full((400, 1, 3), -0.5), radiance_color_space=LINEAR_REC709
     )
 
 

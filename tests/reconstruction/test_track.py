@@ -27,9 +27,7 @@ OPTIONS = TrackOptions(
 )
 
 BRIEF = replace(
-    OPTIONS,
-    joints=JointOptions(levels=(2, 1), iterations=(3, 3)),
-    refinement=replace(REFINEMENT, normal_iterations=4),
+    OPTIONS, joints=JointOptions(levels=(2, 1), iterations=(3, 3)), refinement=replace(REFINEMENT, normal_iterations=4)
 )
 
 
@@ -219,8 +217,7 @@ class TestRefusals:
                 begin_track(ball_cloud(9).with_arrays(**changes), views, BRIEF, device=device)
 
     @pytest.mark.parametrize(
-        ("name", "value"),
-        [("joint_count", 0), ("largest_drop", -1.0), ("largest_gap", np.nan), ("largest_tear", -0.1)],
+        ("name", "value"), [("joint_count", 0), ("largest_drop", -1.0), ("largest_gap", np.nan), ("largest_tear", -0.1)]
     )
     def test_options_of_tracking(self, name, value):
         with pytest.raises(InvalidOptionError, match=f"{name} must be"):

@@ -10,13 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.trace.reference import (
-    ALPHA_MIN,
-    FLOAT32_ROUNDOFF,
-    RayPairs,
-    ReferenceGaussians,
-    candidate_pairs,
-)
+from beam_warp.trace.reference import ALPHA_MIN, FLOAT32_ROUNDOFF, RayPairs, ReferenceGaussians, candidate_pairs
 from beam_warp.world.gaussians import GaussianCloud
 
 

@@ -41,9 +41,7 @@ def make_cloud(seed=0, count=6, *, degree=1, relightable=True, axes="rub", **cha
 
 def make_sequence(frames=3, count=6, *, metadata=None, **options):
     return GaussianSequence.from_clouds(
-        [make_cloud(seed, count, **options) for seed in range(frames)],
-        frames_per_second=24.0,
-        metadata=metadata,
+        [make_cloud(seed, count, **options) for seed in range(frames)], frames_per_second=24.0, metadata=metadata
     )
 
 

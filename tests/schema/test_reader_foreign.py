@@ -153,8 +153,7 @@ def test_a_moving_transform_makes_frames(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("name", "space"),
-    [("lin_rec709_scene", "lin_rec709_scene"), ("srgb_rec709_scene", "srgb_rec709_display")],
+    ("name", "space"), [("lin_rec709_scene", "lin_rec709_scene"), ("srgb_rec709_scene", "srgb_rec709_display")]
 )
 def test_colour_space_comes_from_an_ancestor(tmp_path, rng, name, space):
     stage = author(

@@ -157,9 +157,7 @@ class TestProperties:
         scene = Scene.from_gaussians(random_cloud(rng, 50), device)
         origins, directions = random_rays(rng, 20)
         there = visibility(
-            scene,
-            wp.array(origins, dtype=wp.vec3, device=device),
-            wp.array(directions, dtype=wp.vec3, device=device),
+            scene, wp.array(origins, dtype=wp.vec3, device=device), wp.array(directions, dtype=wp.vec3, device=device)
         )
         assert isinstance(there, wp.array)
         assert np.array_equal(there.numpy(), visibility(scene, origins, directions))

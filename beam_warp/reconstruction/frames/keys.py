@@ -12,11 +12,7 @@ from beam_warp.reconstruction.frames.protocols import FrameSteps
 
 def common_inputs(steps: FrameSteps, device: Any) -> str:
     """Return all that every frame of a job depends on, as JSON: the code, the kind of Warp device, the options."""
-    content = {
-        "code": code_digest(),
-        "device": "cuda" if device.is_cuda else "cpu",
-        "options": steps.options(),
-    }
+    content = {"code": code_digest(), "device": "cuda" if device.is_cuda else "cpu", "options": steps.options()}
     return json.dumps(content, sort_keys=True)
 
 

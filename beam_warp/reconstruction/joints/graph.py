@@ -231,12 +231,7 @@ def _directions(name: str, value: ArrayLike | None, count: int) -> NDArray[np.fl
 
 
 def _nearest(
-    points: NDArray[np.float64],
-    joints: NDArray[np.float64],
-    count: int,
-    facing: _Facing | None,
-    *,
-    themselves: bool,
+    points: NDArray[np.float64], joints: NDArray[np.float64], count: int, facing: _Facing | None, *, themselves: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the nearest joints that go with each point, ``(N, count)``; ``themselves``: points are the joints."""
     if count == 0:

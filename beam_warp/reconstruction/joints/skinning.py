@@ -236,13 +236,7 @@ class Skin:
             self.device,
         )
         launch_add_joint_gradients(
-            self._runs,
-            rotations,
-            self._run_rotations,
-            self._run_positions,
-            out_rotations,
-            out_positions,
-            self.device,
+            self._runs, rotations, self._run_rotations, self._run_positions, out_rotations, out_positions, self.device
         )
 
     def _poses(self, rotations: wp.array, positions: wp.array) -> tuple[wp.array, wp.array]:

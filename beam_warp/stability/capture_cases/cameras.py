@@ -40,9 +40,7 @@ def _altered(at: StressStudio, code: str, *, gain: float, coverage: float = 1.0)
 
 
 @capture_case(
-    "black camera",
-    "black is trained into every Gaussian that the camera sees",
-    "the camera detected and left out",
+    "black camera", "black is trained into every Gaussian that the camera sees", "the camera detected and left out"
 )
 def black_camera(at: StressStudio) -> CaptureStress:
     """One camera's images are black, its masks are right."""

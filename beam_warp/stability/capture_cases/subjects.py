@@ -47,11 +47,7 @@ def every_second_frame(at: StressStudio) -> CaptureStress:
     return CaptureStress(capture=with_every(at.base(), 2))
 
 
-@capture_case(
-    "every third frame",
-    "the same, faster",
-    "followed, or the loss detected and a key frame started",
-)
+@capture_case("every third frame", "the same, faster", "followed, or the loss detected and a key frame started")
 def every_third_frame(at: StressStudio) -> CaptureStress:
     """Motion three times as fast."""
     return CaptureStress(capture=with_every(at.base(), 3))

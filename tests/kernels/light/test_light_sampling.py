@@ -12,10 +12,7 @@ from beam_warp.kernels.light.environment_sampling import (
     square_to_environment,
     square_to_environment_pdf,
 )
-from beam_warp.kernels.light.ggx_sampling import (
-    square_to_visible_reflection,
-    square_to_visible_reflection_pdf,
-)
+from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.light.sampled import environment_distribution
 from beam_warp.world.environment import EnvironmentMap
 
