@@ -103,7 +103,7 @@ class TestAgainstItself:
             # The sRGB curve is at most 12.92 steep: 1e-6 of colour is at most 1.3e-5, or 97 dB.
             scaled = view.channels["base_color_scaled"]
             assert scaled.solid_psnr > 97.0
-            if device == "cpu":  # where the mirror was drawn; CUDA's silhouettes differ by single pixels, which the box counts
+            if device == "cpu":  # it drew the mirror; CUDA's silhouettes differ by single pixels, which the box counts
                 assert scaled.psnr > 97.0
             assert view.channels["base_color"].psnr < 30.0
 
