@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
+from PIL import ImageColor
 from scipy import ndimage
 
 from beam_warp.capture.images import Glimpse
@@ -112,7 +113,7 @@ def _outlined(glimpse: Glimpse) -> NDArray[np.uint8]:
     if glimpse.alpha is not None:
         inside = np.asarray(ndimage.zoom(glimpse.alpha, 2, order=1, grid_mode=True, mode="nearest")) > 0.5
         edge = inside & ~np.asarray(ndimage.binary_erosion(inside, border_value=1), bool)
-        pixels[edge] = [int(OUTLINE[k : k + 2], 16) for k in (1, 3, 5)]
+        pixels[edge] = ImageColor.getrgb(OUTLINE)
     return pixels
 
 

@@ -147,9 +147,9 @@ def test_the_same_camera_and_frame_twice(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"{", "capture must be JSON in UTF-8"),
-        (b"\xff\xfe", "capture must be JSON in UTF-8"),
-        (b"[" * 100_000, "capture must be JSON in UTF-8"),
+        (b"{", "capture must be JSON, got"),
+        (b"\xff\xfe", "file must be text in UTF-8, got other bytes"),
+        (b"[" * 100_000, "capture must be JSON, got"),
         (b"[]", r"capture must be a JSON object, got \[\]"),
         (b"{}", "frames must be a list of 1 to 4194304 records, got None"),
         (b'{"frames": [3]}', "record must be an object, got 3 at"),
