@@ -49,28 +49,21 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
             Gaussians are to be drawn break the contract of `beam_warp.world.metadata`.
         OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
     """
-    paths = output_paths(sequence, path)
+    count = len(sequence)
+    paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
     raster = stated_raster(sequence.metadata)
     with staged_outputs() as staging:
         for frame, final in enumerate(paths):
             cloud = sequence[frame]
+            comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
             if options.target is not None:
                 axes, units_per_meter = TARGETS[options.target]
                 cloud = change_axes(cloud, axes, scale=units_per_meter)
-            comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
-            if options.target is not None:
-                comments.append(f"beam_meters_per_unit {1.0 / TARGETS[options.target][1]:g}")
+                comments.append(f"beam_meters_per_unit {1.0 / units_per_meter:g}")
             if raster is not None:
                 comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])!s}")
             _write_cloud(cloud, staging.path_for(final), options, comments)
     return paths
-
-
-def output_paths(sequence: GaussianSequence, path: Path) -> list[Path]:
-    """Return the files that `write` makes for a sequence: the path itself, or numbered from its name."""
-    if len(sequence) == 1:
-        return [path]
-    return [numbered_path(path, frame) for frame in range(len(sequence))]
 
 
 def _write_cloud(cloud: GaussianCloud, path: Path, options: WriteOptions, frame_comments: list[str]) -> None:

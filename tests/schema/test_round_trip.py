@@ -7,7 +7,7 @@ import pytest
 from pxr import Sdf, Usd, Vt
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.schema.layout import HALF_ABSOLUTE, HALF_EPSILON
+from beam_warp.schema.layout import HALF_EPSILON
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.writer import write_asset
 from beam_warp.world.gaussians import GaussianSequence
@@ -24,7 +24,7 @@ def assert_same(got, wanted, full_float):
         if full_float or name in ("positions", "ids", "observability"):
             assert np.array_equal(found, array), name
         else:
-            bound = np.maximum(HALF_EPSILON * np.abs(array), HALF_ABSOLUTE)
+            bound = np.maximum(HALF_EPSILON * np.abs(array), 2.0**-25)  # half's relative and absolute rounding
             assert (np.abs(found.astype(np.float64) - array) <= bound).all(), name
 
 
