@@ -33,7 +33,7 @@ from beam_warp.capture.picture import (
 )
 from beam_warp.capture.rigs import frustum_corners
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
+from beam_warp.image.files import replacing
 
 IMAGE_SIDE = 56
 """Longer side of the images in the frustums [pixel]; each pixel is drawn as two triangles."""
@@ -78,8 +78,8 @@ def write_page(report: CaptureReport, path: Path) -> None:
         f'<div class="images">{"".join(_figure(glimpse, rig) for glimpse in glimpses)}</div>\n'
         f'<script type="application/json" id="data">{data}</script>\n<script>{script}</script>\n</body>\n</html>\n'
     )
-    with staged_outputs() as staging:
-        staging.path_for(path).write_text(page, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def _findings(report: CaptureReport) -> str:

@@ -18,9 +18,9 @@ from beam_warp.capture.inspect import SPLIT, CaptureReport
 from beam_warp.capture.records import SparsePoints
 from beam_warp.capture.rigs import frustum_corners, meeting_point
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import BeamError
 from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.files import replacing
 from beam_warp.world.camera import Camera
 
 GREY = "#555555"
@@ -213,8 +213,8 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     top += heights["images"] + 0.2
     for number, (text, ink) in enumerate(lines):
         figure.text(0.3 / WIDTH, 1 - (top + 0.19 * number) / total, text, size=9, color=ink, va="center")
-    with staged_outputs() as staging:
-        figure.savefig(staging.path_for(path), format="png", dpi=RESOLUTION, pil_kwargs={"optimize": True})
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=RESOLUTION, pil_kwargs={"optimize": True})
 
 
 def _finding_lines(findings: Iterable[Finding]) -> list[tuple[str, str]]:
