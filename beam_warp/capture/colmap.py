@@ -76,22 +76,22 @@ class _Pose:
     where: str
 
 
-def find(folder: Path) -> Path | None:
-    """Return the folder of a capture's model, or None if there is none."""
-    for inner in FOLDERS:
-        if any(
-            (folder / inner / f"cameras{s}").is_file() and (folder / inner / f"images{s}").is_file() for s in SUFFIXES
-        ):
-            return folder / inner
+def find(folder: Path) -> tuple[Path, str] | None:
+    """Return the folder of a capture's model and the suffix of its files, or None if there is none."""
+    for model in (folder / inner for inner in FOLDERS):
+        for suffix in SUFFIXES:
+            if (model / f"cameras{suffix}").is_file() and (model / f"images{suffix}").is_file():
+                return model, suffix
     return None
 
 
-def read(folder: Path, model: Path, keep: float) -> CaptureContents:
+def read(folder: Path, model: Path, suffix: str, keep: float) -> CaptureContents:
     """Read a model whose images lie in ``folder/images`` or, if there is no such folder, in ``folder``.
 
     Args:
         folder: The capture.
         model: Folder that `find` returned.
+        suffix: Suffix that `find` returned.
         keep: See `Capture.read`.
 
     Raises:
@@ -99,7 +99,6 @@ def read(folder: Path, model: Path, keep: float) -> CaptureContents:
         AssetFormatError: A file is truncated or damaged, a camera model is not one of `MODELS`, an image names a camera
             that does not exist, a pose is not rigid, or a lens cannot be inverted; the message names file and row.
     """
-    suffix = next(s for s in SUFFIXES if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
     binary = suffix == ".bin"
     cameras_path, images_path = model / f"cameras{suffix}", model / f"images{suffix}"
     photographs = _binary_cameras(cameras_path) if binary else _text_cameras(cameras_path)
