@@ -296,10 +296,11 @@ def _draw_rig(axes: Any, rig: Rig, view: Camera) -> None:
         camera, color = rig.cameras[name], COLORS[rig.kinds[name]]
         weight = 1.0 - 0.6 * (depths[name] - near) / max(far - near, 1e-12)
         corners = view.project(np.concatenate([frustum_corners(camera, rig.depth), camera.position[None]]))[:, :2]
-        paint = {"facecolors": to_rgba(color, 0.10 + 0.12 * weight), "edgecolors": to_rgba(color, weight)}
-        axes.add_collection(PolyCollection([corners[:4]], linewidths=1.1, zorder=5 + order, **paint))
+        face, edge = to_rgba(color, 0.10 + 0.12 * weight), to_rgba(color, weight)
+        square = PolyCollection([corners[:4]], facecolors=face, edgecolors=edge, linewidths=1.1, zorder=5 + order)
+        axes.add_collection(square)
         sides = [np.array([corners[4], corner]) for corner in corners[:4]]
-        axes.add_collection(LineCollection(sides, colors=[to_rgba(color, weight)], linewidths=0.8, zorder=5 + order))
+        axes.add_collection(LineCollection(sides, colors=[edge], linewidths=0.8, zorder=5 + order))
         style = {"color": color, "alpha": 0.5 + 0.5 * weight, "path_effects": halo, "zorder": 99}
         axes.text(*corners[4], labels[name], size=7, ha="center", va="bottom", **style)
 
