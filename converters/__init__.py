@@ -6,7 +6,6 @@ met, so that PLY costs no USD; nothing here imports Warp.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,21 +22,11 @@ if TYPE_CHECKING:
     from beam_warp.converters.inspection import Inspection
 
 
-@dataclass(frozen=True)
-class Format:
-    """The modules of this package that read and write one format."""
-
-    reader: str
-    writer: str
+FORMATS = {".ply": ("ply", "ply_writer"), **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("usd", "usd"))}
+"""Suffix → the modules of this package that read and write files of that format."""
 
 
-_PLY, _USD = Format("ply", "ply_writer"), Format("usd", "usd")
-
-FORMATS = {".ply": _PLY, ".usd": _USD, ".usda": _USD, ".usdc": _USD, ".usdz": _USD}
-"""Suffix → format."""
-
-
-def _format_of(path: Path) -> Format:
+def _modules_of(path: Path) -> tuple[str, str]:
     if path.suffix.lower() not in FORMATS:
         raise InvalidOptionError(
             f"file name must end in one of {', '.join(FORMATS)}, got {path.name}. Rename it or convert it elsewhere."
@@ -89,9 +78,8 @@ def read(
         drop_invalid=drop_invalid,
     )
     if source.is_dir():
-        paths = numbered_files(source)
-        return _module(_PLY.reader).read_numbered(paths, options)
-    reader = _format_of(source).reader
+        return _module("ply").read_numbered(numbered_files(source), options)
+    reader, _ = _modules_of(source)
     if not source.is_file():
         raise MissingFileError(f"input must be an existing file or folder, got {source}. Check the path.")
     return _module(reader).read(source, options)
@@ -104,7 +92,7 @@ def require_output(path: Path) -> None:
         InvalidOptionError: The suffix is none that we write.
         OutputError: The folder is missing or closed.
     """
-    _format_of(path)
+    _modules_of(path)
     if path.name.lower().endswith(".compressed.ply"):
         raise InvalidOptionError(
             f"output must be a plain .ply, got {path.name}: the compressed form is only read. Drop .compressed."
@@ -131,7 +119,8 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
     require_output(final)
     if final.suffix.lower() == ".ply" and len(sequence) > 1:
         require_no_stale_frames(final, len(sequence))
-    return _module(_format_of(final).writer).write(sequence, final, options)
+    _, writer = _modules_of(final)
+    return _module(writer).write(sequence, final, options)
 
 
 def inspect(path: str | Path) -> Inspection:

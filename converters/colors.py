@@ -13,13 +13,13 @@ CAPTURED = "captured"
 BASE_COLOR_ONLY = "baseColorOnly"
 NO_COLOR = "none"
 
-_TOE, _TOE_SLOPE = 0.0031308, 12.92
+_TOE = 0.0031308
 
 
-def srgb_slope(linear: ArrayLike) -> NDArray[np.float64]:
+def _srgb_slope(linear: ArrayLike) -> NDArray[np.float64]:
     """Return the derivative of `linear_to_srgb`; on the toe, and below 0, the toe's slope."""
     value = np.asarray(linear, dtype=np.float64)
-    return np.where(value <= _TOE, _TOE_SLOPE, 1.055 / 2.4 * np.maximum(value, _TOE) ** (1.0 / 2.4 - 1.0))
+    return np.where(value <= _TOE, 12.92, 1.055 / 2.4 * np.maximum(value, _TOE) ** (1.0 / 2.4 - 1.0))
 
 
 def display_radiance(cloud: GaussianCloud) -> tuple[NDArray[np.float32], str]:
@@ -33,7 +33,7 @@ def display_radiance(cloud: GaussianCloud) -> tuple[NDArray[np.float32], str]:
         if cloud.radiance_color_space == DISPLAY_SRGB:
             return cloud.radiance, CAPTURED
         mean = color_from_dc(cloud.radiance[:, :1])
-        encoded = srgb_slope(mean) * cloud.radiance
+        encoded = _srgb_slope(mean) * cloud.radiance
         encoded[:, :1] = dc_from_color(linear_to_srgb(np.maximum(mean, 0.0)))
         return encoded.astype(np.float32), CAPTURED
     if cloud.base_color is None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -72,10 +71,6 @@ class Inspection:
     materials: tuple[str, ...]
     comments: tuple[str, ...]
     notes: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the facts, JSON-able."""
-        return asdict(self)
 
     def as_text(self) -> str:
         """Return one line for each fact."""

@@ -8,6 +8,7 @@ finite values; LF line ends; less than 2 GB per file.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,9 @@ from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, display_radia
 from beam_warp.converters.numbering import numbered_path
 from beam_warp.converters.options import WriteOptions
 from beam_warp.converters.ply_container import RASTER_WORDS
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.image.files import replacing
 from beam_warp.schema import SCHEMA_VERSION
 from beam_warp.world.axes import TARGETS, change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -49,28 +50,21 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
             Gaussians are to be drawn break the contract of `beam_warp.world.metadata`.
         OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
     """
-    paths = output_paths(sequence, path)
+    count = len(sequence)
+    paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
     raster = stated_raster(sequence.metadata)
-    with staged_outputs() as staging:
+    with ExitStack() as outputs:
         for frame, final in enumerate(paths):
             cloud = sequence[frame]
+            comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
             if options.target is not None:
                 axes, units_per_meter = TARGETS[options.target]
                 cloud = change_axes(cloud, axes, scale=units_per_meter)
-            comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
-            if options.target is not None:
-                comments.append(f"beam_meters_per_unit {1.0 / TARGETS[options.target][1]:g}")
+                comments.append(f"beam_meters_per_unit {1.0 / units_per_meter:g}")
             if raster is not None:
                 comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])!s}")
-            _write_cloud(cloud, staging.path_for(final), options, comments)
+            _write_cloud(cloud, outputs.enter_context(replacing(final)), options, comments)
     return paths
-
-
-def output_paths(sequence: GaussianSequence, path: Path) -> list[Path]:
-    """Return the files that `write` makes for a sequence: the path itself, or numbered from its name."""
-    if len(sequence) == 1:
-        return [path]
-    return [numbered_path(path, frame) for frame in range(len(sequence))]
 
 
 def _write_cloud(cloud: GaussianCloud, path: Path, options: WriteOptions, frame_comments: list[str]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -120,8 +121,7 @@ def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:
     """Author unit, up axis and time codes, the same in every layer, since USD would retime references otherwise."""
     rate = float(contents.sequence.frames_per_second)
     layer.defaultPrim = ASSET_PATH.strip("/")
-    layer.timeCodesPerSecond = rate
-    layer.framesPerSecond = rate
+    layer.timeCodesPerSecond = layer.framesPerSecond = rate
     layer.startTimeCode = 0.0
     layer.endTimeCode = float(len(contents.sequence) - 1)
     root = layer.pseudoRoot
@@ -129,10 +129,19 @@ def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:
     root.SetInfo("upAxis", UP_AXES[contents.survey.axes])
 
 
-def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
+def static_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
+    """Create a layer with everything but time samples."""
+    layer = Sdf.Layer.CreateNew(str(path))
+    author_stage(layer, contents)
+    _author_asset_prim(layer, contents)
+    _author_splats_prim(layer, contents)
+    return layer
+
+
+def _author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     """Define /Asset with playback and provenance."""
     sequence, metadata = contents.sequence, contents.sequence.metadata
-    prim = _define(layer, ASSET_PATH, "Xform", SEQUENCE_API)
+    prim = define(layer, ASSET_PATH, "Xform", SEQUENCE_API)
     prim.SetInfo("kind", "component")
     # Notes tell of the reading of another file, not of this one.
     provenance = {str(key): str(value) for key, value in metadata.items() if key != "notes"}
@@ -152,13 +161,13 @@ def author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
         _uniform(prim, "beam:sequence:captureFrames", "int[]", Vt.IntArray(frames))
 
 
-def author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
+def _author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     """Define /Asset/Splats with tokens, hints, constant arrays, and declarations of the arrays that vary.
 
     Varying attributes are declared without a value, so that a host that does not know our schema sees their types.
     """
     survey, metadata = contents.survey, contents.sequence.metadata
-    prim = _define(layer, SPLATS_PATH, SPLAT_TYPE, MATERIAL_API, "ColorSpaceAPI")
+    prim = define(layer, SPLATS_PATH, SPLAT_TYPE, MATERIAL_API, "ColorSpaceAPI")
     normals = "normals" in survey.names
     meaning = _choice(metadata, "radiance_meaning", RADIANCE_MEANINGS) if survey.captured else "baseColorOnly"
     for name, type_name, value in (
@@ -224,11 +233,13 @@ def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, st
     prim.SetInfo("clips", {"default": clips})
 
 
-def _define(layer: Sdf.Layer, path: str, type_name: str, *schemas: str) -> Sdf.PrimSpec:
+def define(layer: Sdf.Layer, path: str, type_name: str, *schemas: str) -> Sdf.PrimSpec:
+    """Define a prim of a type, with applied schemas."""
     prim = Sdf.CreatePrimInLayer(layer, path)
     prim.specifier = Sdf.SpecifierDef
     prim.typeName = type_name
-    prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=list(schemas)))
+    if schemas:
+        prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=list(schemas)))
     return prim
 
 

@@ -17,9 +17,8 @@ from pxr import Usd, UsdGeom
 
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidOptionError
-from beam_warp.schema.dependencies import layer_files
 from beam_warp.schema.placement import placement_of
-from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters, transform_times
+from beam_warp.schema.stage_queries import layer_files, open_asset, stage_axes, stage_meters, transform_times
 from beam_warp.world.axes import axes_matrix
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import WORLD_AXES

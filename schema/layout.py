@@ -32,9 +32,6 @@ HALF_MIN_NORMAL = 2.0**-14
 HALF_EPSILON = 2.0**-11
 """Largest relative error of rounding a number in [HALF_MIN_NORMAL, HALF_MAX] to half."""
 
-HALF_ABSOLUTE = 2.0**-25
-"""Largest absolute error of rounding a number below HALF_MIN_NORMAL to half."""
-
 
 @dataclass(frozen=True)
 class Channel:
@@ -67,7 +64,7 @@ class Channel:
     def half_is_safe(self, largest: float, smallest: float) -> bool:
         """Return True if half precision is safe for values whose non-zero magnitudes are in [smallest, largest].
 
-        The error is then at most `HALF_EPSILON` relative or `HALF_ABSOLUTE` absolute, whichever is larger, and for
+        The error is then at most `HALF_EPSILON` relative or 2^-25 absolute, whichever is larger, and for
         a ``relative`` channel at most `HALF_EPSILON` relative for every element.
         """
         if self.half_type_name is None or self.position_like:

@@ -17,7 +17,7 @@ from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionE
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, Channel, from_vt
-from beam_warp.schema.placement import Placement, placement_of
+from beam_warp.schema.placement import placement_of
 from beam_warp.schema.stage_queries import (
     ancestors,
     applied_schemas,
@@ -82,7 +82,9 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
     notes: list[str] = []
     metadata = _metadata(prim, source, notes)
     frames, rate, topology = _timing(stage, prim, source, notes)
-    meters_per_unit = _meters_per_unit(stage, source, notes)
+    meters_per_unit = stage_meters(stage, source)
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        notes.append(f"one unit is taken as {meters_per_unit:g} m, USD's default; the asset states none")
     space, word = radiance_color_space(prim)
     if array_attribute(prim, CHANNELS["radiance"]) is not None and space is None:
         stated = repr(word) if word else "nothing"
@@ -127,7 +129,9 @@ class _FrameReader:
         where = f"{self.source}: {self.prim.GetPath()} at time {time:g}"
         try:
             arrays = self._arrays(time, where)
-            place = self._placement(time, where)
+            cache = UsdGeom.XformCache(time)  # per call: a cache is not safe to share between threads
+            matrix = np.array(cache.GetLocalToWorldTransform(self.prim))
+            place = placement_of(matrix, self.meters_per_unit, where)
             return GaussianCloud(
                 **(arrays if place.is_identity else place.apply(arrays)),
                 axes=self.axes,
@@ -147,17 +151,8 @@ class _FrameReader:
                 names.add(name)
         if not self.captured:
             names.discard("radiance")
-        return frozenset(names - _MOVED if self._moves() else names)
-
-    def _moves(self) -> bool:
-        return any(
-            prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying()
-            for prim in ancestors(self.prim)
-        )
-
-    def _placement(self, time: float, where: str) -> Placement:
-        cache = UsdGeom.XformCache(time)  # per call: a cache is not safe to share between threads
-        return placement_of(np.array(cache.GetLocalToWorldTransform(self.prim)), self.meters_per_unit, where)
+        xforms = (UsdGeom.Xformable(prim) for prim in ancestors(self.prim) if prim.IsA(UsdGeom.Xformable))
+        return frozenset(names - _MOVED if any(xform.TransformMightBeTimeVarying() for xform in xforms) else names)
 
     def _arrays(self, time: float, where: str) -> dict[str, NDArray[Any]]:
         positions = self._array(CHANNELS["positions"], time, where)
@@ -266,14 +261,10 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
         word = authored(prim, name)
         if word is not None:
             said[key] = str(word)
-    antialiased, low_pass = authored(prim, "beam:rasterAntialiased"), authored(prim, "beam:rasterLowPass")
-    if antialiased is not None or low_pass is not None:
-        said.update(
-            raster_metadata(
-                UNSTATED_RASTER[0] if antialiased is None else antialiased,
-                UNSTATED_RASTER[1] if low_pass is None else low_pass,
-            )
-        )
+    raster = [authored(prim, name) for name in ("beam:rasterAntialiased", "beam:rasterLowPass")]
+    if raster != [None, None]:
+        antialiased, low_pass = (UNSTATED_RASTER[i] if value is None else value for i, value in enumerate(raster))
+        said.update(raster_metadata(bool(antialiased), low_pass))
     if array_attribute(prim, CHANNELS["metallic"]) is not None:
         notes.append("the asset has a metallic channel, which is not read")
     return said
@@ -300,13 +291,6 @@ def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) ->
             notes.append("time samples are unevenly spaced; the rate is that of the median step")
     times = times or [stage.GetStartTimeCode()]
     return times, rate, "constant" if topology == "constant" or len(times) == 1 else "perFrame"
-
-
-def _meters_per_unit(stage: Usd.Stage, source: Path, notes: list[str]) -> float:
-    meters = stage_meters(stage, source)
-    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        notes.append(f"one unit is taken as {meters:g} m, USD's default; the asset states none")
-    return meters
 
 
 def _unit(name: str, vectors: NDArray[np.float32], where: str) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
@@ -49,6 +49,22 @@ def open_asset(path: str | Path, *, trusted: bool) -> tuple[Path, Usd.Stage]:
         raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
 
 
+def layer_files(path: Path) -> list[Path]:
+    """Return the files of all layers of a stage, including value clips, with the stage's own file first.
+
+    Raises:
+        AssetFormatError: OpenUSD cannot open the stage, or a layer is missing.
+    """
+    try:
+        layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
+    except Tf.ErrorException as error:
+        raise AssetFormatError(f"{path} must open in OpenUSD, got {error}. Export the file again.") from error
+    if missing:
+        raise AssetFormatError(f"{path} must have all its layers, got none at {missing[0]}. Copy it with them.")
+    files = {Path(layer.realPath) for layer in layers if layer.realPath and Path(layer.realPath).is_file()}
+    return [path, *sorted(files - {path, path.absolute(), path.resolve()})]
+
+
 def stage_axes(stage: Usd.Stage, source: Path) -> str:
     """Return the axes code of a stage's up axis.
 
@@ -56,10 +72,10 @@ def stage_axes(stage: Usd.Stage, source: Path) -> str:
         AssetFormatError: It is neither Y nor Z.
     """
     up = str(UsdGeom.GetStageUpAxis(stage))
-    for axes, name in UP_AXES.items():
-        if up == name:
-            return axes
-    raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
+    axes = next((axes for axes, name in UP_AXES.items() if up == name), None)
+    if axes is None:
+        raise AssetFormatError(f"{source} must have upAxis Y or Z, got {up!r}. Set it.")
+    return axes
 
 
 def stage_meters(stage: Usd.Stage, source: Path) -> float:
@@ -200,23 +216,18 @@ class ClipSet:
 def clip_sets(prim: Usd.Prim) -> list[ClipSet]:
     """Return the explicit value clips of a prim, with absolute paths."""
     clips = prim.GetMetadata("clips") or {}
-    found = []
-    for name in clips:
-        api = Usd.ClipsAPI(prim)
-        paths = api.GetClipAssetPaths(name)
-        if not paths:
-            continue
-        manifest = api.GetClipManifestAssetPath(name)
-        found.append(
-            ClipSet(
-                prim_path=str(api.GetClipPrimPath(name)),
-                manifest=_absolute(prim, manifest),
-                paths=tuple(_absolute(prim, path) for path in paths),
-                active=tuple((float(start), int(index)) for start, index in api.GetClipActive(name) or ()),
-                times=tuple((float(outer), float(inner)) for outer, inner in api.GetClipTimes(name) or ()),
-            )
+    api = Usd.ClipsAPI(prim)
+    return [
+        ClipSet(
+            prim_path=str(api.GetClipPrimPath(name)),
+            manifest=_absolute(prim, api.GetClipManifestAssetPath(name)),
+            paths=tuple(_absolute(prim, path) for path in paths),
+            active=tuple((float(start), int(index)) for start, index in api.GetClipActive(name) or ()),
+            times=tuple((float(outer), float(inner)) for outer, inner in api.GetClipTimes(name) or ()),
         )
-    return found
+        for name in clips
+        if (paths := api.GetClipAssetPaths(name))
+    ]
 
 
 def _absolute(prim: Usd.Prim, path: Sdf.AssetPath | None) -> str:

@@ -16,12 +16,12 @@ from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.schema import register
 from beam_warp.schema.authoring import (
     AssetContents,
-    author_asset_prim,
     author_clips,
     author_declarations,
     author_frame,
-    author_splats_prim,
     author_stage,
+    define,
+    static_layer,
 )
 from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
 from beam_warp.schema.staging import publish, staged_folder
@@ -89,10 +89,7 @@ def write_asset(
 
 def _write_single(contents: AssetContents, folder: Path, name: str, save_every: int) -> list[str]:
     """Write one binary layer with everything, saved repeatedly so that USD keeps frames on disk and not in memory."""
-    layer = Sdf.Layer.CreateNew(str(folder / name))
-    author_stage(layer, contents)
-    author_asset_prim(layer, contents)
-    author_splats_prim(layer, contents)
+    layer = static_layer(contents, folder / name)
     if contents.varying:
         for frame, arrays in contents.frames():
             author_frame(layer, contents, frame, arrays)
@@ -111,15 +108,8 @@ def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, save_
 
 def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
     """Write a text root layer, a binary layer of constant arrays, a manifest, and a binary layer for each segment."""
-    static = Sdf.Layer.CreateNew(str(folder / f"{stem}.static.usdc"))
-    author_stage(static, contents)
-    author_asset_prim(static, contents)
-    author_splats_prim(static, contents)
-    _save(static)
-
-    manifest = _clip_layer(contents, folder / f"{stem}.manifest.usda")
-    _save(manifest)
-
+    _save(static_layer(contents, folder / f"{stem}.static.usdc"))
+    _save(_clip_layer(contents, folder / f"{stem}.manifest.usda"))
     segments: list[tuple[int, str]] = []
     frames = contents.frames()
     for start in range(0, len(contents.sequence), contents.segment_length):
@@ -148,9 +138,7 @@ def _write_root(contents: AssetContents, folder: Path, stem: str, data: str, seg
     name = f"{stem}.usda"
     layer = Sdf.Layer.CreateNew(str(folder / name))
     author_stage(layer, contents)
-    prim = Sdf.CreatePrimInLayer(layer, ASSET_PATH)
-    prim.specifier = Sdf.SpecifierDef
-    prim.typeName = "Xform"
+    prim = define(layer, ASSET_PATH, "Xform")
     prim.referenceList.prependedItems = [Sdf.Reference(f"./{data}", ASSET_PATH)]
     if segments:
         relative = [(start, f"./{segment}") for start, segment in segments]

@@ -46,7 +46,7 @@ class Capture(CaptureContents):
         if transforms.is_file():
             return cls(**vars(nerfstudio.read(transforms, keep)))
         if (model := colmap.find(path)) is not None:
-            return cls(**vars(colmap.read(path, model, keep)))
+            return cls(**vars(colmap.read(path, *model, keep)))
         if matrices := projections.find(path):
             return cls(**vars(projections.read(path, matrices)))
         raise MissingFileError(

@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.lenses import Lens
+from beam_warp.capture.lenses import COEFFICIENT_NAMES
 from beam_warp.capture.records import (
     IMAGE_FOLDER,
-    MASK_FOLDER,
     MAX_RECORDS,
     CaptureContents,
     CaptureRecord,
@@ -29,9 +28,11 @@ from beam_warp.capture.records import (
     SparsePoints,
     camera_name_of,
     mask_beside,
+    read_bytes,
+    read_text,
 )
 from beam_warp.capture.undistort import Intrinsics
-from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
+from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.world.quaternions import matrix_of
 
@@ -61,7 +62,6 @@ MAX_NAME_BYTES = 4096
 
 _POINT_2D_BYTES = 24
 _TRACK_BYTES = 8
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _NAMES_BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
 
 
@@ -76,22 +76,22 @@ class _Pose:
     where: str
 
 
-def find(folder: Path) -> Path | None:
-    """Return the folder of a capture's model, or None if there is none."""
-    for inner in FOLDERS:
-        if any(
-            (folder / inner / f"cameras{s}").is_file() and (folder / inner / f"images{s}").is_file() for s in SUFFIXES
-        ):
-            return folder / inner
+def find(folder: Path) -> tuple[Path, str] | None:
+    """Return the folder of a capture's model and the suffix of its files, or None if there is none."""
+    for model in (folder / inner for inner in FOLDERS):
+        for suffix in SUFFIXES:
+            if (model / f"cameras{suffix}").is_file() and (model / f"images{suffix}").is_file():
+                return model, suffix
     return None
 
 
-def read(folder: Path, model: Path, keep: float) -> CaptureContents:
+def read(folder: Path, model: Path, suffix: str, keep: float) -> CaptureContents:
     """Read a model whose images lie in ``folder/images`` or, if there is no such folder, in ``folder``.
 
     Args:
         folder: The capture.
         model: Folder that `find` returned.
+        suffix: Suffix that `find` returned.
         keep: See `Capture.read`.
 
     Raises:
@@ -99,16 +99,14 @@ def read(folder: Path, model: Path, keep: float) -> CaptureContents:
         AssetFormatError: A file is truncated or damaged, a camera model is not one of `MODELS`, an image names a camera
             that does not exist, a pose is not rigid, or a lens cannot be inverted; the message names file and row.
     """
-    suffix = next(s for s in SUFFIXES if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
     binary = suffix == ".bin"
     cameras_path, images_path = model / f"cameras{suffix}", model / f"images{suffix}"
     photographs = _binary_cameras(cameras_path) if binary else _text_cameras(cameras_path)
     images_folder = folder / IMAGE_FOLDER if (folder / IMAGE_FOLDER).is_dir() else folder
-    has_masks = (folder / MASK_FOLDER).is_dir()
     records: list[CaptureRecord] = []
     seen: dict[str, str] = {}
     for row in _binary_poses(images_path) if binary else _text_poses(images_path):
-        record = _record(row, photographs, folder, images_folder, has_masks, keep)
+        record = _record(row, photographs, folder, images_folder, keep)
         if record.name in seen:
             raise AssetFormatError(
                 f"image names must differ without their suffix, got {row.name} and {seen[record.name]} at {row.where}. "
@@ -123,9 +121,7 @@ def read(folder: Path, model: Path, keep: float) -> CaptureContents:
     return CaptureContents(folder=folder, records=tuple(records), read_points=read_points)
 
 
-def _record(
-    row: _Pose, photographs: dict[int, Photograph], folder: Path, images: Path, has_masks: bool, keep: float
-) -> CaptureRecord:
+def _record(row: _Pose, photographs: dict[int, Photograph], folder: Path, images: Path, keep: float) -> CaptureRecord:
     if row.camera not in photographs:
         raise AssetFormatError(
             f"camera of an image must be one of cameras, got {row.camera} at {row.where}. Export the model again."
@@ -144,12 +140,9 @@ def _record(
     )
     return CaptureRecord(
         camera_name=camera_name_of(name),
-        frame=0,
-        time=0.0,
-        split="train",
         camera=camera,
         image_path=images / name,
-        mask_path=mask_beside(folder, name) if has_masks else None,
+        mask_path=mask_beside(folder, name),
         undistortion=undistortion,
     )
 
@@ -179,13 +172,8 @@ def _photograph(model: str, width: int, height: int, parameters: list[float], wh
                 f"{name} of a camera must be a number in [{low:g}, {high:g}], got {value:g} at {where}. "
                 "Correct the file."
             )
-    lens_model = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
-    try:
-        lens = Lens(tuple(values.get(name, 0.0) for name in _COEFFICIENTS), lens_model)
-    except BeamError as error:
-        raise AssetFormatError(f"{model} has no pinhole at {where}: {error}") from error
     intrinsics = Intrinsics(width, height, focal_x, focal_y, values["cx"], values["cy"])
-    return Photograph(intrinsics, lens, model, where)
+    return Photograph.of(intrinsics, tuple(values.get(name, 0.0) for name in COEFFICIENT_NAMES), model, where)
 
 
 def _refused(model: str, where: str) -> AssetFormatError:
@@ -201,19 +189,12 @@ def _cut(path: Path) -> AssetFormatError:
     )
 
 
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MissingFileError(f"capture must be readable, got {path} ({error.strerror}). Check the rights.") from error
-
-
 class _Bytes:
     """A binary file, read from front to back; no count is believed that the file's length does not allow."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = _content(path)
+        self.data = read_bytes(path)
         self.place = 0
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
@@ -225,17 +206,16 @@ class _Bytes:
         return values
 
     def count(self, least: int, most: int = 2**63) -> int:
-        """Return a count of items that take at least ``least`` bytes each."""
+        """Return a count of items that take at least ``least`` bytes each, all within the file."""
         (count,) = self.take(_COUNT)
         if count > most or count * least > len(self.data) - self.place:
             raise _cut(self.path)
         return count
 
-    def skip(self, size: int) -> None:
-        """Skip bytes."""
-        if self.place + size > len(self.data):
-            raise _cut(self.path)
-        self.place += size
+    def skip_list(self, size: int) -> None:
+        """Skip a list of items of ``size`` bytes each, with the count before it."""
+        count = self.count(size)
+        self.place += count * size
 
     def name(self) -> str:
         """Return a text that ends in a zero byte."""
@@ -280,7 +260,7 @@ def _binary_poses(path: Path) -> Iterator[_Pose]:
     for index in range(source.count(_IMAGE.size + 1 + _COUNT.size, MAX_RECORDS)):
         values = source.take(_IMAGE)
         name = source.name()
-        source.skip(_POINT_2D_BYTES * source.count(_POINT_2D_BYTES))
+        source.skip_list(_POINT_2D_BYTES)
         yield _Pose(np.array(values[1:5]), np.array(values[5:8]), values[8], name, f"{path}, image {index}")
     source.finish()
 
@@ -292,7 +272,7 @@ def _binary_points(path: Path) -> SparsePoints:
     for index in range(count):
         values = source.take(_POINT)
         positions[index], colors[index] = values[1:4], values[4:7]
-        source.skip(_TRACK_BYTES * source.count(_TRACK_BYTES))
+        source.skip_list(_TRACK_BYTES)
     source.finish()
     return _points(path, positions, colors)
 
@@ -337,13 +317,7 @@ class _Line:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Return the lines of a text file with their numbers, without comments; empty lines are kept."""
-    try:
-        text = _content(path).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise AssetFormatError(
-            f"model must be text in UTF-8, got other bytes at {path}. Copy the file again."
-        ) from error
-    return ((number, line) for number, line in enumerate(text.splitlines(), 1) if not line.startswith("#"))
+    return ((number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if not line.startswith("#"))
 
 
 def _text_cameras(path: Path) -> dict[int, Photograph]:

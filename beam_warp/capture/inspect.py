@@ -21,7 +21,6 @@ from beam_warp.capture.cameras import MIN_CAMERAS, Volume, judge_cameras
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.findings import Finding, Findings, Severity, are, count_of, names_of
 from beam_warp.capture.images import Glimpse, glimpse_of, judge_images
-from beam_warp.capture.rigs import frustum_volume as frustum_volume
 from beam_warp.capture.rigs import up_direction
 from beam_warp.checks import require_count
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError

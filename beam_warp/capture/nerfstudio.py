@@ -8,7 +8,6 @@ for measuring errors, ``truth`` and ``relit``.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from functools import partial
@@ -18,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.lenses import COEFFICIENT_NAMES, MAX_COEFFICIENT, Lens
+from beam_warp.capture.lenses import COEFFICIENT_NAMES, MAX_COEFFICIENT
 from beam_warp.capture.records import (
     COLOR_SPACES,
-    MASK_FOLDER,
     MAX_RECORDS,
     CaptureContents,
     CaptureRecord,
@@ -29,10 +27,11 @@ from beam_warp.capture.records import (
     SparsePoints,
     camera_name_of,
     mask_beside,
+    read_json,
 )
 from beam_warp.capture.undistort import Intrinsics
 from beam_warp.converters.ply_container import read_header, read_table
-from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
+from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
 
 FILE_NAME = "transforms.json"
@@ -44,11 +43,8 @@ MAX_FILE_BYTES = 2**30
 MAX_FRAME = 10**9
 """Largest frame number that is read."""
 
-LENS_MODELS = {
-    **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
-    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
-}
-"""Lens model for each of nerfstudio's camera models; nerfstudio too treats all but the last one alike."""
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+"""Camera models that are read; nerfstudio too treats all but the last one alike."""
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -68,13 +64,13 @@ def read(path: Path, keep: float) -> CaptureContents:
         for split in ("train", "val", "test")
         for name in _Fields(content, str(path)).texts(f"{split}_filenames")
     }
-    has_masks = (root / MASK_FOLDER).is_dir()
+    shared = {name: content[name] for name in _SHARED_NAMES if name in content}
     records, seen = [], {}
     for index, entry in enumerate(listed):
         where = f"{path}, frames[{index}]"
         if not isinstance(entry, dict):
             raise AssetFormatError(f"record must be an object, got {_shown(entry)} at {where}. Write it as one.")
-        record = _record(_Fields({**_shared(content), **entry}, where), root, splits, keep, has_masks)
+        record = _record(_Fields({**shared, **entry}, where), root, splits, keep)
         if record.name in seen:
             raise AssetFormatError(
                 f"camera and frame must be another pair in each record, got {record.name} "
@@ -162,6 +158,10 @@ class _Fields:
             raise self.error(name, "fit for a file name", value)
         return value
 
+    def path(self, name: str, root: Path) -> Path | None:
+        """Return a named file; None if the field is absent."""
+        return None if self.values.get(name) is None else root / self.text(name)
+
     def paths(self, name: str, root: Path) -> dict[str, Path]:
         """Return named files; none if the field is absent."""
         value = self.values.get(name, {})
@@ -193,19 +193,15 @@ class _Fields:
 
 
 _SHARED_NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", *COEFFICIENT_NAMES, "camera_model", "color_space")
+"""Fields of the whole file that apply to every record that does not state them itself."""
 
 
-def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields that apply to every record that does not state them itself."""
-    return {name: content[name] for name in _SHARED_NAMES if name in content}
-
-
-def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float, has_masks: bool) -> CaptureRecord:
+def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float) -> CaptureRecord:
     """Read one record."""
     model = fields.text("camera_model", "OPENCV")
-    if model not in LENS_MODELS:
-        raise fields.error("camera_model", f"one of {', '.join(LENS_MODELS)}", model)
-    photograph = Photograph(
+    if model not in CAMERA_MODELS:
+        raise fields.error("camera_model", f"one of {', '.join(CAMERA_MODELS)}", model)
+    photograph = Photograph.of(
         Intrinsics(
             fields.integer("w", low=1, high=2**16),
             fields.integer("h", low=1, high=2**16),
@@ -214,7 +210,7 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float,
             fields.number("cx", low=-1e9, high=1e9),
             fields.number("cy", low=-1e9, high=1e9),
         ),
-        _lens(fields, LENS_MODELS[model]),
+        tuple(fields.number(name, 0.0, low=-MAX_COEFFICIENT, high=MAX_COEFFICIENT) for name in COEFFICIENT_NAMES),
         model,
         fields.where,
     )
@@ -222,7 +218,6 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float,
         fields.matrix("transform_matrix") @ _OPENGL_TO_OPENCV, "transform_matrix", keep
     )
     file_path = fields.text("file_path")
-    beside = mask_beside(root, file_path) if has_masks else None
     return CaptureRecord(
         camera_name=fields.file_stem("camera", camera_name_of(file_path)),
         frame=fields.integer("frame", 0, low=0, high=MAX_FRAME),
@@ -230,22 +225,12 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float,
         split=fields.text("split", splits.get(file_path, "train")),
         camera=camera,
         image_path=root / file_path,
-        mask_path=root / fields.text("mask_path") if fields.values.get("mask_path") is not None else beside,
+        mask_path=fields.path("mask_path", root) or mask_beside(root, file_path),
         color_space=_color_space(fields),
-        truth_path=root / fields.text("truth") if fields.values.get("truth") is not None else None,
+        truth_path=fields.path("truth", root),
         relit_paths=fields.paths("relit", root),
         undistortion=undistortion,
     )
-
-
-def _lens(fields: _Fields, model: str) -> Lens:
-    coefficients = tuple(
-        fields.number(name, 0.0, low=-MAX_COEFFICIENT, high=MAX_COEFFICIENT) for name in COEFFICIENT_NAMES
-    )
-    try:
-        return Lens(coefficients, model)
-    except BeamError as error:
-        raise AssetFormatError(f"{model} has no pinhole at {fields.where}: {error}") from error
 
 
 def _color_space(fields: _Fields) -> str | None:
@@ -261,17 +246,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     """Read one JSON object from a file."""
     if not path.is_file():
         raise MissingFileError(f"capture must be a folder with {FILE_NAME}, got {path} (no such file). Check the path.")
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise AssetFormatError(
-                f"capture must be smaller than {MAX_FILE_BYTES} bytes, got more at {path}. Split it."
-            )
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MissingFileError(f"capture must be readable, got {path} ({error.strerror}). Check the rights.") from error
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise AssetFormatError(f"capture must be JSON in UTF-8, got {reason} at {path}. Correct the file.") from error
+    content = read_json(path, "capture", MAX_FILE_BYTES)
     if not isinstance(content, dict):
         raise AssetFormatError(f"capture must be a JSON object, got {_shown(content)} at {path}. Correct the file.")
     return content

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
+from PIL import ImageColor
 from scipy import ndimage
 
 from beam_warp.capture.images import Glimpse
@@ -32,7 +33,7 @@ from beam_warp.capture.picture import (
 )
 from beam_warp.capture.rigs import frustum_corners
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
+from beam_warp.image.files import replacing
 
 IMAGE_SIDE = 56
 """Longer side of the images in the frustums [pixel]; each pixel is drawn as two triangles."""
@@ -77,8 +78,8 @@ def write_page(report: CaptureReport, path: Path) -> None:
         f'<div class="images">{"".join(_figure(glimpse, rig) for glimpse in glimpses)}</div>\n'
         f'<script type="application/json" id="data">{data}</script>\n<script>{script}</script>\n</body>\n</html>\n'
     )
-    with staged_outputs() as staging:
-        staging.path_for(path).write_text(page, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def _findings(report: CaptureReport) -> str:
@@ -112,7 +113,7 @@ def _outlined(glimpse: Glimpse) -> NDArray[np.uint8]:
     if glimpse.alpha is not None:
         inside = np.asarray(ndimage.zoom(glimpse.alpha, 2, order=1, grid_mode=True, mode="nearest")) > 0.5
         edge = inside & ~np.asarray(ndimage.binary_erosion(inside, border_value=1), bool)
-        pixels[edge] = [int(OUTLINE[k : k + 2], 16) for k in (1, 3, 5)]
+        pixels[edge] = ImageColor.getrgb(OUTLINE)
     return pixels
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from beam_warp.capture.findings import Finding, count_of
 from beam_warp.capture.images import Glimpse
@@ -17,9 +18,9 @@ from beam_warp.capture.inspect import SPLIT, CaptureReport
 from beam_warp.capture.records import SparsePoints
 from beam_warp.capture.rigs import frustum_corners, meeting_point
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import BeamError
 from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.files import replacing
 from beam_warp.world.camera import Camera
 
 GREY = "#555555"
@@ -212,8 +213,8 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     top += heights["images"] + 0.2
     for number, (text, ink) in enumerate(lines):
         figure.text(0.3 / WIDTH, 1 - (top + 0.19 * number) / total, text, size=9, color=ink, va="center")
-    with staged_outputs() as staging:
-        figure.savefig(staging.path_for(path), format="png", dpi=RESOLUTION, pil_kwargs={"optimize": True})
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=RESOLUTION, pil_kwargs={"optimize": True})
 
 
 def _finding_lines(findings: Iterable[Finding]) -> list[tuple[str, str]]:
@@ -265,6 +266,7 @@ def _outside_view(rig: Rig) -> Camera:
 def _draw_rig(axes: Any, rig: Rig, view: Camera) -> None:
     """Draw the frustums in perspective, far ones first and paler."""
     from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.colors import to_rgba
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.0, foreground="white")]
@@ -294,23 +296,18 @@ def _draw_rig(axes: Any, rig: Rig, view: Camera) -> None:
         camera, color = rig.cameras[name], COLORS[rig.kinds[name]]
         weight = 1.0 - 0.6 * (depths[name] - near) / max(far - near, 1e-12)
         corners = view.project(np.concatenate([frustum_corners(camera, rig.depth), camera.position[None]]))[:, :2]
-        face = PolyCollection([corners[:4]], facecolors=color, edgecolors=color, alpha=None, linewidths=1.1)
-        face.set_facecolor((*_rgb(color), 0.10 + 0.12 * weight))
-        face.set_edgecolor((*_rgb(color), weight))
-        face.set_zorder(5 + order)
-        axes.add_collection(face)
+        face, edge = to_rgba(color, 0.10 + 0.12 * weight), to_rgba(color, weight)
+        square = PolyCollection([corners[:4]], facecolors=face, edgecolors=edge, linewidths=1.1, zorder=5 + order)
+        axes.add_collection(square)
         sides = [np.array([corners[4], corner]) for corner in corners[:4]]
-        axes.add_collection(LineCollection(sides, colors=[(*_rgb(color), weight)], linewidths=0.8, zorder=5 + order))
+        axes.add_collection(LineCollection(sides, colors=[edge], linewidths=0.8, zorder=5 + order))
         style = {"color": color, "alpha": 0.5 + 0.5 * weight, "path_effects": halo, "zorder": 99}
         axes.text(*corners[4], labels[name], size=7, ha="center", va="bottom", **style)
 
 
-def _rgb(color: str) -> tuple[float, float, float]:
-    return tuple(int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))  # type: ignore[return-value]
-
-
 def _draw_plan(axes: Any, rig: Rig) -> None:
     """Draw the rig from above, with z towards the viewer."""
+    from matplotlib.colors import to_rgba
     from matplotlib.patches import Polygon, Rectangle
 
     positions, colors = rig.points
@@ -318,13 +315,14 @@ def _draw_plan(axes: Any, rig: Rig) -> None:
         axes.scatter(positions[:, 0], positions[:, 1], s=0.8, c=colors, linewidths=0)
     if rig.volume is not None:
         low, high = rig.volume[0], rig.volume[7]
-        axes.add_patch(Rectangle(low[:2], *(high - low)[:2], fill=True, fc=(*_rgb(VOLUME), 0.12), ec=VOLUME, lw=1.2))
+        axes.add_patch(Rectangle(low[:2], *(high - low)[:2], fill=True, fc=to_rgba(VOLUME, 0.12), ec=VOLUME, lw=1.2))
     labels = rig.labels()
     for name, camera in rig.cameras.items():
         color = COLORS[rig.kinds[name]]
         corners = frustum_corners(camera, rig.depth)
         outline = np.concatenate([camera.position[None], corners])[:, :2]
-        axes.add_patch(Polygon(_hull(outline), closed=True, fc=(*_rgb(color), 0.15), ec=color, lw=0.9))
+        hull = outline[ConvexHull(outline).vertices]
+        axes.add_patch(Polygon(hull, closed=True, fc=to_rgba(color, 0.15), ec=color, lw=0.9))
         away = camera.position[:2] - corners.mean(axis=0)[:2]
         length = float(np.linalg.norm(away))
         shift = away / length * 0.45 * rig.depth if length > 0.2 * rig.depth else np.array([0.0, 0.45 * rig.depth])
@@ -346,24 +344,6 @@ def _draw_plan(axes: Any, rig: Rig) -> None:
         side.set_color("#BBBBBB")
     axes.grid(color="#EEEEEE", lw=0.8)
     axes.set_axisbelow(True)
-
-
-def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners of the convex hull of a few points ``(N, 2)``, in order (Andrew's monotone chain)."""
-    order = sorted(map(tuple, points.tolist()))
-
-    def chain(row: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        found: list[tuple[float, ...]] = []
-        for p in row:
-            while len(found) > 1 and (
-                (found[-1][0] - found[-2][0]) * (p[1] - found[-2][1])
-                <= (found[-1][1] - found[-2][1]) * (p[0] - found[-2][0])
-            ):
-                found.pop()
-            found.append(p)
-        return found[:-1]
-
-    return np.array(chain(order) + chain(reversed(order)))
 
 
 def _draw_glimpse(axes: Any, glimpse: Glimpse, kind: str) -> None:

@@ -13,7 +13,6 @@ all images: the whole number from 1 to `MAX_SCALE` that brings the principal poi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +23,12 @@ from numpy.typing import NDArray
 from beam_warp.capture.records import (
     COLOR_SPACES,
     IMAGE_FOLDER,
-    MASK_FOLDER,
     CaptureContents,
     CaptureRecord,
     camera_name_of,
     mask_beside,
+    read_json,
+    read_text,
 )
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.files import SUFFIXES, image_size
@@ -149,12 +149,9 @@ def read(folder: Path, matrices: Sequence[Path]) -> CaptureContents:
         records.append(
             CaptureRecord(
                 camera_name=camera_name_of(name.removeprefix(f"{IMAGE_FOLDER}/")),
-                frame=0,
-                time=0.0,
-                split="train",
                 camera=_camera(parts[stem], sizes[stem], scale, shift, found[stem]),
                 image_path=image,
-                mask_path=mask_beside(folder, name) if (folder / MASK_FOLDER).is_dir() else None,
+                mask_path=mask_beside(folder, name),
                 color_space=options.color_space,
             )
         )
@@ -170,27 +167,10 @@ def _image_of(folder: Path, stem: str) -> Path | None:
     return None
 
 
-def _read_small(path: Path) -> str:
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise AssetFormatError(f"file must be at most {MAX_FILE_BYTES} bytes, got more at {path}. Check it.")
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise MissingFileError(f"capture must be readable, got {path} ({error.strerror}). Check the rights.") from error
-    except UnicodeDecodeError as error:
-        raise AssetFormatError(f"file must be text in UTF-8, got other bytes at {path}. Copy it again.") from error
-
-
 def _read_options(path: Path) -> _Options:
     if not path.is_file():
         return _Options()
-    try:
-        content = json.loads(_read_small(path))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, BeamError):
-            raise
-        reason = " ".join(str(error).split())
-        raise AssetFormatError(f"options must be JSON, got {reason} at {path}. Correct the file.") from error
+    content = read_json(path, "options", MAX_FILE_BYTES)
     known = ("scale", "pixel_centers", "color_space")
     if not isinstance(content, dict) or set(content) - set(known):
         raise AssetFormatError(
@@ -213,7 +193,7 @@ def _read_options(path: Path) -> _Options:
 
 
 def _decompose_file(path: Path) -> Decomposition:
-    words = _read_small(path).split()
+    words = read_text(path, MAX_FILE_BYTES).split()
     try:
         values = np.array([float(word) for word in words])
     except ValueError:

@@ -5,9 +5,11 @@ Images are read when they are asked for and never kept, so that memory does not 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,9 +68,9 @@ class CaptureRecord:
     """
 
     camera_name: str
-    frame: int
-    time: float
-    split: str
+    frame: int = 0
+    time: float = 0.0
+    split: str = "train"
     camera: Camera
     image_path: Path
     mask_path: Path | None = None
@@ -253,6 +255,19 @@ class Photograph:
     model: str
     where: str
 
+    @classmethod
+    def of(cls, intrinsics: Intrinsics, coefficients: tuple[float, ...], model: str, where: str) -> Photograph:
+        """Make a photograph's record with the coefficients of a lens, of the model that the file names.
+
+        Raises:
+            AssetFormatError: The lens model has no such coefficients; the message names the place.
+        """
+        try:
+            lens = Lens(coefficients, "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV")
+        except BeamError as error:
+            raise AssetFormatError(f"{model} has no pinhole at {where}: {error}") from error
+        return cls(intrinsics, lens, model, where)
+
     def undistort(self, pose: ArrayLike, pose_name: str, keep: float) -> tuple[Camera, Undistortion | None]:
         """Return the pinhole camera of the undistorted image, and the undistortion, None if the lens has none.
 
@@ -273,6 +288,39 @@ class Photograph:
         except BeamError as error:
             raise AssetFormatError(f"{pose_name} is no camera pose at {self.where}: {error}") from error
         return camera, None if self.lens.is_straight else undistortion
+
+
+def read_bytes(path: Path, most: int | None = None) -> bytes:
+    """Return the content of a file that describes a capture, of at most ``most`` bytes.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        AssetFormatError: It is larger.
+    """
+    try:
+        if most is not None and path.stat().st_size > most:
+            raise AssetFormatError(f"file must be at most {most} bytes, got more at {path}. Check it, or split it.")
+        return path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(f"capture must be readable, got {path} ({error.strerror}). Check the rights.") from error
+
+
+def read_text(path: Path, most: int | None = None) -> str:
+    """Return the text of a file that describes a capture; see `read_bytes`."""
+    try:
+        return read_bytes(path, most).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise AssetFormatError(f"file must be text in UTF-8, got other bytes at {path}. Copy it again.") from error
+
+
+def read_json(path: Path, what: str, most: int) -> Any:
+    """Return the content of a JSON file, which errors call ``what``; see `read_bytes`."""
+    text = read_text(path, most)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise AssetFormatError(f"{what} must be JSON, got {reason} at {path}. Correct the file.") from error
 
 
 def camera_name_of(file_path: str) -> str:

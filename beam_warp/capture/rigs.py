@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_number
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.camera import Camera
 
@@ -22,6 +21,9 @@ GRID = 32
 
 MAX_CAMERAS = 64
 """Most cameras that are tested for what they see; of more cameras, an even selection is tested."""
+
+COMMON_SHARE = 0.75
+"""Share of the cameras that see every point of the common volume."""
 
 LEAST_SHARE = 1.0 / 3.0
 """Least share of the cameras that must see a point in common."""
@@ -72,33 +74,28 @@ def frustum_corners(camera: Camera, depth: float) -> NDArray[np.float64]:
     return local @ camera.camera_to_world[:3, :3].T + camera.position
 
 
-def frustum_volume(
-    cameras: Sequence[Camera], *, share: float = 0.75
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def frustum_volume(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box around the points that most cameras see.
 
     The search reaches from the point that the cameras look at as far as their distance to it; for nearly parallel
     cameras, it reaches four times their extent ahead of them.
 
     Args:
-        cameras: At least two cameras.
-        share: Share of the cameras that must see a point. If no point is seen by so many, it is 0.8 of the largest
-            number that see one point.
+        cameras: At least two cameras. `COMMON_SHARE` of them must see a point; if no point is seen by so many, it is
+            0.8 of the largest number that see one point.
 
     Returns:
         The lower and the upper corner [m], ``(3,)`` each.
 
     Raises:
-        InvalidOptionError: There are fewer than two cameras, no point is seen by two of them and by `LEAST_SHARE`, or
-            ``share`` is out of range.
+        InvalidOptionError: There are fewer than two cameras, or no point is seen by two of them and by `LEAST_SHARE`.
     """
-    require_number("share", share, 0.0, 1.0)
     if len(cameras) < 2:
         raise InvalidOptionError(
             f"cameras must be at least 2 to have a volume in common, got {len(cameras)}. Add some."
         )
     step = -(-len(cameras) // MAX_CAMERAS)
-    asked = list(cameras)[::step] if step > 1 else list(cameras)
+    asked = cameras[::step]
     center, reach = _region(asked)
     low, high = center - reach, center + reach
     needed: int | None = None
@@ -112,7 +109,7 @@ def frustum_volume(
                     f"cameras must have a volume in common, got no point that more than {most} of {len(asked)} see. "
                     "Check the poses: their axes, their units, and that they are camera-to-world."
                 )
-            needed = max(2, min(int(np.ceil(share * len(asked))), int(np.ceil(0.8 * most))))
+            needed = max(2, min(int(np.ceil(COMMON_SHARE * len(asked))), int(np.ceil(0.8 * most))))
         inside = points[counts >= needed]
         if not len(inside):
             break
@@ -184,7 +181,12 @@ POSE_MISTAKES = {
 """Usual mistakes in poses written for nerfstudio, each with the function that undoes it in the poses as read."""
 
 
-def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: float = 0.8) -> tuple[str, ...]:
+DOUBT, TRUST = 0.5, 0.8
+"""Poses are right if the first share of the cameras or more looks at a common point with a common up; a mistake is
+likely if at least the second share looks at a common point once the mistake is undone."""
+
+
+def likely_mistakes(cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Return the mistakes in writing the poses that, once undone, make the cameras look at a common point.
 
     Poses are doubted in two cases: their cameras do not look at a common point, or they do and have no common up
@@ -193,8 +195,6 @@ def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: flo
 
     Args:
         cameras: Cameras; with fewer than three, nothing can be said.
-        doubt: Poses are right if this share of the cameras or more looks at a common point with a common up.
-        trust: Share of the cameras that must look at a common point once the mistake is undone.
 
     Returns:
         The likeliest mistake first, by the cameras' agreement on up; others follow if they agree nearly as well. Empty
@@ -207,8 +207,8 @@ def likely_mistakes(cameras: Sequence[Camera], *, doubt: float = 0.5, trust: flo
     if share is None:
         return ()
     undone = {name: undo(poses) for name, undo in POSE_MISTAKES.items()}
-    agreed = {name: _up_length(q) for name, q in undone.items() if (facing_share(cameras, q) or 0.0) >= trust}
-    if share >= doubt:
+    agreed = {name: _up_length(q) for name, q in undone.items() if (facing_share(cameras, q) or 0.0) >= TRUST}
+    if share >= DOUBT:
         if _up_length(poses) >= NO_UP:
             return ()
         agreed = {name: length for name, length in agreed.items() if length >= ONE_UP}

@@ -139,7 +139,7 @@ def inspect(command: InspectCommand) -> int:
     """Print what a file holds."""
     found = converters.inspect(command.input)
     if command.json:
-        print_json(found.as_json())
+        print_json(dataclasses.asdict(found))
     else:
         print(found.as_text())
     return 0

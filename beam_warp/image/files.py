@@ -149,7 +149,7 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
     if suffix == ".exr":
         return Image(path, _read_exr(path), color_space or LINEAR_REC709, premultiplied=True)
     if suffix == ".hdr":
-        rgb = read_radiance_hdr(path, max_side=MAX_SIDE, max_pixels=MAX_PIXELS)
+        rgb = read_radiance_hdr(path, _require_size)
         channels = {name: rgb[..., index] for index, name in enumerate("RGB")}
         return Image(path, channels, color_space or LINEAR_REC709, premultiplied=True)
     return Image(path, _read_pillow(path), color_space or DISPLAY_SRGB, premultiplied=False)

@@ -8,6 +8,7 @@ the same light; pictures in XYZE or with transposed scan order are refused.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +25,12 @@ MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 32767
 _RESOLUTION = re.compile(rb"([+-])Y (\d{1,9}) ([+-])X (\d{1,9})\n")
 
 
-def read_radiance_hdr(path: Path, *, max_side: int, max_pixels: int) -> NDArray[np.float32]:
+def read_radiance_hdr(path: Path, require_size: Callable[[Path, int, int], None]) -> NDArray[np.float32]:
     """Read a picture as linear RGB.
 
     Args:
         path: The file.
-        max_side: Largest width or height accepted [px].
-        max_pixels: Largest number of pixels accepted.
+        require_size: Function that refuses a picture by its path, width and height [px].
 
     Returns:
         Radiance, ``(H, W, 3)`` float32, top row first, with the header's exposure divided out.
@@ -46,11 +46,7 @@ def read_radiance_hdr(path: Path, *, max_side: int, max_pixels: int) -> NDArray[
             f"image must be a readable file, got {path} ({error.strerror}). Check the path."
         ) from error
     flip_y, flip_x, height, width, exposure, start = _parse_header(path, data)
-    if not (0 < height <= max_side and 0 < width <= max_side and height * width <= max_pixels):
-        raise AssetFormatError(
-            f"image must have sides in [1, {max_side}] px and at most {max_pixels} px, got {width} x {height} "
-            f"in {path}. Resize it."
-        )
+    require_size(path, width, height)
     # A scanline takes at least one four-byte entry: refuse what cannot be complete before allocating for it.
     if len(data) - start < 4 * height:
         raise _truncated(path, 0)

@@ -76,8 +76,6 @@ def display(
         InvalidArrayError: The shape is another, or a value is not finite.
         InvalidOptionError: The transform is none, or the exposure is out of range.
     """
-    if transform == "standard":
-        return display_image(linear_rgb, exposure_stops)
     return display_image(display_linear(linear_rgb, transform, exposure_stops))
 
 

@@ -81,9 +81,7 @@ def require_encoder(ffmpeg: str) -> None:
             check=False,
         )
     except OSError as error:
-        raise OutputError(
-            f"ffmpeg must run, got {error.strerror or error} of {ffmpeg}. To mend it, {INSTALL}."
-        ) from error
+        raise _not_running(ffmpeg, error) from error
     if asked.returncode != 0:
         raise _failed(ffmpeg, asked.stderr, asked.returncode)
     if ENCODER not in asked.stdout.decode(errors="replace").split():
@@ -125,9 +123,7 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOpt
                 start_new_session=True,  # Ctrl-C is ours to handle: it must not end ffmpeg in the middle of a write
             )
         except OSError as error:
-            raise OutputError(
-                f"ffmpeg must run, got {error.strerror or error} of {ffmpeg}. To mend it, {INSTALL}."
-            ) from error
+            raise _not_running(ffmpeg, error) from error
         assert process.stdin is not None
         try:
             count = _feed(process.stdin, first, images)
@@ -185,6 +181,10 @@ def _require_frame(image: NDArray[np.uint8], shape: tuple[int, ...]) -> None:
             f"frames must be uint8 of one shape (H, W, 3), got {image.dtype} {image.shape} in a film of {shape}. "
             "Resize them."
         )
+
+
+def _not_running(ffmpeg: str, error: OSError) -> OutputError:
+    return OutputError(f"ffmpeg must run, got {error.strerror or error} of {ffmpeg}. To mend it, {INSTALL}.")
 
 
 def _failed(ffmpeg: str, said: bytes, code: int) -> OutputError:

@@ -33,10 +33,10 @@ from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.trace.camera_rays import pixel_rays
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.scene import NOTHING, Scene
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
 
 PASS_SAMPLES = 16

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 from beam_warp._version import __version__
 from beam_warp.capture.images import EXPOSURE_STOPS as INSPECTED_STOPS
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.image.files import replacing
 from beam_warp.jobs.markdown import markdown_table
 from beam_warp.reconstruction.gains import EXPOSURE_STOPS
 from beam_warp.stability import captures, materials, relighting
@@ -372,9 +372,9 @@ def write_page(path: Path, result: StabilityResult, command: str) -> None:
     Raises:
         OutputError: The page cannot be written.
     """
-    with staged_outputs() as staging:
+    with replacing(path) as temporary:
         before = path.read_text(encoding="utf-8") if path.is_file() else ""
-        staging.path_for(path).write_text(markdown(result, command, before), encoding="utf-8")
+        temporary.write_text(markdown(result, command, before), encoding="utf-8")
 
 
 def _estimates(outcomes: Sequence[OcclusionOutcome]) -> str:

@@ -131,7 +131,7 @@ def source_files(path: Path) -> tuple[tuple[Path, ...], ...]:
     if path.is_dir():
         return tuple((file,) for file in numbered_files(path))
     if path.suffix.lower() in USD_SUFFIXES:
-        from beam_warp.schema.dependencies import layer_files  # brings OpenUSD along
+        from beam_warp.schema.stage_queries import layer_files  # brings OpenUSD along
 
         return (tuple(layer_files(path)),)
     return ((path,),)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
+from beam_warp.image.files import replacing
 from beam_warp.study.table import TOLERANCE, Interval, Table
 
 STYLE = """
@@ -48,8 +48,8 @@ def write_page(table: Table, path: Path) -> None:
         f"<script>{get_plotlyjs()}</script>\n</head>\n<body>\n"
         f'<script type="application/json" id="data">{data}</script>\n<script>{script}</script>\n</body>\n</html>\n'
     )
-    with staged_outputs() as staging:
-        staging.path_for(path).write_text(page, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def _data(table: Table) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from beam_warp.checks import require_package
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.errors import InvalidOptionError
+from beam_warp.image.files import replacing
 from beam_warp.study.table import Axis, Metric, Row, Table
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -139,8 +139,8 @@ def write_image(table: Table, path: Path) -> None:
         draw_effect(axes, table, metric)
     for number, line in enumerate(notes):
         figure.text(0.2 / WIDTH, (heights[4] - 0.1 - 0.185 * number) / total, line, fontsize=8.2, color=GREY, va="top")
-    with staged_outputs() as staging:
-        figure.savefig(staging.path_for(path), dpi=RESOLUTION, format="png")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=RESOLUTION, format="png")
 
 
 def varying(table: Table, metric: Metric) -> list[Row]:

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_number
-from beam_warp.converters.staging import require_writable, staged_outputs
+from beam_warp.converters.staging import require_writable
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError, OutputError
+from beam_warp.image.files import replacing
 
 Level = str | int | float
 
@@ -340,9 +341,9 @@ def write_table(table: Table, path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    with staged_outputs() as staging:
+    with replacing(path) as temporary:
         text = _head(table.subject) + "".join(_line(_cells(table.subject, row)) for row in table.rows)
-        staging.path_for(path).write_text(text, encoding="utf-8", newline="")
+        temporary.write_text(text, encoding="utf-8", newline="")
 
 
 def read_table(path: Path) -> Table:

@@ -14,10 +14,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.converters.staging import staged_outputs
 from beam_warp.device.arrays import upload
 from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidArrayError
+from beam_warp.image.files import replacing
 from beam_warp.kernels.trace.surface_rays import launch_local_surface
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.normals import estimate_normals
@@ -140,7 +140,7 @@ def find_references(
         }
     )
     if file is not None:
-        with staged_outputs() as staging, staging.path_for(file).open("wb") as stream:
+        with replacing(file) as temporary, temporary.open("wb") as stream:
             np.savez(stream, fingerprint=np.array(fingerprint), **vars(found))
     return found
 

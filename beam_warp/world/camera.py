@@ -23,6 +23,8 @@ MAX_PIXELS = 2**28
 RIGID_TOLERANCE = 1e-4
 """Largest entry of |R^T R - I| accepted as a rotation: single-precision poses printed with six digits are within it."""
 
+_LENGTHS = ("focal_x", "focal_y", "center_x", "center_y")
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -104,10 +106,7 @@ class Camera:
             self,
             width=self.width * factor,
             height=self.height * factor,
-            focal_x=self.focal_x * factor,
-            focal_y=self.focal_y * factor,
-            center_x=self.center_x * factor,
-            center_y=self.center_y * factor,
+            **{name: getattr(self, name) * factor for name in _LENGTHS},
         )
 
     def reduced(self, factor: int) -> Camera:
@@ -123,10 +122,7 @@ class Camera:
             self,
             width=self.width // factor,
             height=self.height // factor,
-            focal_x=self.focal_x / factor,
-            focal_y=self.focal_y / factor,
-            center_x=self.center_x / factor,
-            center_y=self.center_y / factor,
+            **{name: getattr(self, name) / factor for name in _LENGTHS},
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
@@ -248,17 +244,12 @@ class Camera:
     ) -> Camera:
         """Place an orbit camera so near that a cloud just fills the image.
 
-        Trained clouds have stray Gaussians far off, so only the positions that `bulk` returns are framed.
+        Trained clouds have stray Gaussians far off, so only the positions that `bulk` returns are framed. All other
+        arguments are those of `frame_points`.
 
         Args:
             positions: Centres [m], ``(N, 3)`` with N at least 1.
             opacities: Weight of each position, ``(N,)`` in [0, 1]; None weighs all the same.
-            azimuth: See `orbit` [degree].
-            elevation: See `orbit` [degree].
-            width: Image width [pixel].
-            height: Image height [pixel].
-            vertical_fov: Angle between the top and bottom edges of the image [degree].
-            margin: Size of the image over that of the part that the cloud may fill, at least 1.
 
         Raises:
             InvalidArrayError: An array breaks its contract, or there is no Gaussian.

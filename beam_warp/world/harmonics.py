@@ -26,49 +26,43 @@ def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
     d = np.asarray(directions, dtype=np.float64)
     x, y, z = d[..., 0], d[..., 1], d[..., 2]
     xx, yy, zz = x * x, y * y, z * z
-    bands = [[np.full_like(x, SH_C0)]]
+    terms = [np.full_like(x, SH_C0)]
     if degree >= 1:
         c1 = np.sqrt(3.0 / (4.0 * np.pi))
-        bands.append([-c1 * y, c1 * z, -c1 * x])
+        terms += [-c1 * y, c1 * z, -c1 * x]
     if degree >= 2:
         c = np.sqrt(15.0 / (4.0 * np.pi))
-        bands.append(
-            [
-                c * x * y,
-                -c * y * z,
-                np.sqrt(5.0 / (16.0 * np.pi)) * (2.0 * zz - xx - yy),
-                -c * x * z,
-                0.5 * c * (xx - yy),
-            ]
-        )
+        terms += [
+            c * x * y,
+            -c * y * z,
+            np.sqrt(5.0 / (16.0 * np.pi)) * (2.0 * zz - xx - yy),
+            -c * x * z,
+            0.5 * c * (xx - yy),
+        ]
     if degree >= 3:
         c35, c105, c21 = np.sqrt(35.0 / (32.0 * np.pi)), np.sqrt(105.0 / (4.0 * np.pi)), np.sqrt(21.0 / (32.0 * np.pi))
-        bands.append(
-            [
-                -c35 * y * (3.0 * xx - yy),
-                c105 * x * y * z,
-                -c21 * y * (4.0 * zz - xx - yy),
-                np.sqrt(7.0 / (16.0 * np.pi)) * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-                -c21 * x * (4.0 * zz - xx - yy),
-                0.5 * c105 * z * (xx - yy),
-                -c35 * x * (xx - 3.0 * yy),
-            ]
-        )
+        terms += [
+            -c35 * y * (3.0 * xx - yy),
+            c105 * x * y * z,
+            -c21 * y * (4.0 * zz - xx - yy),
+            np.sqrt(7.0 / (16.0 * np.pi)) * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            -c21 * x * (4.0 * zz - xx - yy),
+            0.5 * c105 * z * (xx - yy),
+            -c35 * x * (xx - 3.0 * yy),
+        ]
     if degree >= 4:
-        bands.append(
-            [
-                0.75 * np.sqrt(35.0 / np.pi) * x * y * (xx - yy),
-                -0.75 * np.sqrt(35.0 / (2.0 * np.pi)) * y * z * (3.0 * xx - yy),
-                0.75 * np.sqrt(5.0 / np.pi) * x * y * (7.0 * zz - 1.0),
-                -0.75 * np.sqrt(5.0 / (2.0 * np.pi)) * y * z * (7.0 * zz - 3.0),
-                0.1875 / np.sqrt(np.pi) * (35.0 * zz * zz - 30.0 * zz + 3.0),
-                -0.75 * np.sqrt(5.0 / (2.0 * np.pi)) * x * z * (7.0 * zz - 3.0),
-                0.375 * np.sqrt(5.0 / np.pi) * (xx - yy) * (7.0 * zz - 1.0),
-                -0.75 * np.sqrt(35.0 / (2.0 * np.pi)) * x * z * (xx - 3.0 * yy),
-                0.1875 * np.sqrt(35.0 / np.pi) * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
-            ]
-        )
-    return np.stack([term for band in bands for term in band], axis=-1)
+        terms += [
+            0.75 * np.sqrt(35.0 / np.pi) * x * y * (xx - yy),
+            -0.75 * np.sqrt(35.0 / (2.0 * np.pi)) * y * z * (3.0 * xx - yy),
+            0.75 * np.sqrt(5.0 / np.pi) * x * y * (7.0 * zz - 1.0),
+            -0.75 * np.sqrt(5.0 / (2.0 * np.pi)) * y * z * (7.0 * zz - 3.0),
+            0.1875 / np.sqrt(np.pi) * (35.0 * zz * zz - 30.0 * zz + 3.0),
+            -0.75 * np.sqrt(5.0 / (2.0 * np.pi)) * x * z * (7.0 * zz - 3.0),
+            0.375 * np.sqrt(5.0 / np.pi) * (xx - yy) * (7.0 * zz - 1.0),
+            -0.75 * np.sqrt(35.0 / (2.0 * np.pi)) * x * z * (xx - 3.0 * yy),
+            0.1875 * np.sqrt(35.0 / np.pi) * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
+        ]
+    return np.stack(terms, axis=-1)
 
 
 def sh_transform(linear: ArrayLike, degree: int) -> NDArray[np.float64]:

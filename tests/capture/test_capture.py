@@ -122,34 +122,25 @@ def test_images_are_read_when_asked_for(tmp_path):
             "OPENCV has no pinhole at .* k1 must let the lens be inverted .*got -20, .*at 0.1291, at pixel",
         ),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "p1 and p2 must be 0 for OPENCV_FISHEYE"),
+        ({"fl_y": None}, "fl_y must be a number in .*, got nothing at"),
+        ({"camera": "a"}, r"got a_0000 at .*frames\[1\] and frames\[0\]"),
+        ({"color_space": "adobe"}, "color_space must be one of srgb, linear, got 'adobe' at"),
     ],
 )
 def test_a_broken_record_is_named(tmp_path, changes, message):
-    write_capture(tmp_path, [record(), record(camera="b", **changes) if "camera" not in changes else record(**changes)])
+    write_capture(tmp_path, [record(), record(**{"camera": "b", **changes})])
     with pytest.raises(AssetFormatError, match=message) as caught:
         Capture.read(tmp_path)
     assert f"{tmp_path / 'transforms.json'}, frames[1]" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_intrinsic_is_named(tmp_path):
-    write_capture(tmp_path, [record()], fl_y=None)
-    with pytest.raises(AssetFormatError, match=r"fl_y must be a number in .*, got nothing at .*frames\[0\]"):
-        Capture.read(tmp_path)
-
-
-def test_the_same_camera_and_frame_twice(tmp_path):
-    write_capture(tmp_path, [record(), record()])
-    with pytest.raises(AssetFormatError, match=r"got a_0000 at .*frames\[1\] and frames\[0\]"):
-        Capture.read(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"{", "capture must be JSON in UTF-8"),
-        (b"\xff\xfe", "capture must be JSON in UTF-8"),
-        (b"[" * 100_000, "capture must be JSON in UTF-8"),
+        (b"{", "capture must be JSON, got"),
+        (b"\xff\xfe", "file must be text in UTF-8, got other bytes"),
+        (b"[" * 100_000, "capture must be JSON, got"),
         (b"[]", r"capture must be a JSON object, got \[\]"),
         (b"{}", "frames must be a list of 1 to 4194304 records, got None"),
         (b'{"frames": [3]}', "record must be an object, got 3 at"),
@@ -296,11 +287,6 @@ def test_views_that_cannot_be_read(tmp_path):
     with pytest.raises(MissingFileError, match=r"nowhere\.png"):
         nowhere.view()
     assert rounded.view().alpha.max() == 1.0
-    write_capture(tmp_path, [record(color_space="adobe")])
-    with pytest.raises(
-        AssetFormatError, match=r"color_space must be one of srgb, linear, got 'adobe' at .*frames\[0\]"
-    ):
-        Capture.read(tmp_path)
 
 
 def test_sparse_points(tmp_path):

@@ -1,11 +1,10 @@
 """Poses, axes, pixel centres and depth agree with an independent renderer: exact meshes drawn over its pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy import ndimage
 
 from beam_warp.capture.capture import Capture
+from beam_warp.image.metrics import angles_between, block_means
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -17,6 +16,9 @@ FINER = 4
 
 MAX_DEPTH_ERROR = 5e-4
 """[m], median over solid pixels. A shift of half a pixel, the likeliest mistake, makes it 1.2 mm or more."""
+
+MAX_NORMAL_ERROR = 5.0
+"""[degree], median over solid pixels. The truth's are smooth where the mesh is flat, which makes it 2.6 at most."""
 
 MIN_OVERLAP = 0.95
 """Intersection over union. Discs on the outline reach over it by about their standard deviation, half a pixel, and the
@@ -38,19 +40,8 @@ def surface_discs(vertices, faces, rng):
         orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
         scales=np.tile([spacing, spacing, 0.0], (SAMPLES, 1)),
         opacities=np.ones(SAMPLES),
+        normals=normals,
     )
-
-
-def finer(camera):
-    """The same view with smaller pixels."""
-    names = ("width", "height", "focal_x", "focal_y", "center_x", "center_y")
-    return replace(camera, **{name: FINER * getattr(camera, name) for name in names})
-
-
-def pixel_mean(image):
-    """Average the fine pixels of each pixel."""
-    height, width = image.shape
-    return image.reshape(height // FINER, FINER, width // FINER, FINER).mean(axis=(1, 3))
 
 
 def test_drawn_meshes_lie_on_the_truth(data_dir, rng):
@@ -62,10 +53,13 @@ def test_drawn_meshes_lie_on_the_truth(data_dir, rng):
     for record in records[:2]:
         truth = record.truth().channels
         coverage = truth["A"]
-        buffer = rasterize(cloud, finer(record.camera), channels=(), device="cpu")
-        alpha = pixel_mean(buffer.alpha)
-        depth = pixel_mean(buffer.alpha * buffer.depth) / np.maximum(alpha, 1e-6)
+        buffer = rasterize(cloud, record.camera.supersampled(FINER), channels=("normals",), device="cpu")
+        alpha = block_means(buffer.alpha, FINER)
+        depth = block_means(buffer.alpha * buffer.depth, FINER) / np.maximum(alpha, 1e-6)
+        normals = block_means(buffer.channels["normals"], FINER)
         solid = coverage > 0.999
+        known = record.truth().stack("normal.X", "normal.Y", "normal.Z")
+        assert np.median(angles_between(normals[solid], known[solid])) < MAX_NORMAL_ERROR, record.name
         assert (alpha[solid] > 0.99).mean() > 0.99
         assert np.median(np.abs(depth - truth["depth"])[solid]) < MAX_DEPTH_ERROR, record.name
         drawn, wanted = alpha > 0.5, coverage > 0.5

@@ -52,46 +52,30 @@ def test_the_buddha_has_no_masks(data_dir):
     assert report.is_reconstructable
 
 
-def drop_alpha(pixels):
-    return pixels[..., :3]
+def changed(channels, change):
+    def edit(pixels):
+        pixels[..., channels] = change(pixels[..., channels])
+
+    return edit
 
 
-def blacken(pixels):
-    pixels[..., :3] = 0
-
-
-def empty(pixels):
-    pixels[..., 3] = 0
-
-
-def fill(pixels):
-    pixels[..., 3] = 255
-
-
-def dim(pixels):
-    pixels[..., 3] //= 255
-
-
-def invert(pixels):
-    pixels[..., 3] = 255 - pixels[..., 3]
-
-
-def darken(pixels):
-    pixels[..., :3] //= 2  # of sRGB: 2.3 stops
+COLOR, ALPHA = slice(0, 3), 3
+blacken = changed(COLOR, np.zeros_like)
+darken = changed(COLOR, lambda color: color // 2)  # of sRGB: 2.3 stops
 
 
 @pytest.mark.parametrize(
     ("change", "pattern", "code", "severity"),
     [
-        (drop_alpha, "*/*", "no-coverage", "warning"),
-        (drop_alpha, "c03/*", "some-coverage", "warning"),
+        (lambda pixels: pixels[..., :3], "*/*", "no-coverage", "warning"),
+        (lambda pixels: pixels[..., :3], "c03/*", "some-coverage", "warning"),
         (blacken, "c03/*", "black-image", "warning"),
         (blacken, "*/*", "black-image", "error"),
-        (empty, "c03/0001.png", "empty-mask", "warning"),
-        (empty, "*/*", "empty-mask", "error"),
-        (fill, "c03/*", "full-mask", "warning"),
-        (dim, "c03/*", "mask-range", "error"),
-        (invert, "c03/*", "inverted-mask", "warning"),
+        (changed(ALPHA, np.zeros_like), "c03/0001.png", "empty-mask", "warning"),
+        (changed(ALPHA, np.zeros_like), "*/*", "empty-mask", "error"),
+        (changed(ALPHA, lambda _: 255), "c03/*", "full-mask", "warning"),
+        (changed(ALPHA, lambda alpha: alpha // 255), "c03/*", "mask-range", "error"),
+        (changed(ALPHA, lambda alpha: 255 - alpha), "c03/*", "inverted-mask", "warning"),
         (darken, "c03/*", "camera-exposure", "warning"),
         (darken, "c03/0001.png", "frame-exposure", "warning"),
         (darken, "*/0002.png", "frame-exposure", "warning"),
@@ -100,10 +84,10 @@ def darken(pixels):
 )
 def test_faults_of_images(tmp_path, change, pattern, code, severity):
     write_sound(tmp_path)
-    changed = sorted((tmp_path / "images").glob(pattern))
-    for path in changed:
+    paths = sorted((tmp_path / "images").glob(pattern))
+    for path in paths:
         rewrite(path, change)
-    bare = {"frame-without-images"} if len(changed) == CAMERAS * FRAMES and severity == "error" else set()
+    bare = {"frame-without-images"} if len(paths) == CAMERAS * FRAMES and severity == "error" else set()
     assert codes(tmp_path) == {code} | bare
     finding = found(tmp_path, code)
     assert finding.severity == severity
@@ -316,8 +300,8 @@ def test_mistakes_in_the_poses_of_the_captures_are_told_apart(data_dir, name):
     }
     assert likely_mistakes(cameras) == ()
     for told, wrong in wrongs.items():
-        changed = [replace(camera, camera_to_world=wrong(camera.camera_to_world)) for camera in cameras]
-        assert [mistake[: len(told)] for mistake in likely_mistakes(changed)] == [told]
+        turned = [replace(camera, camera_to_world=wrong(camera.camera_to_world)) for camera in cameras]
+        assert [mistake[: len(told)] for mistake in likely_mistakes(turned)] == [told]
 
 
 def test_the_common_volume_is_what_is_seen():

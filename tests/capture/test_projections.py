@@ -116,27 +116,22 @@ def test_what_is_no_pinhole_is_refused(tmp_path, change, message):
         Capture.read(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["a b c d e f g h i j k l", "nan " * 12, "1 " * 13])
-def test_a_damaged_matrix_is_named(tmp_path, text):
-    write(tmp_path, [matrix_of(rig()[0])])
-    (tmp_path / "000_P.txt").write_text(text)
-    with pytest.raises(AssetFormatError, match=r"matrix must be 3 rows of 4 finite numbers, got .*000_P\.txt"):
-        Capture.read(tmp_path)
-
-
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("name", "text", "message"),
     [
-        ("{", "options must be JSON"),
-        ('{"scael": 2}', "options must be a JSON object of scale, pixel_centers, color_space"),
-        ('{"scale": 0}', r"scale must be a number in \[0.001, 1000\], got 0"),
-        ('{"pixel_centers": 3}', "pixel_centers must be half or integer"),
-        ('{"color_space": "x"}', "color_space must be one of srgb, linear"),
+        ("000_P.txt", "a b c d e f g h i j k l", r"matrix must be 3 rows of 4 finite numbers, got .*000_P\.txt"),
+        ("000_P.txt", "nan " * 12, r"matrix must be 3 rows of 4 finite numbers, got .*000_P\.txt"),
+        ("000_P.txt", "1 " * 13, r"matrix must be 3 rows of 4 finite numbers, got .*000_P\.txt"),
+        ("capture.json", "{", "options must be JSON"),
+        ("capture.json", '{"scael": 2}', "options must be a JSON object of scale, pixel_centers, color_space"),
+        ("capture.json", '{"scale": 0}', r"scale must be a number in \[0.001, 1000\], got 0"),
+        ("capture.json", '{"pixel_centers": 3}', "pixel_centers must be half or integer"),
+        ("capture.json", '{"color_space": "x"}', "color_space must be one of srgb, linear"),
     ],
 )
-def test_broken_options_are_named(tmp_path, options, message):
+def test_damaged_files_are_named(tmp_path, name, text, message):
     write(tmp_path, [matrix_of(rig()[0])])
-    (tmp_path / "capture.json").write_text(options)
+    (tmp_path / name).write_text(text)
     with pytest.raises(AssetFormatError, match=message):
         Capture.read(tmp_path)
 

@@ -17,6 +17,9 @@ BARREL = Lens((-0.25, 0.08, -0.01, 0.002, 0.001, -0.0015))
 PINCUSHION = Lens((0.2, -0.03, 0.01, 0.0, -0.002, 0.001))
 FISHEYE = Lens((-0.03, 0.005, -0.002, 0.0003, 0.0, 0.0), "OPENCV_FISHEYE")
 EQUIDISTANT = Lens(model="OPENCV_FISHEYE")
+NEARLY_STRAIGHT = Lens((1e-12, 0, 0, 0, 0, 0))
+"""No pixel moves by a float32 rounding of its position: filters run, not the shortcut of a straight lens."""
+
 LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fisheye": FISHEYE, "equidistant": EQUIDISTANT}
 
 
@@ -34,6 +37,10 @@ def edges_and_inside(photograph):
 def image_of(channels, *, color_space=LINEAR_REC709, premultiplied=True):
     arrays = {name: np.asarray(array, np.float32) for name, array in channels.items()}
     return Image(Path("photo.exr"), arrays, color_space, premultiplied)
+
+
+def grey(plane):
+    return dict.fromkeys("RGB", plane)
 
 
 def pixel_centers(intrinsics):
@@ -204,8 +211,7 @@ class TestImage:
         assert undistortion.image(photo) is photo
 
     def test_whole_pixels_are_copied_bit_by_bit(self, rng):
-        # A lens so weak that no pixel moves by a float32 rounding of its position: filters, not the shortcut, run.
-        undistortion = Undistortion(Lens((1e-12, 0, 0, 0, 0, 0)), PHOTOGRAPH, PHOTOGRAPH)
+        undistortion = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, PHOTOGRAPH)
         alpha = rng.uniform(0.1, 1.0, (120, 160))
         values = rng.normal(size=(120, 160))
         result = undistortion.image(image_of({"R": values, "G": -values, "B": values**2, "A": alpha}))
@@ -216,7 +222,7 @@ class TestImage:
         undistortion = Undistortion.fit(lens, PHOTOGRAPH)
         where = positions(undistortion)
         ramp = 3.0 + (pixel_centers(PHOTOGRAPH) * [0.5, -0.25]).sum(axis=-1)
-        result = undistortion.image(image_of({"R": ramp, "G": ramp, "B": ramp, "depth": ramp}))
+        result = undistortion.image(image_of({**grey(ramp), "depth": ramp}))
         inner = ((where > 2.0) & (where < np.array(PHOTOGRAPH[:2]) - 2.0)).all(axis=-1)
         assert inner.mean() > 0.85
         expected = 3.0 + (where * [0.5, -0.25]).sum(axis=-1)
@@ -227,21 +233,16 @@ class TestImage:
     def test_cubic_keeps_detail_that_averaging_neighbours_loses(self):
         # Half a pixel off, the cubic leaves 0.884 of a wave of four pixels and linear interpolation 0.707.
         shifted = PHOTOGRAPH._replace(center_x=PHOTOGRAPH.center_x + 0.5)
-        wave = np.tile([1.0, 1.0, 2.0, 2.0], 40) * np.ones((120, 1))  # samples of 1.5 + 0.7071 cos at odd eighths
-        result = Undistortion(Lens((1e-12, 0, 0, 0, 0, 0)), PHOTOGRAPH, shifted).image(
-            image_of({"R": wave, "G": wave, "B": wave, "x": wave})
-        )
-        swing = {name: np.ptp(result.channels[name][60, 4:-4]) for name in ("R", "x")}
-        assert swing["x"] == pytest.approx(1.0, abs=1e-4)  # it reads two equal neighbours at its peaks
-        # The cubic would go to 9/8 of the half swing, but nothing leaves the range of what was read.
-        assert swing["R"] == pytest.approx(1.0, abs=1e-4)
-        three = np.tile([0.0, 1.0, 0.0, -1.0], 40) * np.ones((120, 1))
-        result = Undistortion(Lens((1e-12, 0, 0, 0, 0, 0)), PHOTOGRAPH, shifted).image(
-            image_of({"R": three, "G": three, "B": three, "x": three})
-        )
-        swing = {name: np.ptp(result.channels[name][60, 4:-4]) for name in ("R", "x")}
-        assert swing["x"] == pytest.approx(1.0, abs=1e-4)
-        assert swing["R"] == pytest.approx(2 * 0.625, abs=1e-4)
+        for samples, swing in (
+            # Samples of 1.5 + 0.7071 cos at odd eighths. The cubic would go to 9/8 of the half swing, but nothing
+            # leaves the range of what was read.
+            ([1.0, 1.0, 2.0, 2.0], 1.0),
+            ([0.0, 1.0, 0.0, -1.0], 2 * 0.625),
+        ):
+            wave = np.tile(samples, 40) * np.ones((120, 1))
+            result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, shifted).image(image_of({**grey(wave), "x": wave}))
+            assert np.ptp(result.channels["x"][60, 4:-4]) == pytest.approx(1.0, abs=1e-4)
+            assert np.ptp(result.channels["R"][60, 4:-4]) == pytest.approx(swing, abs=1e-4)
 
     @pytest.mark.parametrize("color_space", [LINEAR_REC709, DISPLAY_SRGB])
     @pytest.mark.parametrize("premultiplied", [True, False])
@@ -271,7 +272,7 @@ class TestImage:
         shifted = PHOTOGRAPH._replace(center_x=PHOTOGRAPH.center_x + 0.5)
         step = np.where(np.arange(160) < 80, 0.0, 1.0) * np.ones((120, 1))
         photo = image_of({"Y": step}, color_space=DISPLAY_SRGB, premultiplied=False)
-        result = Undistortion(Lens((1e-12, 0, 0, 0, 0, 0)), PHOTOGRAPH, shifted).image(photo)
+        result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, shifted).image(photo)
         assert result.channels["Y"][60, 80] == pytest.approx(float(linear_to_srgb(0.5)), abs=1e-5)
 
     def test_data_are_means_over_what_is_covered(self):
@@ -299,7 +300,7 @@ class TestImage:
         values = np.ones((120, 160))
         values[60, 80] = np.nan
         values[30, 40] = np.inf
-        result = undistortion.image(image_of({"R": values, "G": values, "B": values})).channels["R"]
+        result = undistortion.image(image_of(grey(values))).channels["R"]
         assert (result[~undistortion.mask()] == 0.0).all()
         assert 2 <= (~np.isfinite(result)).sum() <= 50
         assert (result[undistortion.mask() & np.isfinite(result)] == 1.0).all()
@@ -308,8 +309,8 @@ class TestImage:
         # A board of single pixels, drawn at half its size: every pixel is a mean, none is black or white.
         board = np.indices((120, 160)).sum(axis=0) % 2
         small = PHOTOGRAPH._replace(focal_x=75.0, focal_y=70.0)
-        undistortion = Undistortion(Lens((1e-12, 0, 0, 0, 0, 0)), PHOTOGRAPH, small)
-        result = undistortion.image(image_of({"R": board, "G": board, "B": board})).channels["R"]
+        undistortion = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, small)
+        result = undistortion.image(image_of(grey(board))).channels["R"]
         inner = undistortion.mask()
         assert 0.2 < inner.mean() < 0.3
         np.testing.assert_allclose(result[inner], 0.5, atol=1e-3)
@@ -342,7 +343,7 @@ class TestImage:
         bands = np.searchsorted(edges, x * np.cos(tilt) + y * np.sin(tilt)) % 2
         photo = gaussian_filter(bands.reshape(120, n, 160, n).mean(axis=(1, 3)), 1.0)
         undistortion = Undistortion.fit(lens, PHOTOGRAPH)
-        result = undistortion.image(image_of({"R": photo, "G": photo, "B": photo})).channels["R"]
+        result = undistortion.image(image_of(grey(photo))).channels["R"]
         pinhole = undistortion.pinhole
         found, bowed = [], []
         for values, off in ((result, found), (photo, bowed)):

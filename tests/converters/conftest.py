@@ -67,6 +67,17 @@ def ply_bytes():
 
 
 @pytest.fixture
+def ply_file(ply_bytes, tmp_path):
+    """A function that writes columns as ``a.ply``, with the options of `ply_bytes`, and returns its path."""
+
+    def make(columns, **options):
+        (tmp_path / "a.ply").write_bytes(ply_bytes(columns, **options))
+        return tmp_path / "a.ply"
+
+    return make
+
+
+@pytest.fixture
 def columns():
     """Columns of three sound Gaussians in the training layout, without spherical harmonics above the mean."""
     return {

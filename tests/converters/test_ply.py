@@ -144,9 +144,8 @@ def test_round_trip(tmp_path_factory, make_cloud, positions, radiance, scales, o
 
 
 @pytest.mark.parametrize(("order", "newline"), [("<", "\r\n"), (">", "\n")])
-def test_byte_orders_and_line_ends(columns, ply_bytes, tmp_path, order, newline):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, order=order, newline=newline, comments=["made by hand"]))
-    cloud = converters.read(tmp_path / "a.ply")[0]
+def test_byte_orders_and_line_ends(columns, ply_file, order, newline):
+    cloud = converters.read(ply_file(columns, order=order, newline=newline, comments=["made by hand"]))[0]
     assert np.array_equal(cloud.positions, [[0, 0, 3], [1, -1, 2], [2, 0.5, 1]])
     assert np.array_equal(cloud.orientations, [[0, 0, 0, 1], [1, 0, 0, 0], [0, 0, 0, 1]])  # w last, normalised
     assert np.allclose(cloud.opacities, [0.119202922, 0.5, 0.952574127], rtol=EPSILON)
@@ -183,11 +182,10 @@ def test_ascii_after_other_elements(columns, tmp_path):
     assert np.array_equal(converters.read(tmp_path / "a.ply")[0].positions[:, 0], [0, 1, 2])
 
 
-def test_flat_gaussians_and_missing_colour(columns, ply_bytes, tmp_path):
+def test_flat_gaussians_and_missing_colour(columns, ply_file, tmp_path):
     for name in ("scale_2", "f_dc_0", "f_dc_1", "f_dc_2"):
         del columns[name]
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    sequence = converters.read(tmp_path / "a.ply")
+    sequence = converters.read(ply_file(columns))
     assert np.array_equal(sequence[0].scales[:, 2], [0, 0, 0])
     assert sequence[0].radiance is None
     assert notes_of(sequence)[:2] == [
@@ -201,9 +199,8 @@ def test_flat_gaussians_and_missing_colour(columns, ply_bytes, tmp_path):
     assert back.scales[:, 2].max() == np.float32(np.exp(-30.0))
 
 
-def test_no_gaussians(columns, ply_bytes, tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply_bytes({name: [] for name in columns}))
-    sequence = converters.read(tmp_path / "a.ply")
+def test_no_gaussians(columns, ply_file, tmp_path):
+    sequence = converters.read(ply_file({name: [] for name in columns}))
     assert len(sequence[0]) == 0
     assert notes_of(sequence)[-1] == "holds no Gaussians"
     converters.write(sequence, tmp_path / "b.ply")
@@ -287,17 +284,16 @@ def test_nothing_is_said_of_drawing_without_a_word(make_cloud, columns, ply_byte
 
 
 @pytest.mark.parametrize("text", ["sharp 0.1", "antialiased", "classic nan"])
-def test_a_filter_that_is_none_is_refused(columns, ply_bytes, tmp_path, text):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=[f"beam_raster {text}"]))
+def test_a_filter_that_is_none_is_refused(columns, ply_file, text):
+    path = ply_file(columns, comments=[f"beam_raster {text}"])
     with pytest.raises(AssetFormatError, match=r"a\.ply: beam_raster('s low-pass)? must be"):
-        converters.read(tmp_path / "a.ply")
+        converters.read(path)
 
 
-def test_linear_files_are_read_when_told(columns, ply_bytes, tmp_path):
+def test_linear_files_are_read_when_told(columns, ply_file, tmp_path):
     columns |= {"opacity": [0.25, 0.5, 1.0]}
     columns |= {f"scale_{i}": [0.01, 0.02, 0.03] for i in range(3)}
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    cloud = converters.read(tmp_path / "a.ply", activation="linear")[0]
+    cloud = converters.read(ply_file(columns), activation="linear")[0]
     assert np.array_equal(cloud.opacities, np.float32([0.25, 0.5, 1.0]))
     assert np.array_equal(cloud.scales[:, 0], np.float32([0.01, 0.02, 0.03]))
     assert np.allclose(converters.read(tmp_path / "a.ply", activation="log")[0].scales[0], np.exp(0.01))
@@ -311,12 +307,11 @@ def test_linear_files_are_read_when_told(columns, ply_bytes, tmp_path):
         ("irgs", "IRGS", ("base_color", "metallic"), 0.03 + 0.77 * 0.5, 0.5),
     ],
 )
-def test_materials_of_other_producers(columns, ply_bytes, tmp_path, activation, producer, names, base, rough):
+def test_materials_of_other_producers(columns, ply_file, tmp_path, activation, producer, names, base, rough):
     zeros, ones = [0.0] * 3, [1.0] * 3
     columns |= {f"{names[0]}_{i}": zeros for i in range(3)} | {"roughness": zeros}
     columns |= {f"{names[1]}_{i}": ones for i in range(3)} | ({"metallic": zeros} if activation == "irgs" else {})
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    sequence = converters.read(tmp_path / "a.ply")
+    sequence = converters.read(ply_file(columns))
     assert sequence[0].base_color is None
     assert sequence.metadata["producer"] == f"{producer}, by its property names"
     assert any(
@@ -336,27 +331,25 @@ def test_mesh2splat_is_named(columns, ply_bytes, tmp_path):
     assert converters.inspect(tmp_path / "a.ply").producer == "mesh2splat, by its property names"
 
 
-def test_materials_that_are_not_there(columns, ply_bytes, tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+def test_materials_that_are_not_there(columns, ply_file):
+    path = ply_file(columns)
     with pytest.raises(
         AssetFormatError, match=r"a\.ply: materials of gsir must have albedo_0, .* no material channels"
     ):
-        converters.read(tmp_path / "a.ply", material_activation="gsir")
+        converters.read(path, material_activation="gsir")
 
 
-def test_normals_zero_in_part_are_left_out(columns, ply_bytes, tmp_path):
+def test_normals_zero_in_part_are_left_out(columns, ply_file):
     columns |= {"nx": [0.0, 2.0, 0.0], "ny": [0.0, 0.0, 1.0], "nz": [0.0, 0.0, 0.0]}
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    sequence = converters.read(tmp_path / "a.ply")
+    sequence = converters.read(ply_file(columns))
     assert sequence[0].normals is None
     assert "normals left out: 1 of 3 are zero or not finite" in notes_of(sequence)
 
 
-def test_invalid_rows_are_dropped_on_request(columns, ply_bytes, tmp_path):
+def test_invalid_rows_are_dropped_on_request(columns, ply_file):
     columns["x"][0] = np.nan
     columns["rot_0"][2] = 0.0
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    sequence = converters.read(tmp_path / "a.ply", drop_invalid=True)
+    sequence = converters.read(ply_file(columns), drop_invalid=True)
     assert np.array_equal(sequence[0].positions, [[1, -1, 2]])
     assert "2 of 3 Gaussians dropped: not finite, or zero quaternions" in notes_of(sequence)
 
@@ -367,10 +360,10 @@ def test_a_beam_profile_needs_materials(make_cloud, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_later_schema_is_refused(columns, ply_bytes, tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["beam_schema 2.0"]))
+def test_a_later_schema_is_refused(columns, ply_file):
+    path = ply_file(columns, comments=["beam_schema 2.0"])
     with pytest.raises(SchemaVersionError, match=r"beam_schema must be 1\.x, got 2\.0\. Update beam-warp"):
-        converters.read(tmp_path / "a.ply")
+        converters.read(path)
 
 
 def test_files_too_large_for_importers_are_refused(make_cloud, tmp_path, monkeypatch):
@@ -385,7 +378,9 @@ def test_a_full_disk_leaves_nothing(make_cloud, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("beam_warp.converters.ply_writer._row_source", lambda *_: full)
-    with pytest.raises(OutputError, match=r"output must be writable, got No space left on device at .*Free space"):
+    with pytest.raises(
+        OutputError, match=r"output must be a writable file, got .*a\.ply \(.*No space left on device\)"
+    ):
         write(make_cloud(), tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
 

@@ -150,9 +150,11 @@ def test_bad_values(columns, ply_bytes, tmp_path, name, values, message):
     refused(tmp_path, ply_bytes(columns | {name: values}), message)
 
 
-def test_doubles_beyond_float_are_not_finite(columns, ply_bytes, tmp_path):
+def test_doubles_beyond_float_and_materials_out_of_range(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns | {"x": [1e300, 0.0, 0.0]}, types={"x": "double"})
     refused(tmp_path, content, "positions must be finite, got NaN or infinity at row 0.")
+    content = ply_bytes(columns | {"roughness": [0.0, 1.5, 0.0]}, comments=["beam_material linear"])
+    refused(tmp_path, content, "roughness must lie in [0, 1], got 1.5 at row 1.")
 
 
 def test_files_that_look_linear(columns, ply_bytes, tmp_path):
@@ -181,11 +183,6 @@ def test_files_that_look_linear(columns, ply_bytes, tmp_path):
 )
 def test_wrong_statements(columns, ply_bytes, tmp_path, comment, message):
     refused(tmp_path, ply_bytes(columns, comments=[comment]), message)
-
-
-def test_materials_out_of_range(columns, ply_bytes, tmp_path):
-    content = ply_bytes(columns | {"roughness": [0.0, 1.5, 0.0]}, comments=["beam_material linear"])
-    refused(tmp_path, content, "roughness must lie in [0, 1], got 1.5 at row 1.")
 
 
 @pytest.mark.parametrize(

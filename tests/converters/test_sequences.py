@@ -1,6 +1,7 @@
 """Folders of numbered files, USD as a row of the table, and what an inspection says."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_inspection_of_a_person(data_dir):
     text = found.as_text()
     assert "Gaussians   152,746" in text
     assert "size [m]    1.036 × 3.180 × 1.146" in text
-    assert json.loads(json.dumps(found.as_json(), allow_nan=False))["opacities"]["greatest"] == 1.0
+    assert json.loads(json.dumps(asdict(found), allow_nan=False))["opacities"]["greatest"] == 1.0
 
 
 def test_inspection_of_our_own_sequence(make_cloud, tmp_path):

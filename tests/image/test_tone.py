@@ -46,13 +46,11 @@ class TestEveryTransform:
 
     @pytest.mark.parametrize("hue", [(1.0, 0.0, 0.0), (0.2, 1.0, 0.1), (0.0, 0.1, 1.0)])
     def test_every_channel_grows_with_exposure(self, transform, hue):
+        shown = display_linear((np.array(hue) * 2.0 ** np.linspace(-12.0, 8.0, 300)[:, None])[None], transform)[0]
         if transform in ("agx", "neutral"):  # these trade saturation for brightness: their sum grows
-            light = np.array(hue) * 2.0 ** np.linspace(-12.0, 8.0, 300)[:, None]
-            total = display_linear(light[None], transform)[0].astype(np.float64).sum(axis=-1)
-            assert (np.diff(total) >= -3 * FLOAT32).all()
+            assert (np.diff(shown.astype(np.float64).sum(axis=-1)) >= -3 * FLOAT32).all()
         else:
-            light = np.array(hue) * 2.0 ** np.linspace(-12.0, 8.0, 300)[:, None]
-            assert (np.diff(display_linear(light[None], transform)[0], axis=0) >= 0.0).all()
+            assert (np.diff(shown, axis=0) >= 0.0).all()
 
     def test_exposure_comes_before_the_curve(self, transform, rng):
         light = rng.uniform(0.0, 2.0, (3, 4, 3)).astype(np.float32)
@@ -160,11 +158,7 @@ class TestAlpha:
         (lambda: display(row((0, 0, 0)), "agx", np.nan), InvalidOptionError, "exposure_stops must be a number in"),
         (lambda: display_over(row((0, 0, 0)), [[1.5]]), InvalidArrayError, r"alpha must lie in \[0, 1\], got 1.5"),
         (lambda: display_over(row((0, 0, 0)), [[np.nan]]), InvalidArrayError, "alpha must lie in"),
-        (
-            lambda: display_over(row((0, 0, 0)), [[1.0]], background=(0, 2, 0)),
-            InvalidArrayError,
-            "background must lie in",
-        ),
+        (lambda: display_over(row((0, 0, 0)), [[1]], background=(0, 2, 0)), InvalidArrayError, "background must lie"),
     ],
 )
 def test_refusals(call, kind, message):

@@ -40,6 +40,12 @@ def read(path, **options):
     return read_usd_camera(path, trusted=True, **options)
 
 
+def saved(stage):
+    """Save a stage and read its camera."""
+    stage.Save()
+    return read(stage.GetRootLayer().realPath)
+
+
 def matrix_of(stage, prim="/World/Camera"):
     """The op to place a camera by."""
     return UsdGeom.Xformable(stage.GetPrimAtPath(prim)).AddTransformOp()
@@ -59,8 +65,7 @@ class TestPlace:
         UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World")).SetTranslate(Gf.Vec3d(100.0, 0.0, 0.0))
         # level, 2 m up and 3 m back from the origin, 1 m to the right: at rest it looks along -z, USD's forward
         UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World/Camera")).SetTranslate(Gf.Vec3d(0.0, 200.0, 300.0))
-        stage.Save()
-        got = read(tmp_path / "a.usda").camera_at(0.0, 360, 240)
+        got = saved(stage).camera_at(0.0, 360, 240)
         fov = 2.0 * np.degrees(np.arctan(12.0 / 50.0))
         hand = Camera.look_at((1.0, -3.0, 2.0), (1.0, 0.0, 2.0), width=360, height=240, vertical_fov=fov)
         np.testing.assert_allclose(got.camera_to_world, hand.camera_to_world, atol=1e-12)
@@ -72,8 +77,7 @@ class TestPlace:
         turn, position = Rotation.random(rng=rng), rng.normal(size=3)
         stage = author(tmp_path / "a.usda", up="Z", meters=1.0)
         matrix_of(stage).Set(rigid(turn, position))
-        stage.Save()
-        got = read(tmp_path / "a.usda").camera_at(3.0, 36, 24)
+        got = saved(stage).camera_at(3.0, 36, 24)
         np.testing.assert_allclose(got.camera_to_world[:3, :3], turn.as_matrix() @ OPENGL, atol=1e-12)
         np.testing.assert_allclose(got.position, position, atol=1e-12)
 
@@ -81,24 +85,20 @@ class TestPlace:
         stage = author(tmp_path / "a.usda", up="Z", meters=1.0)
         UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World")).SetScale(Gf.Vec3f(2.0, 2.0, 2.0))
         UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World/Camera")).SetTranslate(Gf.Vec3d(1.0, 0.0, 0.0))
-        stage.Save()
-        got = read(tmp_path / "a.usda").camera_at(0.0, 36, 24)
+        got = saved(stage).camera_at(0.0, 36, 24)
         np.testing.assert_allclose(got.camera_to_world[:3, :3], OPENGL, atol=1e-12)
         np.testing.assert_allclose(got.position, [2.0, 0.0, 0.0], atol=1e-12)
 
     def test_no_unit_is_a_note(self, tmp_path):
-        author(tmp_path / "a.usda", meters=None).Save()
-        assert read(tmp_path / "a.usda").notes == (
-            "a.usda: one unit is taken as 0.01 m, USD's default; it states none",
-        )
+        (note,) = saved(author(tmp_path / "a.usda", meters=None)).notes
+        assert note == "a.usda: one unit is taken as 0.01 m, USD's default; it states none"
 
 
 class TestLens:
     @pytest.mark.parametrize(("width", "height"), [(300, 200), (400, 200), (200, 400)])
     def test_offsets_as_openusd_has_them(self, tmp_path, rng, width, height):
         stage = author(tmp_path / "a.usda", horizontalApertureOffset=4.0, verticalApertureOffset=-3.0)
-        stage.Save()
-        ours = read(tmp_path / "a.usda").camera_at(0.0, width, height)
+        ours = saved(stage).camera_at(0.0, width, height)
         theirs = UsdGeom.Camera(stage.GetPrimAtPath("/World/Camera")).GetCamera(Usd.TimeCode.Default()).frustum
         projection = np.array(theirs.ComputeProjectionMatrix())  # for rows
         local = rng.normal((0.0, 0.0, -9.0), size=(30, 3))  # in USD's camera axes, which are the world's: y up
@@ -112,8 +112,7 @@ class TestLens:
         np.testing.assert_allclose(ours.project(world)[:, :2], expected, rtol=2.0**-20)
 
     def test_nothing_of_the_aperture_is_cut_off(self, tmp_path):
-        author(tmp_path / "a.usda").Save()
-        path = read(tmp_path / "a.usda")
+        path = saved(author(tmp_path / "a.usda"))
         assert path.aspect == 1.5
         assert path.camera_at(0.0, 150, 100).focal_x == pytest.approx(50.0 * 150.0 / 36.0)
         assert path.camera_at(0.0, 300, 100).focal_x == pytest.approx(50.0 * 100.0 / 24.0)
@@ -126,16 +125,9 @@ class TestTime:
         op = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Camera")).AddTranslateOp()
         op.Set(Gf.Vec3d(0.0, 0.0, 0.0), 101)
         op.Set(Gf.Vec3d(0.0, 8.0, 0.0), 113)
-        stage.Save()
-        path = read(tmp_path / "a.usda")
+        path = saved(stage)
         assert path.duration == 1.0
-        for time, y, focal in (
-            (-1.0, 0.0, 40.0),
-            (0.0, 0.0, 40.0),
-            (0.25, 4.0, 45.0),
-            (0.5, 8.0, 50.0),
-            (2.0, 8.0, 60.0),
-        ):
+        for time, y, focal in ((-1, 0, 40), (0, 0, 40), (0.25, 4, 45), (0.5, 8, 50), (2, 8, 60)):
             camera = path.camera_at(time, 360, 240)
             np.testing.assert_allclose(camera.position, [0.0, y, 0.0], atol=1e-12)
             assert camera.focal_x == pytest.approx(10.0 * focal, rel=2.0**-20)
@@ -145,8 +137,7 @@ class TestTime:
         op = UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddRotateZOp()
         op.Set(0.0, 0)
         op.Set(360.0, 10)
-        stage.Save()
-        got = read(tmp_path / "a.usda").camera_at(0.25, 36, 24)
+        got = saved(stage).camera_at(0.25, 36, 24)
         turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
         np.testing.assert_allclose(got.camera_to_world[:3, :3], turn @ OPENGL, atol=1e-7)
 
@@ -155,8 +146,7 @@ class TestTime:
         op = matrix_of(stage)
         for time, degrees in ((0, 0.0), (1, 90.0)):
             op.Set(rigid(Rotation.from_euler("x", degrees, degrees=True), (time, 0.0, 0.0)), time)
-        stage.Save()
-        got = read(tmp_path / "a.usda").camera_at(0.5, 36, 24)
+        got = saved(stage).camera_at(0.5, 36, 24)
         half = Rotation.from_euler("x", 45, degrees=True).as_matrix()
         np.testing.assert_allclose(got.camera_to_world[:3, :3], half @ OPENGL, atol=1e-12)
 
@@ -176,9 +166,8 @@ class TestMistakes:
         ],
     )
     def test_lenses_and_prims(self, tmp_path, changes, message):
-        author(tmp_path / "a.usda", **changes).Save()
         with pytest.raises(AssetFormatError) as caught:
-            read(tmp_path / "a.usda")
+            saved(author(tmp_path / "a.usda", **changes))
         assert str(caught.value).startswith(str(tmp_path / "a.usda"))
         assert message in str(caught.value)
 
@@ -196,9 +185,8 @@ class TestMistakes:
         op = matrix_of(stage)
         op.Set(Gf.Matrix4d(1.0), 0)
         op.Set(Gf.Matrix4d(matrix.tolist()), 5)
-        stage.Save()
         with pytest.raises(AssetFormatError) as caught:
-            read(tmp_path / "a.usda")
+            saved(stage)
         assert "/World/Camera at time 5 " in str(caught.value)
         assert message in str(caught.value)
 

@@ -29,6 +29,12 @@ def author(path, *, up="Z", meters=0.01, prim_path="/World/Scan/Points", **value
     return stage
 
 
+def saved(stage, **options):
+    """Save a stage and read it as an asset."""
+    stage.Save()
+    return read_asset(stage.GetRootLayer().realPath, trusted=True, **options)
+
+
 def points(rng, count=5):
     return (100.0 * rng.normal(size=(count, 3))).astype(np.float32)
 
@@ -81,8 +87,7 @@ def test_a_mirror_keeps_ellipsoids_and_colours(tmp_path, rng):
         radiance__sphericalHarmonicsCoefficients=harmonics.reshape(-1, 3),
     )
     UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan/Points")).AddScaleOp().Set((-1.0, 1.0, 1.0))
-    stage.GetRootLayer().Save()
-    cloud = read_asset(tmp_path / "a.usdc", trusted=True)[0]
+    cloud = saved(stage)[0]
     flip = np.diag([-1.0, 1.0, 1.0])
 
     def covariances(rotations):
@@ -95,8 +100,7 @@ def test_a_mirror_keeps_ellipsoids_and_colours(tmp_path, rng):
 
 
 def test_absent_arrays_take_the_defaults_of_usd(tmp_path, rng):
-    author(tmp_path / "a.usda", up=None, meters=None, positions=points(rng)).Save()
-    found = read_asset(tmp_path / "a.usda", trusted=True)
+    found = saved(author(tmp_path / "a.usda", up=None, meters=None, positions=points(rng)))
     cloud = found[0]
     assert cloud.axes == "rub"
     assert np.array_equal(cloud.orientations, np.tile([0, 0, 0, 1], (5, 1)))
@@ -108,22 +112,22 @@ def test_absent_arrays_take_the_defaults_of_usd(tmp_path, rng):
 
 def test_float_is_preferred_and_long_arrays_are_cut(tmp_path, rng):
     p = points(rng)
-    author(
+    stage = author(
         tmp_path / "a.usda",
         meters=1.0,
         positions=p,
         positionsh=Vt.Vec3hArray.FromNumpy(np.zeros((5, 3), np.float16)),
         opacities=np.linspace(0, 1, 9).astype(np.float32),
-    ).Save()
-    cloud = read_asset(tmp_path / "a.usda", trusted=True)[0]
+    )
+    cloud = saved(stage)[0]
     assert np.array_equal(cloud.positions, p)
     assert np.array_equal(cloud.opacities, np.linspace(0, 1, 9).astype(np.float32)[:5])
 
 
 def test_quaternions_are_normalised(tmp_path, rng):
     q = np.tile(np.float32([0, 0, 3, 4]), (5, 1))
-    author(tmp_path / "a.usda", positions=points(rng), orientations=q).Save()
-    assert np.allclose(read_asset(tmp_path / "a.usda", trusted=True)[0].orientations, [0, 0, 0.6, 0.8])
+    stage = author(tmp_path / "a.usda", positions=points(rng), orientations=q)
+    assert np.allclose(saved(stage)[0].orientations, [0, 0, 0.6, 0.8])
 
 
 def test_time_samples_are_frames(tmp_path, rng):
@@ -133,8 +137,7 @@ def test_time_samples_are_frames(tmp_path, rng):
     p = points(rng)
     for time in (10.0, 12.0, 14.0):
         attribute.Set(Vt.Vec3fArray.FromNumpy(p * np.float32(time)), time)
-    stage.Save()
-    found = read_asset(tmp_path / "a.usda", trusted=True)
+    found = saved(stage)
     assert (len(found), found.frames_per_second, found.topology) == (3, 12.0, "perFrame")
     assert np.array_equal(found[2].positions, p * np.float32(14.0))
     assert found.constant == frozenset()
@@ -145,8 +148,7 @@ def test_a_moving_transform_makes_frames(tmp_path, rng):
     op = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan")).AddTranslateOp()
     op.Set((0.0, 0.0, 0.0), 1.0)
     op.Set((1.0, 0.0, 0.0), 2.0)
-    stage.Save()
-    found = read_asset(tmp_path / "a.usda", trusted=True)
+    found = saved(stage)
     assert len(found) == 2
     assert np.allclose(found[1].positions - found[0].positions, [1.0, 0.0, 0.0], atol=1e-4)
     assert "positions" not in found.constant
@@ -163,8 +165,7 @@ def test_colour_space_comes_from_an_ancestor(tmp_path, rng, name, space):
         radiance__sphericalHarmonicsCoefficients=np.zeros((5, 3), np.float32),
     )
     Usd.ColorSpaceAPI.Apply(stage.GetPrimAtPath("/World/Scan")).CreateColorSpaceNameAttr(name)
-    stage.Save()
-    found = read_asset(tmp_path / "a.usda", trusted=True)
+    found = saved(stage)
     assert found[0].radiance_color_space == space
     assert "notes" not in found.metadata
 
@@ -176,12 +177,11 @@ def broken(match, error=AssetFormatError):
 def test_several_prims_are_named(tmp_path, rng):
     stage = author(tmp_path / "a.usda", positions=points(rng))
     UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Other")
-    stage.Save()
     with broken(r"must hold one Gaussian-splat prim, got /World/Scan/Points, /World/Other\. Pass one of them"):
-        read_asset(tmp_path / "a.usda", trusted=True)
-    assert len(read_asset(tmp_path / "a.usda", prim_path="/World/Scan/Points", trusted=True)[0]) == 5
+        saved(stage)
+    assert len(saved(stage, prim_path="/World/Scan/Points")[0]) == 5
     with broken(r"must hold a Gaussian-splat prim /World, got /World/Scan/Points"):
-        read_asset(tmp_path / "a.usda", prim_path="/World", trusted=True)
+        saved(stage, prim_path="/World")
 
 
 @pytest.mark.parametrize(("scale", "shear"), [((1.0, 1.0, 1.0), 0.5), ((0.0, 0.0, 0.0), 0.0)])
@@ -191,9 +191,8 @@ def test_only_similarities_are_applied(tmp_path, rng, scale, shear):
     matrix.SetScale(scale)
     matrix[1, 0] = shear
     UsdGeom.Xformable(stage.GetPrimAtPath("/World/Scan")).AddTransformOp().Set(matrix)
-    stage.Save()
     with broken(r"at time 0 must be placed by rotation, uniform scale and translation.* Bake the transform"):
-        read_asset(tmp_path / "a.usda", trusted=True)
+        saved(stage)
 
 
 def test_faults_of_arrays(tmp_path, rng):
@@ -214,9 +213,8 @@ def test_faults_of_arrays(tmp_path, rng):
         ({"positions": Vt.Vec3fArray([(0, 0, np.nan)])}, r"positions must be finite, got NaN or infinity at row 0"),
     ]
     for index, (values, match) in enumerate(cases):
-        author(tmp_path / f"{index}.usda", **values).Save()
         with broken(match):
-            read_asset(tmp_path / f"{index}.usda", trusted=True)
+            saved(author(tmp_path / f"{index}.usda", **values))
 
 
 def test_faults_of_files(tmp_path):
@@ -227,10 +225,8 @@ def test_faults_of_files(tmp_path):
     (tmp_path / "a.usdc").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     with broken(r"a.usdc must be a .usdc file, got the first bytes b'ply\\nform'"):
         read_asset(tmp_path / "a.usdc", trusted=True)
-    stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
-    stage.Save()
     with broken(r"must hold a ParticleField3DGaussianSplat, got none\. Convert the splats"):
-        read_asset(tmp_path / "empty.usda", trusted=True)
+        saved(Usd.Stage.CreateNew(str(tmp_path / "empty.usda")))
 
 
 def rewritten_version(path, version):

@@ -14,14 +14,17 @@ from beam_warp.world.harmonics import SH_C0
 
 
 @pytest.fixture
-def open_splats():
+def written(tmp_path):
+    """A function that writes a sequence, or clouds as one, and returns the prim of the splats."""
     stages = []
 
-    def open_one(path):
-        stages.append(Usd.Stage.Open(str(path)))
+    def write(source, name="a.usdc", **options):
+        sequence = GaussianSequence.from_clouds(source) if isinstance(source, list) else source
+        write_asset(sequence, tmp_path / name, **options)
+        stages.append(Usd.Stage.Open(str(tmp_path / name)))
         return stages[-1].GetPrimAtPath("/Asset/Splats")
 
-    return open_one
+    return write
 
 
 def names(folder):
@@ -33,20 +36,16 @@ def names(folder):
     [
         ("a.usda", 1, ["a.static.usdc", "a.usda"]),
         ("a.usda", 3, ["a.frames.usdc", "a.usda"]),
-        (
-            "a.usda",
-            70,
-            ["a.000000.usdc", "a.000030.usdc", "a.000060.usdc", "a.manifest.usda", "a.static.usdc", "a.usda"],
-        ),
+        ("a.usda", 70, [*(f"a.0000{n}0.usdc" for n in (0, 3, 6)), "a.manifest.usda", "a.static.usdc", "a.usda"]),
         ("a.usdc", 70, ["a.usdc"]),
         ("a.usdz", 70, ["a.usdz"]),
     ],
 )
 def test_files(tmp_path, sequence, name, frames, files):
-    written = write_asset(sequence(frames), tmp_path / name)
+    paths = write_asset(sequence(frames), tmp_path / name)
     assert names(tmp_path) == files
-    assert sorted(path.name for path in written) == files
-    assert written[-1].name == name
+    assert sorted(path.name for path in paths) == files
+    assert paths[-1].name == name
 
 
 def test_text_layers_stay_small(tmp_path, sequence):
@@ -54,9 +53,8 @@ def test_text_layers_stay_small(tmp_path, sequence):
     assert max(path.stat().st_size for path in tmp_path.glob("*.usda")) < 3000
 
 
-def test_one_precision_and_constants_once(tmp_path, sequence, open_splats):
-    write_asset(sequence(3), tmp_path / "a.usdc")
-    prim = open_splats(tmp_path / "a.usdc")
+def test_one_precision_and_constants_once(sequence, written):
+    prim = written(sequence(3))
     arrays = {a.GetName(): a.GetNumTimeSamples() for a in prim.GetAuthoredAttributes() if a.GetTypeName().isArray}
     assert arrays == {
         "beam:ambientOcclusionErrorh": 0,
@@ -91,35 +89,27 @@ def test_one_precision_and_constants_once(tmp_path, sequence, open_splats):
         ("ambient_occlusion_error", 1e-9, "beam:ambientOcclusionErrorh"),  # absolutely small is small enough
     ],
 )
-def test_half_only_where_it_is_safe(tmp_path, cloud, open_splats, channel, value, usd_name):
+def test_half_only_where_it_is_safe(cloud, written, channel, value, usd_name):
     base = cloud()
     array = base.arrays()[channel].copy()
     array.flat[0] = value
     moved = base.with_arrays(**{channel: array}, positions=base.positions + 1.0)
     # The second frame decides for both: an attribute has one precision.
-    write_asset(GaussianSequence.from_clouds([base, moved]), tmp_path / "a.usdc")
-    prim = open_splats(tmp_path / "a.usdc")
-    written = [name for name in (usd_name.removesuffix("h"), usd_name.removesuffix("h") + "h") if has(prim, name)]
-    assert written == [usd_name]
+    prim = written([base, moved])
+    variants = (usd_name.removesuffix("h"), usd_name.removesuffix("h") + "h")
+    assert [name for name in variants if prim.GetAttribute(name).HasAuthoredValue()] == [usd_name]
 
 
-def has(prim, name):
-    return prim.GetAttribute(name).HasAuthoredValue()
-
-
-def test_loose_quaternions_are_normalised_before_half(tmp_path, cloud, open_splats):
+def test_loose_quaternions_are_normalised_before_half(cloud, written):
     base = cloud()
-    write_asset(
-        GaussianSequence.from_clouds([base.with_arrays(orientations=base.orientations * 1.0009)]), tmp_path / "a.usdc"
-    )
-    stored = np.asarray(open_splats(tmp_path / "a.usdc").GetAttribute("orientationsh").Get()).astype(np.float64)
+    prim = written([base.with_arrays(orientations=base.orientations * 1.0009)])
+    stored = np.asarray(prim.GetAttribute("orientationsh").Get()).astype(np.float64)
     assert np.abs(np.linalg.norm(stored, axis=1) - 1.0).max() <= 2.0**-11  # four components, each off by 2^-12
 
 
-def test_stand_in_radiance_is_encoded_base_colour_times_occlusion(tmp_path, cloud, open_splats):
+def test_stand_in_radiance_is_encoded_base_colour_times_occlusion(cloud, written):
     grey = cloud(count=2, degree=None, base_color=[[0.5, 0.25, 0.002]] * 2, ambient_occlusion=[1.0, 0.5])
-    write_asset(GaussianSequence.from_clouds([grey]), tmp_path / "a.usdc", full_float=True)
-    prim = open_splats(tmp_path / "a.usdc")
+    prim = written([grey], full_float=True)
     shown = 0.5 + SH_C0 * np.asarray(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get())
     # sRGB of .5, .25, .125 (IEC 61966-2-1), and the linear toe 12.92 x below .0031308
     wanted = [[0.735357, 0.537099, 0.02584], [0.537099, 0.388573, 0.01292]]
@@ -129,16 +119,15 @@ def test_stand_in_radiance_is_encoded_base_colour_times_occlusion(tmp_path, clou
     assert prim.GetAttribute("colorSpace:name").Get() == "srgb_rec709_display"
 
 
-def test_harmonics_are_contiguous_triplets_padded_to_one_degree(tmp_path, cloud, open_splats):
+def test_harmonics_are_contiguous_triplets_padded_to_one_degree(cloud, written):
     low, high = cloud(0, 2, degree=0), cloud(1, 2, degree=1)
-    write_asset(GaussianSequence.from_clouds([low, high]), tmp_path / "a.usdc", full_float=True)
-    attribute = open_splats(tmp_path / "a.usdc").GetAttribute("radiance:sphericalHarmonicsCoefficients")
+    attribute = written([low, high], full_float=True).GetAttribute("radiance:sphericalHarmonicsCoefficients")
     assert np.array_equal(np.asarray(attribute.Get(1)), high.radiance.reshape(-1, 3))
     assert np.array_equal(np.asarray(attribute.Get(0))[[0, 4]], low.radiance[:, 0])
     assert not np.asarray(attribute.Get(0))[[1, 2, 3, 5, 6, 7]].any()
 
 
-def test_extent_is_three_sigma_of_each_frame(tmp_path, cloud, open_splats):
+def test_extent_is_three_sigma_of_each_frame(cloud, written):
     half = np.sqrt(0.5)
     turned = cloud(
         count=1,
@@ -146,28 +135,25 @@ def test_extent_is_three_sigma_of_each_frame(tmp_path, cloud, open_splats):
         scales=[[0.1, 0.2, 0.3]],
         orientations=[[0.0, 0.0, half, half]],  # a quarter turn about z swaps x and y
     )
-    write_asset(GaussianSequence.from_clouds([turned]), tmp_path / "a.usdc")
-    extent = np.asarray(open_splats(tmp_path / "a.usdc").GetAttribute("extent").Get())
+    extent = np.asarray(written([turned]).GetAttribute("extent").Get())
     assert np.abs(extent - [[0.4, 1.7, 2.1], [1.6, 2.3, 3.9]]).max() < 1e-6
 
 
 @pytest.mark.parametrize("frames", [4, 65])
-def test_quaternions_keep_their_sign_over_time(tmp_path, cloud, open_splats, frames):
+def test_quaternions_keep_their_sign_over_time(cloud, written, frames):
     base = cloud()
     clouds = [
         base.with_arrays(orientations=base.orientations * (-1) ** frame, positions=base.positions + frame)
         for frame in range(frames)
     ]
-    write_asset(GaussianSequence.from_clouds(clouds), tmp_path / "a.usda", segment_length=30)
-    attribute = open_splats(tmp_path / "a.usda").GetAttribute("orientationsh")
+    attribute = written(clouds, "a.usda", segment_length=30).GetAttribute("orientationsh")
     first = np.asarray(attribute.Get(0))
     assert all(np.array_equal(np.asarray(attribute.Get(frame)), first) for frame in range(frames))
 
 
-def test_display_colour_is_the_mean_weighted_by_opacity(tmp_path, cloud, open_splats):
+def test_display_colour_is_the_mean_weighted_by_opacity(cloud, written):
     two = cloud(count=2, base_color=[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], opacities=[0.75, 0.25])
-    write_asset(GaussianSequence.from_clouds([two]), tmp_path / "a.usdc")
-    color = np.asarray(open_splats(tmp_path / "a.usdc").GetAttribute("primvars:displayColor").Get())
+    color = np.asarray(written([two]).GetAttribute("primvars:displayColor").Get())
     assert np.allclose(color, [[0.75, 0.0, 0.25]])
 
 
@@ -236,19 +222,18 @@ def test_a_package_that_would_reach_the_limit_is_refused_in_advance(tmp_path, se
     assert names(tmp_path) == []
 
 
-def refused(match):
-    return pytest.raises(BeamError, match=match)
-
-
-def test_bad_targets(tmp_path, sequence):
-    with refused(r"path must end in .usda, .usdc, .usdz, got 'a.ply'"):
-        write_asset(sequence(1), tmp_path / "a.ply")
-    with refused(r"path must name a file without .* got 'a\[1\].usda'\. Rename it"):
-        write_asset(sequence(1), tmp_path / "a[1].usda")
-    with refused(r"none must be a folder that can be written, got No such file or directory"):
-        write_asset(sequence(1), tmp_path / "none" / "a.usda")
-    with refused(r"segment_length must be an integer in \[1"):
-        write_asset(sequence(1), tmp_path / "a.usda", segment_length=0)
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.ply", {}, r"path must end in .usda, .usdc, .usdz, got 'a.ply'"),
+        ("a[1].usda", {}, r"path must name a file without .* got 'a\[1\].usda'\. Rename it"),
+        ("none/a.usda", {}, r"none must be a folder that can be written, got No such file or directory"),
+        ("a.usda", {"segment_length": 0}, r"segment_length must be an integer in \[1"),
+    ],
+)
+def test_bad_targets(tmp_path, sequence, name, options, message):
+    with pytest.raises(BeamError, match=message):
+        write_asset(sequence(1), tmp_path / name, **options)
 
 
 def test_bad_sequences(tmp_path, cloud, sequence):

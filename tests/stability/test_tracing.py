@@ -24,8 +24,9 @@ from beam_warp.stability import tracing_cases as stress_cases
 from beam_warp.stability.page import HOW_TO_READ, OCCLUSION_TEXT
 from beam_warp.stability.tracing import HIERARCHIES, run_case, scene_under
 from beam_warp.stability.tracing_cases import CASES, case_of
-from beam_warp.trace.reference import rotation_matrices, visibility_enclosure, visibility_reference
+from beam_warp.trace.reference import visibility_enclosure, visibility_reference
 from beam_warp.trace.transmittance import EXACT, TraceOptions
+from beam_warp.world.quaternions import rotation_matrices
 
 SMALL = [case for case in CASES if not case.large]
 

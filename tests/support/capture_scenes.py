@@ -3,6 +3,7 @@
 import numpy as np
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.image.metrics import block_means
 from beam_warp.world.camera import Camera
 
 SUPERSAMPLES = 4
@@ -25,26 +26,18 @@ def directions(count):
 def cameras_around(count, *, distance=2.0, size=64, fov=40.0, center=(0.0, 0.0, 0.0)):
     """Cameras evenly around a point that look at it."""
     middle = np.asarray(center, float)
-    return [
-        Camera.look_at(
-            middle + distance * d,
-            middle,
-            up=(0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0),
-            width=size,
-            height=size,
-            vertical_fov=fov,
-        )
-        for d in directions(count)
-    ]
+    lens = {"width": size, "height": size, "vertical_fov": fov}
+    ups = ((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0) for d in directions(count))
+    places = zip(directions(count), ups, strict=True)
+    return [Camera.look_at(middle + distance * d, middle, up=up, **lens) for d, up in places]
 
 
 def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0.3, 0.1)):
     """One view of a ball of one colour: its rays pass the centre at no more than the radius."""
-    s = SUPERSAMPLES
     to_center = np.asarray(center, float) - camera.position
-    along = camera.supersampled(s).directions() @ to_center
+    along = camera.supersampled(SUPERSAMPLES).directions() @ to_center
     hit = (along > 0.0) & ((to_center**2).sum() - along**2 <= radius**2)
-    alpha = hit.reshape(camera.height, s, camera.width, s).mean(axis=(1, 3), dtype=np.float32)
+    alpha = block_means(hit.astype(np.float32), SUPERSAMPLES)
     return CapturedView(name=name, camera=camera, color=alpha[..., None] * np.float32(color), alpha=alpha)
 
 

@@ -33,14 +33,8 @@ def write_sound(folder, cameras=None, frames=FRAMES):
             grey = np.full_like(alpha, int(140 + 20 * camera.forward[0]))
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             PillowImage.fromarray(np.stack([grey, grey, grey, alpha], -1).astype(np.uint8)).save(folder / path)
-            records.append(
-                {
-                    "file_path": path,
-                    "camera": f"c{k:02d}",
-                    "frame": frame,
-                    "transform_matrix": (camera.camera_to_world @ FLIP).tolist(),
-                }
-            )
+            pose = (camera.camera_to_world @ FLIP).tolist()
+            records.append({"file_path": path, "camera": f"c{k:02d}", "frame": frame, "transform_matrix": pose})
     camera = cameras[0]
     content = {"w": WIDTH, "h": HEIGHT, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 20.0, "cy": 15.0}
     content["frames"] = records

@@ -11,8 +11,9 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE
 from beam_warp.stability.tracing import traced_cloud
 from beam_warp.trace.first_surface import closest_surface
-from beam_warp.trace.reference import FLOAT32_ROUNDOFF, rotation_matrices
+from beam_warp.trace.reference import FLOAT32_ROUNDOFF
 from beam_warp.trace.transmittance import TraceOptions
+from beam_warp.world.quaternions import rotation_matrices
 
 WHOLE = TraceOptions(stop=0.0)
 FIELDS = (

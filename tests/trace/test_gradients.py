@@ -10,8 +10,8 @@ from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.trace import gradients
 from beam_warp.trace.gradients import visibility_gradients
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.transmittance import TraceOptions
+from beam_warp.world.quaternions import rotation_matrices
 
 WHOLE = TraceOptions(stop=0.0)
 OF_GAUSSIANS = ("positions", "orientations", "scales", "opacities")

@@ -53,9 +53,11 @@ def test_there_are_48_codes_half_of_each_hand():
 
 
 @pytest.mark.parametrize("code", ["rd", "rdd", "RDF"])
-def test_a_wrong_code_is_refused(code, rng):
+def test_a_wrong_code_or_scale_is_refused(code, rng):
     with pytest.raises(InvalidOptionError, match=r"target must be three letters, one each of r/l, u/d and f/b, got"):
         change_axes(make_cloud(rng), code)
+    with pytest.raises(InvalidOptionError, match=r"scale must be a number in \[1e-06, 1e\+06\], got nan"):
+        change_axes(make_cloud(rng), "rub", scale=float("nan"))
 
 
 @settings(max_examples=40, deadline=None)
@@ -97,11 +99,6 @@ def test_unreal_is_in_centimetres(rng):
     moved = change_axes(cloud, axes, scale=units)
     assert np.allclose(moved.positions, 100.0 * cloud.positions[:, [2, 0, 1]] * [-1, 1, 1], rtol=2 * EPSILON)
     assert np.allclose(moved.scales, 100.0 * cloud.scales, rtol=EPSILON)
-
-
-def test_a_wrong_scale_is_refused(rng):
-    with pytest.raises(InvalidOptionError, match=r"scale must be a number in \[1e-06, 1e\+06\], got nan"):
-        change_axes(make_cloud(rng), "rub", scale=float("nan"))
 
 
 def test_zeroth_degree_and_no_optional_arrays(rng):

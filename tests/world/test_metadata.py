@@ -19,16 +19,9 @@ def test_options_survive(antialiased, low_pass):
     assert RasterOptions.from_metadata(options.as_metadata()) == options
 
 
-def test_what_is_stated_is_text():
-    assert RasterOptions(antialiased=True, low_pass=0.1).as_metadata() == {
-        "raster_antialiased": "true",
-        "raster_low_pass": "0.1",
-    }
-
-
-def test_near_and_depth_are_not_stated():
-    options = RasterOptions(near=2.0, depth="exact")
-    assert RasterOptions.from_metadata(options.as_metadata()) == RasterOptions()
+def test_filters_are_stated_as_text_and_near_and_depth_are_not():
+    stated = RasterOptions(antialiased=True, low_pass=0.1, near=2.0, depth="exact").as_metadata()
+    assert stated == {"raster_antialiased": "true", "raster_low_pass": "0.1"}
 
 
 def test_nothing_stated_is_the_default():
