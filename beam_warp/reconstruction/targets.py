@@ -21,8 +21,6 @@ from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
     launch_add_sample_gradients,
     launch_average,
-    launch_encode,
-    launch_spread,
     launch_square_error,
 )
 from beam_warp.raster.depth_normals import DepthNormals
@@ -161,10 +159,6 @@ class ViewTargets:
         self._error = wp.zeros(1, dtype=float, device=self.device)
         self._sums = SumBuffers(self.device)
 
-    def __len__(self) -> int:
-        """Return the number of views."""
-        return len(self._colors)
-
     def select(self, index: int) -> None:
         """Look from a view; may be captured in a CUDA graph."""
         self.rasterizer.set_cameras(self._cameras[index])
@@ -177,18 +171,20 @@ class ViewTargets:
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
-        launch_encode(self._color, self._samples, self._encoded, self.device)
+        launch_average(self._color, self._samples, True, self._encoded, self.device)
         target = self._colors[index]
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded)]
         if weights.ssim > 0.0:
             terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
-        launch_add_sample_gradients(self._color, self._samples, self._to_encoded, self._to_color, self.device)
+        launch_add_sample_gradients(self._color, self._samples, True, self._to_encoded, self._to_color, self.device)
         alpha = self._alphas[index]
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
-            launch_average(self._alpha, self._samples, self._covered, self.device)
+            launch_average(self._alpha, self._samples, False, self._covered, self.device)
             terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
-            launch_spread(self._to_covered, self._samples, self._to_alpha, self.device)
+            launch_add_sample_gradients(
+                self._alpha, self._samples, False, self._to_covered, self._to_alpha, self.device
+            )
         if weights.normal > 0.0:
             self._to_surface.zero_()
             geometry = self._depth_normals[index]
@@ -230,7 +226,7 @@ class ViewTargets:
         """
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
-        launch_encode(self._color, self._samples, self._encoded, self.device)
+        launch_average(self._color, self._samples, True, self._encoded, self.device)
         launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
         return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
@@ -240,17 +236,20 @@ class ViewTargets:
         self.select(index)
         self.rasterizer.draw(gaussians)
 
-    def subject_pixels(self, index: int) -> int:
-        """Return how many pixels of a view the subject covers; all without alpha."""
-        return self._subjects[index]
+    def gap(self, index: int) -> float:
+        """Return the largest connected part of a view's subject that what was drawn last does not cover, a fraction.
 
-    def missed(self, index: int) -> NDArray[np.bool_]:
-        """Return which pixels of the subject what was drawn last does not cover, ``(H, W)``; none without alpha."""
+        It is 0 without alpha.
+        """
         alpha = self._alphas[index]
         if alpha is None:
-            return np.zeros((self.height, self.width), bool)
-        launch_average(self._alpha, self._samples, self._covered, self.device)
-        return ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+            return 0.0
+        launch_average(self._alpha, self._samples, False, self._covered, self.device)
+        missed = ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+        labelled: Any = ndimage.label(missed)  # its types say that it may be a number
+        parts, count = labelled
+        largest = np.bincount(parts.ravel())[1:].max() if count else 0
+        return largest / max(self._subjects[index], 1)
 
 
 class TargetSet:
@@ -322,14 +321,11 @@ class TargetSet:
         return total
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
-        """Draw every view; return the largest connected part of its subject that is not drawn, a fraction, ``(V,)``."""
+        """Draw every view, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
         gaps = []
         for group, index in self._places:
             group.draw(index, gaussians)
-            labelled: Any = ndimage.label(group.missed(index))  # its types say that it may be a number
-            parts, count = labelled
-            largest = np.bincount(parts.ravel())[1:].max() if count else 0
-            gaps.append(largest / max(group.subject_pixels(index), 1))
+            gaps.append(group.gap(index))
         return np.array(gaps)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
+from support.float32 import EPSILON
 from support.moving_ball import ball_cloud
 
 from beam_warp.image.color import LINEAR_REC709
@@ -12,8 +13,6 @@ from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, hidden,
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-
-EPSILON = 2.0**-24
 
 
 def rows_of(rng, count):

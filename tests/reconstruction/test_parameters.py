@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.activation import activate, thin_axes
+from support.float32 import EPSILON
 from support.moving_ball import ball_cloud
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.raster.records import GaussianGradients
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
-
-EPSILON = 2.0**-24
 
 NAMES = ("positions", "orientations", "radiance", "log_scales", "logits")
 

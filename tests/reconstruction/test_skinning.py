@@ -6,29 +6,14 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import skinning as twin
+from reference.image_losses import slope
 from scipy.spatial.transform import Rotation
+from support.float32 import EPSILON, relative_error, single, vectors, zeros
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.reconstruction.joints.skinning import Anchors, Skin
 
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
-
 BLENDS = ("linear", "dual")
-
-
-def vectors(array, device):
-    array = np.asarray(array, np.float32)
-    return wp.array(array, dtype=wp.vec3 if array.shape[1] == 3 else wp.quat, device=device)
-
-
-def zeros(count, width, device):
-    return wp.zeros(count, dtype=wp.vec3 if width == 3 else wp.quat, device=device)
-
-
-def single(array):
-    """Values that float32 holds, in float64."""
-    return np.asarray(array, np.float32).astype(float)
 
 
 def scene(rng, skin_count, joint_count, neighbor_count=8, turn=0.8):
@@ -67,20 +52,6 @@ def gradients(skin, rotations, positions, to_positions, to_orientations):
         *out,
     )
     return out[0].numpy().astype(float), out[1].numpy().astype(float)
-
-
-def slope(loss, array, step=1e-5):
-    """Central differences."""
-    found = np.empty(array.shape)
-    for i in np.ndindex(*array.shape):
-        moved = np.zeros(array.shape)
-        moved[i] = step
-        found[i] = (loss(array + moved) - loss(array - moved)) / (2.0 * step)
-    return found
-
-
-def relative_error(found, expected):
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("blend", BLENDS)

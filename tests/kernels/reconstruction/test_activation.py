@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.activation import activate, thin_axes
+from support.float32 import EPSILON
 
 from beam_warp.kernels.reconstruction.activation import (
     Shapes,
@@ -11,9 +12,6 @@ from beam_warp.kernels.reconstruction.activation import (
     launch_add_rows,
     launch_add_shape_gradients,
 )
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
 
 ROUNDINGS = 64
 """An exponential is within 2 ulp, 4 roundings; of an opacity there are three, two roots and nine other operations."""
