@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -27,13 +27,14 @@ from beam_warp.raster.depth_normals import DepthNormals
 from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.world.gaussians import GaussianCloud
 
 CROP_MARGIN = 8
 """Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
 
 CROP_STEP = 16
 """Sides of crops are multiples of a tile of the rasteriser [pixel]."""
-
 
 MOST_SAMPLES = 4
 """Largest side of the square of samples of a pixel."""
@@ -327,6 +328,24 @@ class TargetSet:
             group.draw(index, gaussians)
             gaps.append(group.gap(index))
         return np.array(gaps)
+
+
+def shuffled_views(rng: np.random.Generator, view_count: int, steps: int) -> NDArray[np.int64]:
+    """Return which view each step looks at: all of them, shuffled, again and again; at least one round."""
+    rounds = max(-(-steps // view_count), 1)
+    return np.concatenate([rng.permutation(view_count) for _ in range(rounds)])
+
+
+def disc_spacing(cloud: GaussianCloud) -> float:
+    """Return the distance of neighbouring discs [m], from the median of their second largest deviations."""
+    return float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / DISC_WIDTH
+
+
+def chosen_samples(samples: int | Literal["auto"], cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
+    """Return the side of the square of samples of a pixel; `sample_side` chooses it where it is ``"auto"``."""
+    if samples != "auto":
+        return int(samples)
+    return sample_side(views, np.median(cloud.positions, axis=0), disc_spacing(cloud))
 
 
 def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:

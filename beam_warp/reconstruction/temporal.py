@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import require_number
 from beam_warp.device.array_checks import float_rows
-from beam_warp.kernels.reconstruction.squared_difference import launch_add_difference_gradients
+from beam_warp.kernels.reconstruction.gradient_sums import launch_add_difference_gradients
 from beam_warp.reconstruction.parameters import GaussianParameters
 
 SMALLEST_SPACING = 1e-11

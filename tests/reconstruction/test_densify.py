@@ -66,12 +66,6 @@ class TestSplit:
     def test_variance_along_the_axis_is_four_fifths(self):
         assert pytest.approx(0.8, abs=0.02) == SPLIT_OFFSET**2 + SPLIT_SHRINK**2
 
-    def test_none_is_none(self, rng):
-        rows = rows_of(rng, 5)
-        before = copied(rows)
-        split(rows, np.zeros(0, int), np.zeros(0, int))
-        assert all((rows[name] == before[name]).all() for name in rows)
-
     @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
     def test_the_image_of_a_disc_hardly_changes(self, device, opacity):
         """The image keeps its middle and its height; it gets up to 1.3 times as bright: halves hold 2 x 0.65 of it.

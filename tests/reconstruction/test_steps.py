@@ -21,12 +21,6 @@ TRACKING = TrackOptions(
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread(monkeypatch):
-    """Images here are so small that threads only wait for one another."""
-    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
-
-
 @pytest.mark.parametrize("changes", [{}, {"samples": 2}, {"raster": RasterOptions()}])
 def test_a_track_begins_where_its_key_frame_ended(device, changes):
     """The same views of the same Gaussians, drawn in the same way: the same PSNR."""

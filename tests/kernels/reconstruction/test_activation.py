@@ -6,12 +6,7 @@ import warp as wp
 from reference.activation import activate, thin_axes
 from support.float32 import EPSILON
 
-from beam_warp.kernels.reconstruction.activation import (
-    Shapes,
-    launch_activate,
-    launch_add_rows,
-    launch_add_shape_gradients,
-)
+from beam_warp.kernels.reconstruction.activation import Shapes, launch_activate, launch_add_shape_gradients
 
 ROUNDINGS = 64
 """An exponential is within 2 ulp, 4 roundings; of an opacity there are three, two roots and nine other operations."""
@@ -153,11 +148,3 @@ class TestEndsOfTheRange:
     def test_without_a_filter_opacity_is_the_sigmoid_however_small_a_scale(self, device):
         _, opacities = activated([[-60.0, -61.0, -62.0]], [0.0], [0.0], device)
         assert opacities[0] == pytest.approx(0.5, rel=8 * EPSILON)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 27), (1025, 4)])
-def test_rows_are_added(device, rng, shape):
-    rows, before = rng.normal(size=(2, *shape)).astype(np.float32)
-    out = wp.array(before, dtype=float, device=device)
-    launch_add_rows(wp.array(rows, dtype=float, device=device), out, device)
-    np.testing.assert_array_equal(out.numpy(), before + rows)

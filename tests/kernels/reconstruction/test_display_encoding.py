@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from support.float32 import EPSILON
+from support.moving_ball import block_means
 
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.kernels.reconstruction.display_encoding import launch_add_sample_gradients, launch_average
@@ -26,9 +27,7 @@ def strided(array, device, columns=7):
 
 
 def means(samples, factor):
-    height, width = samples.shape[0] // factor, samples.shape[1] // factor
-    blocks = samples.astype(np.float64).reshape(height, factor, width, factor, -1)
-    return blocks.mean(axis=(1, 3))
+    return block_means(samples.astype(np.float64), factor)
 
 
 def averaged(samples, factor, device, bring=upload, *, is_color=True):
@@ -40,13 +39,6 @@ def averaged(samples, factor, device, bring=upload, *, is_color=True):
 
 def slopes(values):
     return np.where(values > KNEE, 1.055 / 2.4 * np.maximum(values, KNEE) ** (1.0 / 2.4 - 1.0), 12.92)
-
-
-@pytest.mark.parametrize(
-    ("linear", "display"), [(0.0, 0.0), (0.001, 0.01292), (1.0, 1.0), (0.5, 0.735356983052), (4.0, 1.824796295276)]
-)
-def test_values_of_the_curve(device, linear, display):
-    assert averaged(np.full((1, 1, 1), linear), 1, device)[0, 0, 0] == pytest.approx(display, rel=ROUNDINGS * EPSILON)
 
 
 def test_the_knee_is_no_step(device):
@@ -85,20 +77,3 @@ class TestImages:
             share = (slope * upstream / factor**2).repeat(factor, axis=0).repeat(factor, axis=1)
             bound = ROUNDINGS * EPSILON * np.abs(share) + 2 * EPSILON * (np.abs(share) + np.abs(before))
             assert (np.abs(out.numpy() - (before + share)) <= bound).all()
-
-
-def test_gradients_are_central_differences(device, rng):
-    """Differences of the float64 curve do not reach its step at the knee: means stay 1e-3 of it away."""
-    samples = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (6, 8, 3))).astype(np.float32)
-    values = means(samples, 2)
-    samples[0::2, 0::2][np.abs(values / KNEE - 1.0) < 0.1] += 1e-3
-    upstream = rng.normal(size=(3, 4, 3)).astype(np.float32)
-    out = wp.zeros((6, 8, 3), dtype=float, device=device)
-    launch_add_sample_gradients(upload(samples, device), 2, True, upload(upstream, device), out, device)
-    expected, wide = np.zeros((6, 8, 3)), samples.astype(np.float64)
-    for at in np.ndindex(6, 8, 3):
-        step = np.zeros((6, 8, 3))
-        step[at] = 1e-5 * wide[at]
-        change = linear_to_srgb(means(wide + step, 2)) - linear_to_srgb(means(wide - step, 2))
-        expected[at] = (upstream * change).sum() / (2.0 * step[at])
-    assert np.linalg.norm(out.numpy() - expected) <= 1e-5 * np.linalg.norm(expected)
