@@ -25,7 +25,7 @@ from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_l
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
 from beam_warp.reconstruction.parameters import GaussianParameters, require_something
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, chosen_samples, disc_spacing, shuffled_views
@@ -218,7 +218,7 @@ def fit_gaussians(
     options: FitOptions | None = None,
     *,
     device: str | None = None,
-    progress: StepProgress = no_step_progress,
+    progress: StepProgress = no_progress,
 ) -> Fit:
     """Fit Gaussians to the photographs of one moment.
 
@@ -320,7 +320,7 @@ class Fitter:
         self._weights = options.weights
         self._taken = 0
 
-    def run(self, progress: StepProgress = no_step_progress) -> None:
+    def run(self, progress: StepProgress = no_progress) -> None:
         """Take all steps."""
         chosen = self.options
         total = chosen.color_iterations + chosen.normal_iterations

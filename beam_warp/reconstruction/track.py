@@ -22,7 +22,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.fit import NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
 from beam_warp.reconstruction.joints.selection import select_joints
@@ -208,7 +208,7 @@ def advance_track(
     options: TrackOptions,
     *,
     device: str | None = None,
-    progress: StepProgress = no_step_progress,
+    progress: StepProgress = no_progress,
 ) -> tuple[Track, dict[str, Any]]:
     """Find the Gaussians of the next frame.
 

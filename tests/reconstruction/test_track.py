@@ -13,7 +13,7 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
-from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.reconstruction.track import TrackOptions, advance_track, begin_track, outward_normals
 
 CAMERAS = rig()
 
@@ -111,15 +111,6 @@ class TestLost:
 
 
 class TestArrays:
-    def test_a_track_comes_back_bit_by_bit(self, device):
-        track, _ = advance_track(rough_track(device), ball_views(CAMERAS[:3], turn=turned(3)), BRIEF, device=device)
-        arrays = track.arrays()
-        again = Track.from_arrays(arrays).arrays()
-        assert list(again) == list(arrays)
-        for name, array in arrays.items():
-            assert again[name].dtype == array.dtype
-            np.testing.assert_array_equal(again[name], array)
-
     def test_same_bits_for_every_number_of_threads(self, device, monkeypatch):
         views, found = ball_views(rig(2, 48)), []
         for threads in ("1", "3"):
