@@ -104,7 +104,7 @@ class TestSplit:
 
 class TestHidden:
     def test_those_that_show_least(self):
-        """At most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
+        """Those that show least, at most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
         shares = np.array([50.0, 1.0, 10.0, 2.0, 36.0, 1.0])
         assert np.flatnonzero(hidden(shares, 0.05)).tolist() == [1, 3, 5]
         assert np.flatnonzero(hidden(shares, 0.01)).tolist() == [1]  # of the equal ones, the first
