@@ -21,16 +21,14 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.graphs import StepGraphs
-from beam_warp.errors import InvalidArrayError
-from beam_warp.kernels.reconstruction.gradient_lengths import launch_add_gradient_lengths
+from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
-from beam_warp.reconstruction.initial import DISC_WIDTH
-from beam_warp.reconstruction.parameters import GaussianParameters
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
+from beam_warp.reconstruction.parameters import GaussianParameters, require_something
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, sample_side
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, chosen_samples, disc_spacing, shuffled_views
 from beam_warp.reconstruction.temporal import TemporalTerms
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -109,8 +107,8 @@ class FitOptions:
         refine_every: Steps from one refinement to the next; 0 for none.
         refine_until: Part of all steps after which there is none.
         split_fraction: Most of the Gaussians that one refinement splits.
-        hidden_share: Gaussians that show least are dropped at a refinement, as many as together show this part of
-            what all show: those that sank behind others, about a third of them, and nobody pulls back.
+        hidden_share: A refinement drops the Gaussians that show least, which together hold this part of the weights of
+            all: about a third of all Gaussians, which sank behind others and which no gradient pulls back.
         dead_opacity: Gaussians below it are dropped.
         seed: Same seed, same device, same result.
 
@@ -220,7 +218,7 @@ def fit_gaussians(
     options: FitOptions | None = None,
     *,
     device: str | None = None,
-    progress: StepProgress = no_step_progress,
+    progress: StepProgress = no_progress,
 ) -> Fit:
     """Fit Gaussians to the photographs of one moment.
 
@@ -239,10 +237,7 @@ def fit_gaussians(
     Source: Kerbl et al. 2023, 3DGS; BEAM §3.1 for the normals; what differs is in `docs/reconstruction.md`.
     """
     chosen = options or FitOptions()
-    if not len(views) or not len(start):
-        raise InvalidArrayError(
-            f"views and start must hold something, got {len(views)} views and {len(start)} Gaussians. Pass some."
-        )
+    require_something("start", start, views)
     if len(start) > chosen.gaussian_count:
         start = start.select(np.linspace(0, len(start) - 1, chosen.gaussian_count).astype(int))
     target = resolve_device(device)
@@ -303,15 +298,14 @@ class Fitter:
         self.device = device
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
-        center = np.median(start.positions, axis=0)
-        spacing = float(np.median(np.sort(start.scales, axis=1)[:, 1])) / DISC_WIDTH
-        self.samples = sample_side(views, center, spacing) if options.samples == "auto" else int(options.samples)
+        self.samples = chosen_samples(options.samples, start, views)
         self._targets = TargetSet(views, count, options.raster, self.samples, device)
-        self._extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
+        center = np.median(start.positions, axis=0)
+        extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
         self._limits = SamplingLimits([view.camera for view in views], device=device)
         rates = options.rates
         self._rates = {
-            "positions": rates.positions * self._extent,
+            "positions": rates.positions * extent,
             "orientations": rates.orientations,
             "log_scales": rates.scales,
             "logits": rates.opacities,
@@ -321,16 +315,16 @@ class Fitter:
         self._adam: Adam = self.parameters.optimizer(self._rates)
         self._gradient_sums = wp.zeros(count, dtype=float, device=device)
         self._gradient_counts = wp.zeros(count, dtype=float, device=device)
-        self._temporal = TemporalTerms(self.parameters, spacing) if options.temporal > 0.0 else None
+        self._temporal = TemporalTerms(self.parameters, disc_spacing(start)) if options.temporal > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._taken = 0
 
-    def run(self, progress: StepProgress = no_step_progress) -> None:
+    def run(self, progress: StepProgress = no_progress) -> None:
         """Take all steps."""
         chosen = self.options
         total = chosen.color_iterations + chosen.normal_iterations
-        order = self._order(total)
+        order = shuffled_views(np.random.default_rng(chosen.seed), len(self._targets), total)
         facts: dict[str, float] = {"gaussians": float(self.parameters.alive().sum())}
         self._weights = replace(chosen.weights, normal=0.0)
         self._graphs.clear()
@@ -392,12 +386,6 @@ class Fitter:
     def _mean_gradients(self) -> NDArray[np.float32]:
         """Return the mean length of each row's position gradients since the last refinement, ``(N,)``."""
         return self._gradient_sums.numpy() / np.maximum(self._gradient_counts.numpy(), 1.0)
-
-    def _order(self, total: int) -> NDArray[np.int64]:
-        """Return which view each step looks at: all of them, shuffled, again and again."""
-        rng = np.random.default_rng(self.options.seed)
-        rounds = -(-total // len(self._targets))
-        return np.concatenate([rng.permutation(len(self._targets)) for _ in range(max(rounds, 1))])
 
     def _set_rates(self, part: float) -> None:
         """Let steps shrink: ``part`` of them have been taken."""

@@ -25,10 +25,10 @@ Of sound captures (walker, runner, demo figure) no view is off by more than 0.11
 or more with 4; the others then at 0.28 at most with 4 and 0.10 with 8 (`docs/reconstruction.md`)."""
 
 CLEAR_OF_RESIDUALS = 2.0
-"""Exposures are reported only if they are so many times the middle one of the differences that are left.
+"""Least ratio of a reported exposure to the median of the differences that its view's points are left with.
 
-Where views share few points, at grazing angles or after much motion, these are as large (four cameras, five frames on:
-0.69 of 0.47)."""
+Where views share few points, at grazing angles or after much motion, these differences are as large as the exposures
+(four cameras, five frames on: 0.69 of 0.47)."""
 
 LARGEST_SIDE = 320
 """Pixels of a side at which views are compared, about: each sample is the mean of some."""

@@ -16,6 +16,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
+from beam_warp.image.metrics import block_means
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.reconstruction.silhouettes import launch_measure_silhouette
 from beam_warp.kernels.reconstruction.visual_hull import (
@@ -24,13 +25,14 @@ from beam_warp.kernels.reconstruction.visual_hull import (
     BLOCK_POINTS,
     OUTSIDE,
     SURFACE,
+    Grid,
+    Silhouettes,
     launch_fill_blocks,
     launch_find_cells,
     launch_gather_cells,
     launch_judge_blocks,
 )
 from beam_warp.raster.layout import ViewLayout
-from beam_warp.world.camera import Camera
 
 MIN_RESOLUTION = 16
 MAX_RESOLUTION = 1024
@@ -45,17 +47,17 @@ SEARCH_ROUNDS = 8
 """Most times that the box is drawn closer."""
 
 ENOUGH = 0.8
-"""Part of the longest side above which a round of the search that leaves it is the last."""
+"""Part of the longest side: a round of the search that leaves more of it is the last."""
 
 SEARCH_SIDE = 320
 """Longest side of the masks [pixel] while the box is searched for: larger ones are reduced by whole factors."""
 
 VOXEL_PIXELS = 2
-"""Masks are reduced while a voxel covers more pixels than this: finer ones would tell it nothing, at a higher price."""
+"""Pixels across a voxel: masks with more are reduced, because finer ones cost more and add nothing."""
 
 DISTANCE_LIMIT = 32.0
-"""Distances to a silhouette are measured up to so many pixels: a block of the search, and of the grid, has a radius
-of fewer where masks are reduced as above."""
+"""Largest distance to a silhouette that is measured [pixel]: where masks are reduced as above, the blocks of the search
+and of the grid have a smaller radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +115,11 @@ def visual_hull(
     target = resolve_device(device)
     used, ignored = masked_views(views)
     if len(used) < 2:
+        names = ", ".join(view.name for view in ignored)
         raise InvalidArrayError(
             f"views must have at least two masks that show something, got {len(used)} of {len(views)}"
-            f"{_listed(' (no mask, or an empty one: ', ignored)}. Pass views with alpha, or points to start from."
+            f"{f' (no mask, or an empty one: {names})' if names else ''}. Pass views with alpha, or points to start "
+            "from."
         )
     agreeing = len(used) // 2 + 1 if quorum is None else quorum
     longest = max(max(view.camera.width, view.camera.height) for view in used)
@@ -187,17 +191,6 @@ def _pixels_per_metre(views: Sequence[CapturedView], middle: NDArray[np.float64]
     return float(np.median(focal / np.maximum(distances, 1e-9)))
 
 
-def _reduced(view: CapturedView, factor: int) -> tuple[Camera, NDArray[np.float32]]:
-    """Return a view's camera and mask at a fraction of the resolution, as `CapturedView.reduced`, without colour."""
-    camera, alpha = view.camera.reduced(factor), np.asarray(view.alpha)
-    whole = alpha[: camera.height * factor, : camera.width * factor]
-    return camera, whole.reshape(camera.height, factor, camera.width, factor).mean(axis=(1, 3), dtype=np.float32)
-
-
-def _listed(start: str, views: Sequence[CapturedView]) -> str:
-    return f"{start}{', '.join(view.name for view in views)})" if views else ""
-
-
 def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
     """Return the size of the search's blocks in a box, and how many there are along each axis."""
     sides = box[1] - box[0]
@@ -205,27 +198,38 @@ def _blocks(box: NDArray[np.float64]) -> tuple[float, NDArray[np.int_]]:
     return size, np.maximum(np.ceil(sides / size - 1e-6).astype(int), 1)
 
 
+def _grid(lower: NDArray[np.float64], size: float, count: NDArray[Any]) -> Grid:
+    grid = Grid()
+    grid.origin, grid.size, grid.count = wp.vec3(*lower), size, wp.vec3i(*count)
+    return grid
+
+
 class _Cones:
     """The silhouettes of views on a device: the box that they allow, and the surface inside it."""
 
     def __init__(self, views: Sequence[CapturedView], factor: int, quorum: int, device: Any) -> None:
         self.captured = list(views)
-        self.quorum = quorum
         self.device = device
-        cameras, masks = zip(*(_reduced(view, factor) for view in views), strict=True)
+        cameras = [view.camera.reduced(factor) for view in views]
+        masks = [
+            block_means(np.asarray(view.alpha)[: camera.height * factor, : camera.width * factor], factor)
+            for view, camera in zip(views, cameras, strict=True)
+        ]
         pixels = sum(mask.size for mask in masks)
         if pixels > 2**31 - 1:
             raise InvalidArrayError(
                 f"masks must have at most {2**31 - 1} pixels in all, got {pixels}. Reduce the views."
             )
         self.records = ViewLayout.of(cameras).views
-        self.views = wp.array(self.records, dtype=RasterView, device=device)
-        self.distances = wp.empty(pixels, dtype=float, device=device)
+        self.silhouettes = Silhouettes()
+        self.silhouettes.views = wp.array(self.records, dtype=RasterView, device=device)
+        self.silhouettes.distances = wp.empty(pixels, dtype=float, device=device)
+        self.silhouettes.quorum = quorum
         for mask, record in zip(masks, self.records, strict=True):
             column_gaps, row_gaps = (wp.empty(mask.shape, dtype=float, device=device) for _ in range(2))
-            alpha = upload(mask, float, device)
+            alpha, distances = upload(mask, float, device), self.silhouettes.distances
             launch_measure_silhouette(
-                alpha, DISTANCE_LIMIT, column_gaps, row_gaps, record.first_pixel, self.distances, device
+                alpha, DISTANCE_LIMIT, column_gaps, row_gaps, record.first_pixel, distances, device
             )
 
     def search(self) -> NDArray[np.float64]:
@@ -248,9 +252,7 @@ class _Cones:
     def judge(self, lower: NDArray[np.float64], size: float, count: NDArray[Any]) -> NDArray[np.int32]:
         """Return the states of a grid of blocks."""
         states = wp.empty(int(np.prod(count)), dtype=int, device=self.device)
-        launch_judge_blocks(
-            wp.vec3(*lower), size, wp.vec3i(*count), self.views, self.distances, self.quorum, states, self.device
-        )
+        launch_judge_blocks(_grid(lower, size, count), self.silhouettes, states, self.device)
         return states.numpy().reshape(count)
 
     def carve(self, lower: NDArray[np.float64], voxel: float, count: NDArray[Any]) -> trimesh.Trimesh:
@@ -265,10 +267,8 @@ class _Cones:
         device = self.device
         subscripts = upload(blocks, wp.vec3i, device)
         depths = wp.empty(len(blocks) * BLOCK_POINTS, dtype=float, device=device)
-        origin = wp.vec3(*lower)
-        launch_fill_blocks(
-            subscripts, origin, voxel, wp.vec3i(*count), self.views, self.distances, self.quorum, depths, device
-        )
+        grid = _grid(lower, voxel, count)
+        launch_fill_blocks(subscripts, grid, self.silhouettes, depths, device)
         crossed = wp.empty(len(blocks) * BLOCK_CELLS, dtype=int, device=device)
         launch_find_cells(depths, crossed, device)
         wp.utils.array_scan(crossed, crossed, inclusive=True)
@@ -278,7 +278,7 @@ class _Cones:
         cells = wp.empty(cell_count, dtype=wp.vec3i, device=device)
         corners = wp.empty((cell_count, 8), dtype=float, device=device)
         launch_gather_cells(subscripts, depths, crossed, cells, corners, device)
-        vertices, faces = sparse_marching_cubes_from_cells(cells, corners, origin, voxel, device=device)
+        vertices, faces = sparse_marching_cubes_from_cells(cells, corners, grid.origin, voxel, device=device)
         # Depth grows inwards, so Warp's faces, which turn towards larger values, turn in.
         return trimesh.Trimesh(vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1], process=False)
 
@@ -288,9 +288,10 @@ def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:
     size, count = _blocks(box)
     views = cones.captured
     left = np.zeros(len(views), np.int64)
-    cones.quorum = len(views) - 1
+    cones.silhouettes.quorum = len(views) - 1
     for i in range(len(views) if len(views) > 2 else 0):
-        cones.views = wp.array(cones.records[:i] + cones.records[i + 1 :], dtype=RasterView, device=cones.device)
+        others = cones.records[:i] + cones.records[i + 1 :]
+        cones.silhouettes.views = wp.array(others, dtype=RasterView, device=cones.device)
         left[i] = np.count_nonzero(cones.judge(box[0], size, count) != OUTSIDE)
     # Blocks are judged with a margin: those along one cone's side may be left without any view.
     blamed = [view.name for view, blocks in zip(views, left, strict=True) if blocks > 0.5 * left.max()]

@@ -9,7 +9,7 @@ tracking is lost becomes a key frame itself.
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
-    store           frames.store    one file a frame, under a key (frames.keys)
+    store           frames.store    one file a frame, under its key
     write           this module     asset, previews, report
 
 The key of a frame covers everything it depends on: the version, the kind of device, the options, what the capture
@@ -38,13 +38,12 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.report import device_facts, versions, write_report
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.frames.keys import common_inputs, key_of_frame
 from beam_warp.reconstruction.frames.model import model_frame
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
 from beam_warp.reconstruction.frames.protocols import FrameSteps, Progress, no_progress
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
-from beam_warp.reconstruction.frames.store import FrameStore, stored_cloud, stored_sequence
+from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, key_of_frame, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata

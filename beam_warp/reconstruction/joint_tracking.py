@@ -21,7 +21,7 @@ from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
-from beam_warp.reconstruction.targets import LossWeights, TargetSet
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, shuffled_views
 from beam_warp.world.gaussians import GaussianCloud
 
 
@@ -46,9 +46,9 @@ class JointOptions:
         levels: Reductions of the images, coarse to fine: the coarser, the further a motion is found.
         iterations: Steps at each of them.
         weights: Weights of the images' terms.
-        rigidity: Weight of motion that is not rigid around each joint, at full resolution (E_smooth); on reduced images
-            as many times less as these have fewer pixels: stiff joints turn too slowly for what is far away.
-        rotation_rate: Size of steps of quaternions at full resolution; at others as many times as they are reduced.
+        rigidity: Weight of motion that is not rigid around each joint (E_smooth) at full resolution; on reduced images
+            divided by the square of the reduction, because stiff joints turn too slowly where motion is large.
+        rotation_rate: Size of steps of quaternions at full resolution; on reduced images times the reduction.
         position_rate: Size of steps of positions, likewise, in distances between joints.
         final_rate: Part of both that is left at the end of each level.
         blend: How several joints move a Gaussian: ``"linear"`` or ``"dual"``.
@@ -116,9 +116,8 @@ class JointTracker:
         self._rigidity = RigidityLoss(graph, device=device)
         at_rest = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
         self._rest_rotations = upload(at_rest, wp.quat, device)
-        self._rest_positions = upload(joints.astype(np.float32), wp.vec3, device)
         self._rotations = wp.clone(self._rest_rotations)
-        self._positions = wp.clone(self._rest_positions)
+        self._positions = wp.clone(self._skin.joint_rest_positions)
         self._rotation_gradients = wp.zeros(count, dtype=wp.quat, device=device)
         self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
         self._drawn = GaussianArrays(
@@ -156,8 +155,7 @@ class JointTracker:
             graphs = StepGraphs(self.device)
             self._carry()
             targets.make_room(self._drawn)
-            rounds = -(-iterations // len(targets))
-            order = np.concatenate([rng.permutation(len(targets)) for _ in range(max(rounds, 1))])
+            order = shuffled_views(rng, len(targets), iterations)
             for iteration in range(iterations):
                 for name, rate in rates.items():
                     left = chosen.final_rate ** (iteration / iterations)
@@ -201,7 +199,7 @@ class JointTracker:
             self._rotations,
             self._positions,
             self._rest_rotations,
-            self._rest_positions,
+            self._skin.joint_rest_positions,
             weight=rigidity,
             rotation_gradients=self._rotation_gradients,
             position_gradients=self._position_gradients,

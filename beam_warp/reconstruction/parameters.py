@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count
 from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.kernels.reconstruction.activation import (
-    Shapes,
-    launch_activate,
-    launch_add_rows,
-    launch_add_shape_gradients,
-)
+from beam_warp.kernels.reconstruction.activation import Shapes, launch_activate, launch_add_shape_gradients
+from beam_warp.kernels.reconstruction.gradient_sums import launch_add_rows
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, GaussianGradients
 from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
@@ -173,6 +171,18 @@ class GaussianParameters:
             radiance=self.radiance.numpy()[alive],
             radiance_color_space=LINEAR_REC709,
             ids=np.flatnonzero(alive),
+        )
+
+
+def require_something(name: str, cloud: GaussianCloud, views: Sequence[CapturedView]) -> None:
+    """Refuse no views and no Gaussians.
+
+    Raises:
+        InvalidArrayError: There is no view or no Gaussian.
+    """
+    if not len(views) or not len(cloud):
+        raise InvalidArrayError(
+            f"views and {name} must hold something, got {len(views)} views and {len(cloud)} Gaussians. Pass some."
         )
 
 

@@ -133,7 +133,6 @@ def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     factor = -(-rows // MOST_ROWS)
     if factor > 1:
         kept = pixels[: rows // factor * factor, : columns // factor * factor]
-        blocks = kept.reshape(rows // factor, factor, columns // factor, factor, -1)
-        return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+        return np.rint(block_means(kept, factor)).astype(np.uint8)
     factor = max(-(-FEWEST_ROWS // rows), 1)
     return np.repeat(np.repeat(pixels, factor, axis=0), factor, axis=1)

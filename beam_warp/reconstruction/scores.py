@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -78,18 +78,8 @@ class FrameScores:
             name: float(np.mean([getattr(view.novel_view, name) for view in self.views]))
             for name in ("psnr", "ssim", "solid_psnr")
         }
-        for name in (
-            "whole_psnr",
-            "whole_ssim",
-            "alpha_error",
-            "normals_mean_degrees",
-            "normals_median_degrees",
-            "depth_median_mm",
-            "median_depth_median_mm",
-        ):
-            mean = self._mean(name)
-            if mean is not None:
-                record[name] = mean
+        means = {score.name: self._mean(score.name) for score in fields(ViewScores)[2:]}
+        record |= {name: mean for name, mean in means.items() if mean is not None}
         if self.surface is not None:
             record["surface"] = self.surface.as_dict()
         return record | {"views": len(self.views)}

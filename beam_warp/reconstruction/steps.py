@@ -77,7 +77,11 @@ class FitAndTrack:
             unpaired = float((gains.views_of_points < 2).mean())
             said = {**_exposures(gains), "unpaired": unpaired}
             if unpaired > MOST_UNPAIRED:
-                findings.append(_few_cameras(unpaired))
+                what = (
+                    f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of "
+                    "outlines"
+                )
+                findings.append(Finding("warning", "few-cameras", what, remedy="Add cameras."))
         fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
         track = begin_track(fit.cloud, views, self._tracking, device=self.device)
         return track, {**fit.report, **said, "findings": [vars(finding) for finding in findings]}
@@ -131,16 +135,6 @@ class FitAndTrack:
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
-
-
-def _few_cameras(unpaired: float) -> Finding:
-    """Return the finding that cameras are too few, or too far apart, to see depth."""
-    return Finding(
-        "warning",
-        "few-cameras",
-        f"{100.0 * unpaired:.0f} % of the surface are seen by fewer than two views: their depth is that of outlines",
-        remedy="Add cameras.",
-    )
 
 
 def _exposures(gains: ViewGains) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -21,21 +21,20 @@ from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
     launch_add_sample_gradients,
     launch_average,
-    launch_encode,
-    launch_spread,
     launch_square_error,
 )
 from beam_warp.raster.depth_normals import DepthNormals
 from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.world.gaussians import GaussianCloud
 
 CROP_MARGIN = 8
 """Pixels around the subject that are still looked at: a Gaussian that leaves the silhouette must be seen to do so."""
 
 CROP_STEP = 16
 """Sides of crops are multiples of a tile of the rasteriser [pixel]."""
-
 
 MOST_SAMPLES = 4
 """Largest side of the square of samples of a pixel."""
@@ -161,10 +160,6 @@ class ViewTargets:
         self._error = wp.zeros(1, dtype=float, device=self.device)
         self._sums = SumBuffers(self.device)
 
-    def __len__(self) -> int:
-        """Return the number of views."""
-        return len(self._colors)
-
     def select(self, index: int) -> None:
         """Look from a view; may be captured in a CUDA graph."""
         self.rasterizer.set_cameras(self._cameras[index])
@@ -177,18 +172,20 @@ class ViewTargets:
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
-        launch_encode(self._color, self._samples, self._encoded, self.device)
+        launch_average(self._color, self._samples, True, self._encoded, self.device)
         target = self._colors[index]
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded)]
         if weights.ssim > 0.0:
             terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
-        launch_add_sample_gradients(self._color, self._samples, self._to_encoded, self._to_color, self.device)
+        launch_add_sample_gradients(self._color, self._samples, True, self._to_encoded, self._to_color, self.device)
         alpha = self._alphas[index]
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
-            launch_average(self._alpha, self._samples, self._covered, self.device)
+            launch_average(self._alpha, self._samples, False, self._covered, self.device)
             terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
-            launch_spread(self._to_covered, self._samples, self._to_alpha, self.device)
+            launch_add_sample_gradients(
+                self._alpha, self._samples, False, self._to_covered, self._to_alpha, self.device
+            )
         if weights.normal > 0.0:
             self._to_surface.zero_()
             geometry = self._depth_normals[index]
@@ -230,7 +227,7 @@ class ViewTargets:
         """
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
-        launch_encode(self._color, self._samples, self._encoded, self.device)
+        launch_average(self._color, self._samples, True, self._encoded, self.device)
         launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
         return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
@@ -240,17 +237,20 @@ class ViewTargets:
         self.select(index)
         self.rasterizer.draw(gaussians)
 
-    def subject_pixels(self, index: int) -> int:
-        """Return how many pixels of a view the subject covers; all without alpha."""
-        return self._subjects[index]
+    def gap(self, index: int) -> float:
+        """Return the largest connected part of a view's subject that what was drawn last does not cover, a fraction.
 
-    def missed(self, index: int) -> NDArray[np.bool_]:
-        """Return which pixels of the subject what was drawn last does not cover, ``(H, W)``; none without alpha."""
+        It is 0 without alpha.
+        """
         alpha = self._alphas[index]
         if alpha is None:
-            return np.zeros((self.height, self.width), bool)
-        launch_average(self._alpha, self._samples, self._covered, self.device)
-        return ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+            return 0.0
+        launch_average(self._alpha, self._samples, False, self._covered, self.device)
+        missed = ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
+        labelled: Any = ndimage.label(missed)  # its types say that it may be a number
+        parts, count = labelled
+        largest = np.bincount(parts.ravel())[1:].max() if count else 0
+        return largest / max(self._subjects[index], 1)
 
 
 class TargetSet:
@@ -322,15 +322,30 @@ class TargetSet:
         return total
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
-        """Draw every view; return the largest connected part of its subject that is not drawn, a fraction, ``(V,)``."""
+        """Draw every view, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
         gaps = []
         for group, index in self._places:
             group.draw(index, gaussians)
-            labelled: Any = ndimage.label(group.missed(index))  # its types say that it may be a number
-            parts, count = labelled
-            largest = np.bincount(parts.ravel())[1:].max() if count else 0
-            gaps.append(largest / max(group.subject_pixels(index), 1))
+            gaps.append(group.gap(index))
         return np.array(gaps)
+
+
+def shuffled_views(rng: np.random.Generator, view_count: int, steps: int) -> NDArray[np.int64]:
+    """Return which view each step looks at: all of them, shuffled, again and again; at least one round."""
+    rounds = max(-(-steps // view_count), 1)
+    return np.concatenate([rng.permutation(view_count) for _ in range(rounds)])
+
+
+def disc_spacing(cloud: GaussianCloud) -> float:
+    """Return the distance of neighbouring discs [m], from the median of their second largest deviations."""
+    return float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / DISC_WIDTH
+
+
+def chosen_samples(samples: int | Literal["auto"], cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
+    """Return the side of the square of samples of a pixel; `sample_side` chooses it where it is ``"auto"``."""
+    if samples != "auto":
+        return int(samples)
+    return sample_side(views, np.median(cloud.positions, axis=0), disc_spacing(cloud))
 
 
 def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:

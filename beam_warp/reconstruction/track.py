@@ -19,19 +19,16 @@ from scipy.spatial.transform import Rotation
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reconstruction.fit import FIT_RASTER, NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_step_progress
-from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.reconstruction.fit import NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
+from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
 from beam_warp.reconstruction.joints.selection import select_joints
 from beam_warp.reconstruction.joints.skinning import Anchors
-from beam_warp.reconstruction.parameters import require_scene_linear
-from beam_warp.reconstruction.targets import TargetSet, sample_side
+from beam_warp.reconstruction.parameters import require_scene_linear, require_something
+from beam_warp.reconstruction.targets import TargetSet, chosen_samples
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, sh_degree_of
 
 GAUSSIANS_PER_JOINT = 25
@@ -60,7 +57,6 @@ class TrackOptions:
         largest_gap: A frame is lost where a larger connected part of the subject, beyond the key frame's, stays
             uncovered in a view.
         largest_tear: A frame is lost where a larger part of the joints is torn from a neighbour.
-        raster: How splats are drawn.
 
     Raises:
         InvalidOptionError: An option is out of range.
@@ -76,7 +72,6 @@ class TrackOptions:
             temporal=1e-3,
         )
     )
-    raster: RasterOptions = FIT_RASTER
     largest_drop: float = 6.0
     largest_gap: float = 0.03
     largest_tear: float = 0.1
@@ -101,9 +96,10 @@ class TrackOptions:
             weights=fitting.weights,
             sh_degree=fitting.sh_degree,
             samples=fitting.samples,
+            raster=fitting.raster,
             seed=fitting.seed,
         )
-        return replace(self, refinement=refinement, raster=fitting.raster)
+        return replace(self, refinement=refinement)
 
     def __post_init__(self) -> None:
         """Check every option once."""
@@ -186,11 +182,13 @@ def begin_track(
 
     Source: Jiang et al. 2024, DualGS; `docs/tracking.md` lists what differs.
     """
-    _require_something(cloud, views)
+    require_something("cloud", cloud, views)
     require_scene_linear("cloud", cloud)
     count = options.joint_count or int(np.clip(len(cloud) // GAUSSIANS_PER_JOINT, *JOINT_LIMITS))
     rows = select_joints(cloud.positions, min(count, len(cloud)), opacities=cloud.opacities)
-    targets, gaussians = _drawn(cloud, views, options, device)
+    target, chosen = resolve_device(device), options.refinement
+    targets = TargetSet(views, len(cloud), chosen.raster, chosen_samples(chosen.samples, cloud, views), target)
+    gaussians = upload_gaussians(cloud, target, radiance=cloud.radiance)
     psnr, _ = targets.make_room(gaussians)
     normals = outward_normals(cloud, targets.seen_directions(gaussians))
     joints = cloud.positions[rows]
@@ -210,7 +208,7 @@ def advance_track(
     options: TrackOptions,
     *,
     device: str | None = None,
-    progress: StepProgress = no_step_progress,
+    progress: StepProgress = no_progress,
 ) -> tuple[Track, dict[str, Any]]:
     """Find the Gaussians of the next frame.
 
@@ -229,15 +227,15 @@ def advance_track(
         InvalidArrayError: There is no view.
         DeviceError: There is no such device.
     """
-    _require_something(track.cloud, views)
+    require_something("cloud", track.cloud, views)
     began = time.perf_counter()
     target = resolve_device(device)
     chosen = options.refinement
-    samples = chosen.samples if chosen.samples != "auto" else _samples(track.cloud, views)
-    tracker = JointTracker(
-        track.cloud, track.anchors, track.graph, track.joints, options.joints, options.raster, target
-    )
-    pose = tracker.find(views, _expected(track), samples, chosen.seed)
+    samples = chosen_samples(chosen.samples, track.cloud, views)
+    tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, options.joints, chosen.raster, target)
+    # Where joints will be if they go on as they went: turned once more by their last turn.
+    expected = JointPose(track.turns, 2.0 * track.joints - track.previous_joints)
+    pose = tracker.find(views, expected, samples, chosen.seed)
     carried = tracker.carried(track.cloud)
     refinement = replace(
         chosen,
@@ -245,7 +243,6 @@ def advance_track(
         refine_every=0,
         sh_degree=sh_degree_of(require_scene_linear("cloud", carried).shape[1]),  # the key frame's
         samples=samples,
-        raster=options.raster,
         sampling_filter=False,  # it is in the scales already
     )
     fitter = Fitter(views, carried, refinement, target)
@@ -280,36 +277,6 @@ def outward_normals(cloud: GaussianCloud, sides: NDArray[np.floating]) -> NDArra
     normals *= np.sign((normals * sides).sum(axis=1))[:, None]
     normals[~(cloud.scales[picked, thin] <= 0.5 * cloud.scales[picked, next_one])] = 0.0
     return normals.astype(np.float32)
-
-
-def _require_something(cloud: GaussianCloud, views: Sequence[CapturedView]) -> None:
-    """Refuse no views and no Gaussians."""
-    if not len(views) or not len(cloud):
-        raise InvalidArrayError(
-            f"views and cloud must hold something, got {len(views)} views and {len(cloud)} Gaussians. Pass some."
-        )
-
-
-def _expected(track: Track) -> JointPose:
-    """Return where joints will be if they go on as they went: turned once more by their last turn."""
-    return JointPose(track.turns, 2.0 * track.joints - track.previous_joints)
-
-
-def _samples(cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
-    """Return the samples that a fit of these Gaussians takes."""
-    spacing = float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / DISC_WIDTH
-    return sample_side(views, np.median(cloud.positions, axis=0), spacing)
-
-
-def _drawn(
-    cloud: GaussianCloud, views: Sequence[CapturedView], options: TrackOptions, device: str | None
-) -> tuple[TargetSet, GaussianArrays]:
-    """Return views, and a cloud to draw for them."""
-    target = resolve_device(device)
-    chosen = options.refinement.samples
-    samples = chosen if chosen != "auto" else _samples(cloud, views)
-    targets = TargetSet(views, len(cloud), options.raster, samples, target)
-    return targets, upload_gaussians(cloud, target, radiance=cloud.radiance)
 
 
 def _why_lost(

@@ -110,13 +110,6 @@ def add_shape_gradients_kernel(
     out_logits[item] += opacity_gradient * kept * peak * (1.0 - peak)
 
 
-@wp.kernel
-def add_rows_kernel(first: int, rows: wp.array2d[float], out_rows: wp.array2d[float]):
-    item = first + wp.tid()
-    width = rows.shape[1]
-    out_rows[item / width, item % width] += rows[item / width, item % width]
-
-
 def launch_activate(shapes: Shapes, out_scales: Any, out_opacities: Any, device: Any) -> None:
     """Write the scales and opacities that are drawn."""
     launch(activate_kernel, out_scales.size, inputs=[shapes], outputs=[out_scales, out_opacities], device=device)
@@ -126,15 +119,6 @@ def launch_add_shape_gradients(
     shapes: Shapes, scale_gradients: Any, opacity_gradients: Any, out_log_scales: Any, out_logits: Any, device: Any
 ) -> None:
     """Add the gradients of what is moved, given those of what is drawn."""
-    launch(
-        add_shape_gradients_kernel,
-        scale_gradients.size,
-        inputs=[shapes, scale_gradients, opacity_gradients],
-        outputs=[out_log_scales, out_logits],
-        device=device,
-    )
-
-
-def launch_add_rows(rows: Any, out_rows: Any, device: Any) -> None:
-    """Add rows of floats to others."""
-    launch(add_rows_kernel, rows.size, inputs=[rows], outputs=[out_rows], device=device)
+    inputs = [shapes, scale_gradients, opacity_gradients]
+    outputs = [out_log_scales, out_logits]
+    launch(add_shape_gradients_kernel, scale_gradients.size, inputs=inputs, outputs=outputs, device=device)

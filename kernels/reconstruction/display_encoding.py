@@ -25,52 +25,40 @@ def mean_sample(samples: wp.array3d[float], y: int, x: int, channel: int, factor
 
 
 @wp.kernel
-def encode_kernel(first: int, samples: wp.array3d[float], factor: int, out_encoded: wp.array3d[float]):
+def average_kernel(first: int, samples: wp.array3d[float], factor: int, is_color: bool, out_means: wp.array3d[float]):
     item = first + wp.tid()
-    y = item / out_encoded.shape[1]
-    x = item % out_encoded.shape[1]
-    for channel in range(out_encoded.shape[2]):
+    y = item / out_means.shape[1]
+    x = item % out_means.shape[1]
+    for channel in range(out_means.shape[2]):
         value = mean_sample(samples, y, x, channel, factor)
-        encoded = 12.92 * value
-        if value > KNEE:
-            encoded = 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
-        out_encoded[y, x, channel] = encoded
+        shown = value
+        if is_color:
+            shown = 12.92 * value
+            if value > KNEE:
+                shown = 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
+        out_means[y, x, channel] = shown
 
 
 @wp.kernel
 def add_sample_gradients_kernel(
-    first: int, samples: wp.array3d[float], factor: int, gradients: wp.array3d[float], out_gradients: wp.array3d[float]
+    first: int,
+    samples: wp.array3d[float],
+    factor: int,
+    is_color: bool,
+    gradients: wp.array3d[float],
+    out_gradients: wp.array3d[float],
 ):
     item = first + wp.tid()
     y = item / gradients.shape[1]
     x = item % gradients.shape[1]
     for channel in range(gradients.shape[2]):
-        value = mean_sample(samples, y, x, channel, factor)
-        slope = float(12.92)
-        if value > KNEE:
-            slope = (1.055 / 2.4) * wp.pow(value, 1.0 / 2.4 - 1.0)
+        slope = float(1.0)
+        if is_color:
+            slope = 12.92
+            value = mean_sample(samples, y, x, channel, factor)
+            if value > KNEE:
+                slope = (1.055 / 2.4) * wp.pow(value, 1.0 / 2.4 - 1.0)
         share = slope * gradients[y, x, channel] / float(factor * factor)
-        for j in range(factor):
-            for i in range(factor):
-                out_gradients[y * factor + j, x * factor + i, channel] += share
-
-
-@wp.kernel
-def average_kernel(first: int, samples: wp.array3d[float], factor: int, out_means: wp.array3d[float]):
-    item = first + wp.tid()
-    y = item / out_means.shape[1]
-    x = item % out_means.shape[1]
-    for channel in range(out_means.shape[2]):
-        out_means[y, x, channel] = mean_sample(samples, y, x, channel, factor)
-
-
-@wp.kernel
-def spread_kernel(first: int, gradients: wp.array3d[float], factor: int, out_gradients: wp.array3d[float]):
-    item = first + wp.tid()
-    y = item / gradients.shape[1]
-    x = item % gradients.shape[1]
-    for channel in range(gradients.shape[2]):
-        share = gradients[y, x, channel] / float(factor * factor)
         for j in range(factor):
             for i in range(factor):
                 out_gradients[y * factor + j, x * factor + i, channel] += share
@@ -88,29 +76,19 @@ def square_error_kernel(first: int, encoded: wp.array3d[float], target: wp.array
     out_errors[item] = total
 
 
-def launch_encode(samples: Any, factor: int, out_encoded: Any, device: Any) -> None:
-    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode; arrays may be strided."""
-    pixels = out_encoded.shape[0] * out_encoded.shape[1]
-    launch(encode_kernel, pixels, inputs=[samples, factor], outputs=[out_encoded], device=device)
-
-
-def launch_add_sample_gradients(samples: Any, factor: int, gradients: Any, out_gradients: Any, device: Any) -> None:
-    """Add the gradients of linear samples, given those of the encoded image."""
-    pixels = gradients.shape[0] * gradients.shape[1]
-    inputs = [samples, factor, gradients]
-    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
-
-
-def launch_average(samples: Any, factor: int, out_means: Any, device: Any) -> None:
-    """Average ``factor`` x ``factor`` samples a pixel."""
+def launch_average(samples: Any, factor: int, is_color: bool, out_means: Any, device: Any) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode colours; arrays may be strided."""
     pixels = out_means.shape[0] * out_means.shape[1]
-    launch(average_kernel, pixels, inputs=[samples, factor], outputs=[out_means], device=device)
+    launch(average_kernel, pixels, inputs=[samples, factor, is_color], outputs=[out_means], device=device)
 
 
-def launch_spread(gradients: Any, factor: int, out_gradients: Any, device: Any) -> None:
-    """Add the gradients of samples, given those of their averages."""
+def launch_add_sample_gradients(
+    samples: Any, factor: int, is_color: bool, gradients: Any, out_gradients: Any, device: Any
+) -> None:
+    """Add the gradients of linear samples, given those of what `launch_average` writes."""
     pixels = gradients.shape[0] * gradients.shape[1]
-    launch(spread_kernel, pixels, inputs=[gradients, factor], outputs=[out_gradients], device=device)
+    inputs = [samples, factor, is_color, gradients]
+    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
 
 
 def launch_square_error(encoded: Any, target: Any, out_errors: Any, device: Any) -> None:

@@ -78,10 +78,5 @@ def launch_push_apart(
     device: Any,
 ) -> None:
     """Move every point away from neighbours nearer than ``spacing``, and back to the mesh."""
-    launch(
-        push_apart_kernel,
-        len(positions),
-        inputs=[positions, normals, neighbors, spacing, surface],
-        outputs=[out_positions, out_normals],
-        device=device,
-    )
+    inputs = [positions, normals, neighbors, spacing, surface]
+    launch(push_apart_kernel, len(positions), inputs=inputs, outputs=[out_positions, out_normals], device=device)

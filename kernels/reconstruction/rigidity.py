@@ -39,6 +39,8 @@ class EdgeArrays:
 
 @wp.struct
 class JointPoses:
+    """Rotations of joints against their rest, of any length but 0, and their positions."""
+
     rotations: wp.array[wp.vec4]
     positions: wp.array[wp.vec3]
 
@@ -110,10 +112,6 @@ def launch_add_rigidity(
     device: Any,
 ) -> None:
     """Write every joint's weighted sum of squared residuals, and add ``scale`` times its gradients."""
-    launch(
-        add_rigidity_kernel,
-        out_terms.size,
-        inputs=[edges, now, previous, scale],
-        outputs=[out_terms, out_rotation_gradients, out_position_gradients],
-        device=device,
-    )
+    inputs = [edges, now, previous, scale]
+    outputs = [out_terms, out_rotation_gradients, out_position_gradients]
+    launch(add_rigidity_kernel, out_terms.size, inputs=inputs, outputs=outputs, device=device)

@@ -50,10 +50,5 @@ def launch_write_sampling_limits(
 
     A view sees what is farther than ``near`` [m] and inside its image grown by ``margin`` of its sides.
     """
-    launch(
-        write_sampling_limits_kernel,
-        len(positions),
-        inputs=[positions, views, near, margin, factor],
-        outputs=[out_limits],
-        device=device,
-    )
+    inputs = [positions, views, near, margin, factor]
+    launch(write_sampling_limits_kernel, len(positions), inputs=inputs, outputs=[out_limits], device=device)

@@ -127,13 +127,8 @@ def launch_sample_colors(
     A point is seen where it is not farther than the image's depth by more than ``slack`` [m], and its normal faces the
     camera by a cosine above ``least_facing``; points whose normal is 0 face all cameras.
     """
-    launch(
-        sample_colors_kernel,
-        len(positions),
-        inputs=[positions, normals, image, slack, least_facing, row],
-        outputs=[out_samples],
-        device=device,
-    )
+    inputs = [positions, normals, image, slack, least_facing, row]
+    launch(sample_colors_kernel, len(positions), inputs=inputs, outputs=[out_samples], device=device)
 
 
 def launch_agree_colors(samples: Any, out_colors: Any, out_seen: Any, device: Any) -> None:

@@ -38,38 +38,28 @@ def measure_lines_kernel(first: int, alpha: wp.array2d[float], across: int, limi
     # Down the line and up again; columns for across = 0, rows for 1.
     line = first + wp.tid()
     length = alpha.shape[across]
-    gap = float(limit)
-    before = float(0.0)
-    for i in range(length):
-        y = i
-        x = line
-        if across == 1:
-            y = line
-            x = i
-        here = alpha[y, x]
-        gap = wp.min(gap + 1.0, limit)
-        if i > 0:
-            part = crossing(before, here)
-            if part >= 0.0:
-                gap = 1.0 - part
-        out_gaps[y, x] = gap
-        before = here
-    gap = limit
-    for j in range(length):
-        i = length - 1 - j
-        y = i
-        x = line
-        if across == 1:
-            y = line
-            x = i
-        here = alpha[y, x]
-        gap = wp.min(gap + 1.0, limit)
-        if j > 0:
-            part = crossing(before, here)
-            if part >= 0.0:
-                gap = 1.0 - part
-        out_gaps[y, x] = wp.min(out_gaps[y, x], gap)
-        before = here
+    for way in range(2):
+        gap = float(limit)
+        before = float(0.0)
+        for j in range(length):
+            y = j
+            if way == 1:
+                y = length - 1 - j
+            x = line
+            if across == 1:
+                x = y
+                y = line
+            here = alpha[y, x]
+            gap = wp.min(gap + 1.0, limit)
+            if j > 0:
+                part = crossing(before, here)
+                if part >= 0.0:
+                    gap = 1.0 - part
+            if way == 0:
+                out_gaps[y, x] = gap
+            else:
+                out_gaps[y, x] = wp.min(out_gaps[y, x], gap)
+            before = here
 
 
 @wp.kernel
@@ -122,10 +112,5 @@ def launch_measure_silhouette(
             device=device,
             min_chunk=MIN_LINES,
         )
-    launch(
-        measure_pixels_kernel,
-        alpha.size,
-        inputs=[alpha, column_gaps, row_gaps, limit, first_pixel],
-        outputs=[out_distances],
-        device=device,
-    )
+    inputs = [alpha, column_gaps, row_gaps, limit, first_pixel]
+    launch(measure_pixels_kernel, alpha.size, inputs=inputs, outputs=[out_distances], device=device)

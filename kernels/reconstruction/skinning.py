@@ -33,6 +33,7 @@ from beam_warp.kernels.common.quaternions import (
     vector_part,
 )
 from beam_warp.kernels.common.row_loads import load_row
+from beam_warp.kernels.reconstruction.rigidity import JointPoses
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,6 +73,15 @@ class Runs:
 
 
 @wp.struct
+class Messages:
+    """What skins and runs of skins tell their joints, on the way to the gradients of the joints' poses."""
+
+    skins: wp.array[wp.vec4]  # `MESSAGE` rows for each skin
+    run_rotations: wp.array[wp.vec4]
+    run_positions: wp.array[wp.vec3]
+
+
+@wp.struct
 class Blend:
     rotation: wp.quat  # b, not of unit length
     swept: wp.quat  # e, from the origin; dual only
@@ -89,17 +99,17 @@ def signed_weight(weight: float, rotation: wp.quat, first: wp.quat) -> float:
 
 
 @wp.func
-def blend_joints(rest: RestSkin, rotations: wp.array[wp.vec4], positions: wp.array[wp.vec3], skin: int) -> Blend:
+def blend_joints(rest: RestSkin, poses: JointPoses, skin: int) -> Blend:
     x = rest.positions[skin]
     head = rest.joints[0, skin]
-    first = load_rotation(rotations, head)
+    first = load_rotation(poses.rotations, head)
     blend = Blend()
-    blend.origin = positions[head]
+    blend.origin = poses.positions[head]
     for slot in range(rest.joints.shape[0]):
         joint = rest.joints[slot, skin]
         weight = rest.weights[slot, skin]
-        rotation = load_rotation(rotations, joint)
-        y = wp.quat_rotate(rotation, x - rest.joint_positions[joint]) + (positions[joint] - blend.origin)
+        rotation = load_rotation(poses.rotations, joint)
+        y = wp.quat_rotate(rotation, x - rest.joint_positions[joint]) + (poses.positions[joint] - blend.origin)
         signed = signed_weight(weight, rotation, first)
         blend.rotation += signed * rotation
         blend.moved += weight * y
@@ -113,15 +123,10 @@ def blend_joints(rest: RestSkin, rotations: wp.array[wp.vec4], positions: wp.arr
 
 @wp.kernel
 def warp_skin_kernel(
-    first: int,
-    rest: RestSkin,
-    rotations: wp.array[wp.vec4],
-    positions: wp.array[wp.vec3],
-    out_positions: wp.array[wp.vec3],
-    out_orientations: wp.array[wp.vec4],
+    first: int, rest: RestSkin, poses: JointPoses, out_positions: wp.array[wp.vec3], out_orientations: wp.array[wp.vec4]
 ):
     skin = first + wp.tid()
-    blend = blend_joints(rest, rotations, positions, skin)
+    blend = blend_joints(rest, poses, skin)
     out_positions[skin] = blend.origin + blend.moved
     out_orientations[skin] = as_row(wp.normalize(blend.rotation) * load_quaternion(rest.orientations, skin))
 
@@ -130,14 +135,13 @@ def warp_skin_kernel(
 def write_messages_kernel(
     first: int,
     rest: RestSkin,
-    rotations: wp.array[wp.vec4],
-    positions: wp.array[wp.vec3],
+    poses: JointPoses,
     position_gradients: wp.array[wp.vec3],
     orientation_gradients: wp.array[wp.vec4],
-    out_messages: wp.array[wp.vec4],
+    out_messages: Messages,
 ):
     skin = first + wp.tid()
-    blend = blend_joints(rest, rotations, positions, skin)
+    blend = blend_joints(rest, poses, skin)
     g = wp.vec3(0.0, 0.0, 0.0)
     if position_gradients:
         g = position_gradients[skin]
@@ -153,56 +157,46 @@ def write_messages_kernel(
         to_position = pure(g) * blend.rotation / norm
     x = rest.positions[skin]
     message = MESSAGE * rest.places[skin]
-    out_messages[message] = wp.vec4(x[0], x[1], x[2], float(rest.joints[0, skin]))
-    out_messages[message + 1] = as_row(to_rotation)
-    out_messages[message + 2] = as_row(to_position)
+    out_messages.skins[message] = wp.vec4(x[0], x[1], x[2], float(rest.joints[0, skin]))
+    out_messages.skins[message + 1] = as_row(to_rotation)
+    out_messages.skins[message + 2] = as_row(to_position)
 
 
 @wp.kernel
-def sum_runs_kernel(
-    first: int,
-    rest: RestSkin,
-    runs: Runs,
-    rotations: wp.array[wp.vec4],
-    positions: wp.array[wp.vec3],
-    messages: wp.array[wp.vec4],
-    out_rotations: wp.array[wp.vec4],
-    out_positions: wp.array[wp.vec3],
-):
+def sum_runs_kernel(first: int, rest: RestSkin, runs: Runs, poses: JointPoses, out_messages: Messages):
     run = first + wp.tid()
     joint = runs.joints[run]
-    rotation = load_rotation(rotations, joint)
-    position = positions[joint]
+    rotation = load_rotation(poses.rotations, joint)
+    position = poses.positions[joint]
     joint_rest = rest.joint_positions[joint]
     to_rotation = wp.quat(0.0, 0.0, 0.0, 0.0)
     to_position = wp.vec3(0.0, 0.0, 0.0)
     for pair in range(runs.first_pairs[run], runs.first_pairs[run + 1]):
         message = MESSAGE * runs.places[pair]
         weight = runs.weights[pair]
-        row = load_row(messages, message)
+        row = load_row(out_messages.skins, message)
         v = wp.vec3(row[0], row[1], row[2]) - joint_rest
         head = int(row[3])
-        signed = signed_weight(weight, rotation, load_rotation(rotations, head))
-        upstream = load_quaternion(messages, message + 2)
+        signed = signed_weight(weight, rotation, load_rotation(poses.rotations, head))
+        upstream = load_quaternion(out_messages.skins, message + 2)
         g = weight * vector_part(upstream)
-        to_rotation += signed * load_quaternion(messages, message + 1)
+        to_rotation += signed * load_quaternion(out_messages.skins, message + 1)
         if rest.dual != 0:
-            y = wp.quat_rotate(rotation, v) + (position - positions[head])
+            y = wp.quat_rotate(rotation, v) + (position - poses.positions[head])
             to_rotation -= signed * (pure(y) * upstream)
             g = signed * vector_part(upstream * conjugate(rotation))
         to_position += g
         to_rotation += rotate_adjoint(rotation, v, g)
-    out_rotations[run] = as_row(to_rotation)
-    out_positions[run] = to_position
+    out_messages.run_rotations[run] = as_row(to_rotation)
+    out_messages.run_positions[run] = to_position
 
 
 @wp.kernel
 def add_joint_gradients_kernel(
     first: int,
     runs: Runs,
-    rotations: wp.array[wp.vec4],
-    run_rotations: wp.array[wp.vec4],
-    run_positions: wp.array[wp.vec3],
+    poses: JointPoses,
+    messages: Messages,
     out_rotations: wp.array[wp.vec4],
     out_positions: wp.array[wp.vec3],
 ):
@@ -210,79 +204,37 @@ def add_joint_gradients_kernel(
     to_rotation = wp.quat(0.0, 0.0, 0.0, 0.0)
     to_position = wp.vec3(0.0, 0.0, 0.0)
     for run in range(runs.first_runs[joint], runs.first_runs[joint + 1]):
-        to_rotation += load_quaternion(run_rotations, run)
-        to_position += run_positions[run]
-    to_rotation = normalization_adjoint(load_quaternion(rotations, joint), to_rotation)
+        to_rotation += load_quaternion(messages.run_rotations, run)
+        to_position += messages.run_positions[run]
+    to_rotation = normalization_adjoint(load_quaternion(poses.rotations, joint), to_rotation)
     out_rotations[joint] += as_row(to_rotation)
     out_positions[joint] += to_position
 
 
-def launch_warp_skin(
-    rest: Any, rotations: Any, positions: Any, out_positions: Any, out_orientations: Any, device: Any
-) -> None:
+def launch_warp_skin(rest: Any, poses: Any, out_positions: Any, out_orientations: Any, device: Any) -> None:
     """Write where the joints carry every skin, and how they turn it."""
-    launch(
-        warp_skin_kernel,
-        out_positions.size,
-        inputs=[rest, rotations, positions],
-        outputs=[out_positions, out_orientations],
-        device=device,
-    )
+    outputs = [out_positions, out_orientations]
+    launch(warp_skin_kernel, out_positions.size, inputs=[rest, poses], outputs=outputs, device=device)
 
 
-def launch_write_messages(
+def launch_add_pose_gradients(
     rest: Any,
-    rotations: Any,
-    positions: Any,
+    runs: Any,
+    poses: Any,
     position_gradients: Any,
     orientation_gradients: Any,
     out_messages: Any,
-    device: Any,
-) -> None:
-    """Write what every skin tells all of its joints, `MESSAGE` rows each."""
-    launch(
-        write_messages_kernel,
-        out_messages.size // MESSAGE,
-        inputs=[rest, rotations, positions, position_gradients, orientation_gradients],
-        outputs=[out_messages],
-        device=device,
-    )
-
-
-def launch_sum_runs(
-    rest: Any,
-    runs: Any,
-    rotations: Any,
-    positions: Any,
-    messages: Any,
     out_rotations: Any,
     out_positions: Any,
     device: Any,
 ) -> None:
-    """Write what every run of skins adds to the gradients of its joint; rotations as if they were unit quaternions."""
-    launch(
-        sum_runs_kernel,
-        out_positions.size,
-        inputs=[rest, runs, rotations, positions, messages],
-        outputs=[out_rotations, out_positions],
-        device=device,
-    )
+    """Add the gradients of the joints' poses, given those of the skins' positions and orientations, or None.
 
-
-def launch_add_joint_gradients(
-    runs: Any,
-    rotations: Any,
-    run_rotations: Any,
-    run_positions: Any,
-    out_rotations: Any,
-    out_positions: Any,
-    device: Any,
-) -> None:
-    """Add the sums of the runs to every joint's gradients, through the normalisation of its rotation."""
-    launch(
-        add_joint_gradients_kernel,
-        out_positions.size,
-        inputs=[runs, rotations, run_rotations, run_positions],
-        outputs=[out_rotations, out_positions],
-        device=device,
-    )
+    Runs add up rotations as if they were unit quaternions; the joints' sums go through the normalisation.
+    """
+    inputs = [rest, poses, position_gradients, orientation_gradients]
+    launch(write_messages_kernel, len(rest.places), inputs=inputs, outputs=[out_messages], device=device)
+    launch(sum_runs_kernel, len(runs.joints), inputs=[rest, runs, poses], outputs=[out_messages], device=device)
+    inputs = [runs, poses, out_messages]
+    outputs = [out_rotations, out_positions]
+    launch(add_joint_gradients_kernel, out_positions.size, inputs=inputs, outputs=outputs, device=device)

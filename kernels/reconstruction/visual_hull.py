@@ -35,6 +35,24 @@ SURFACE = wp.constant(1)
 INSIDE = wp.constant(2)
 
 
+@wp.struct
+class Silhouettes:
+    """Signed distances to the silhouettes of views, and how many views have to see a point inside."""
+
+    views: wp.array[RasterView]
+    distances: wp.array[float]  # of all pixels, view by view [pixel]
+    quorum: int
+
+
+@wp.struct
+class Grid:
+    """Cubes from ``origin`` on: ``count`` blocks of a size, or the voxels of ``count`` blocks."""
+
+    origin: wp.vec3
+    size: float  # of a cube [m]
+    count: wp.vec3i
+
+
 @wp.func
 def silhouette_distance(view: RasterView, distances: wp.array[float], pixel: wp.vec2) -> float:
     """Signed distance [pixel] at a place of the image, bilinear between centres; constant beyond the outermost."""
@@ -59,51 +77,42 @@ def mean_focal(view: RasterView) -> float:
 
 
 @wp.func
-def hull_depth(
-    point: wp.vec3, views: wp.array[RasterView], distances: wp.array[float], quorum: int, unseen: float
-) -> float:
+def hull_depth(point: wp.vec3, silhouettes: Silhouettes, unseen: float) -> float:
     """Depth [m] in the cones: the least of all views that see the point.
 
-    A point that fewer than ``quorum`` views see is as far outside as ``unseen`` says.
+    A point that fewer views than the quorum see is as far outside as ``unseen`` says.
     """
     least = float(wp.inf)
     seen = int(0)
-    for i in range(views.shape[0]):
-        view = views[i]
+    for i in range(silhouettes.views.shape[0]):
+        view = silhouettes.views[i]
         p = camera_point(view, point)
         if p[2] > NEAR:
             pixel = image_point(view, p)
             if room_around(view, pixel) >= 0.0:
                 seen += 1
-                depth = silhouette_distance(view, distances, pixel) * p[2] / mean_focal(view)
+                depth = silhouette_distance(view, silhouettes.distances, pixel) * p[2] / mean_focal(view)
                 least = wp.min(least, depth)
-    if seen < quorum:
+    if seen < silhouettes.quorum:
         return -unseen
     return least
 
 
 @wp.kernel
-def judge_blocks_kernel(
-    first: int,
-    origin: wp.vec3,
-    size: float,
-    count: wp.vec3i,
-    views: wp.array[RasterView],
-    distances: wp.array[float],
-    quorum: int,
-    out_states: wp.array[int],
-):
+def judge_blocks_kernel(first: int, grid: Grid, silhouettes: Silhouettes, out_states: wp.array[int]):
     block = first + wp.tid()
+    count = grid.count
+    size = grid.size
     k = block % count[2]
     j = block / count[2] % count[1]
     i = block / (count[2] * count[1])
-    center = origin + size * (wp.vec3(float(i), float(j), float(k)) + wp.vec3(0.5, 0.5, 0.5))
+    center = grid.origin + size * (wp.vec3(float(i), float(j), float(k)) + wp.vec3(0.5, 0.5, 0.5))
     radius = 0.8660254037844386 * size
     possible = int(0)  # views that may see some of the block
     against = int(0)  # that see all of it outside
     agreeing = int(0)  # that see all of it inside
-    for v in range(views.shape[0]):
-        view = views[v]
+    for v in range(silhouettes.views.shape[0]):
+        view = silhouettes.views[v]
         p = camera_point(view, center)
         z = p[2]
         if z > radius + NEAR:
@@ -116,7 +125,7 @@ def judge_blocks_kernel(
             if room > -reach:
                 possible += 1
             if room > reach:
-                distance = silhouette_distance(view, distances, pixel)
+                distance = silhouette_distance(view, silhouettes.distances, pixel)
                 if distance < -(reach + PIXEL_MARGIN):
                     against += 1
                 elif distance > reach + PIXEL_MARGIN:
@@ -124,7 +133,7 @@ def judge_blocks_kernel(
         elif z > -radius:
             possible += 1
     state = SURFACE
-    if against > 0 or possible - against < quorum:
+    if against > 0 or possible - against < silhouettes.quorum:
         state = OUTSIDE
     elif agreeing == possible:  # a quorum, by the line before
         state = INSIDE
@@ -133,15 +142,7 @@ def judge_blocks_kernel(
 
 @wp.kernel
 def fill_blocks_kernel(
-    first: int,
-    blocks: wp.array[wp.vec3i],
-    origin: wp.vec3,
-    voxel: float,
-    count: wp.vec3i,
-    views: wp.array[RasterView],
-    distances: wp.array[float],
-    quorum: int,
-    out_depths: wp.array[float],
+    first: int, blocks: wp.array[wp.vec3i], grid: Grid, silhouettes: Silhouettes, out_depths: wp.array[float]
 ):
     item = first + wp.tid()
     corner = item % BLOCK_POINTS
@@ -150,10 +151,11 @@ def fill_blocks_kernel(
     i = block[0] * BLOCK + corner / (side * side)
     j = block[1] * BLOCK + corner / side % side
     k = block[2] * BLOCK + corner % side
-    point = origin + voxel * wp.vec3(float(i), float(j), float(k))
-    depth = hull_depth(point, views, distances, quorum, voxel)
+    voxel = grid.size
+    point = grid.origin + voxel * wp.vec3(float(i), float(j), float(k))
+    depth = hull_depth(point, silhouettes, voxel)
     # The grid ends outside, so that the surface is closed where the box cuts it.
-    ends = count * BLOCK
+    ends = grid.count * BLOCK
     if i == 0 or j == 0 or k == 0 or i == ends[0] or j == ends[1] or k == ends[2]:
         depth = wp.min(depth, -voxel)
     out_depths[item] = depth
@@ -213,38 +215,15 @@ def gather_cells_kernel(
             out_depths[before, corner] = depths[block * BLOCK_POINTS + corner_index(cell, corner)]
 
 
-def launch_judge_blocks(
-    origin: Any, size: float, count: Any, views: Any, distances: Any, quorum: int, out_states: Any, device: Any
-) -> None:
-    """Write which blocks of a grid are outside, inside, or may hold surface; cubes of ``size`` from ``origin`` on."""
-    launch(
-        judge_blocks_kernel,
-        len(out_states),
-        inputs=[origin, size, count, views, distances, quorum],
-        outputs=[out_states],
-        device=device,
-    )
+def launch_judge_blocks(grid: Grid, silhouettes: Silhouettes, out_states: Any, device: Any) -> None:
+    """Write which blocks of a grid are outside, inside, or may hold surface."""
+    launch(judge_blocks_kernel, len(out_states), inputs=[grid, silhouettes], outputs=[out_states], device=device)
 
 
-def launch_fill_blocks(
-    blocks: Any,
-    origin: Any,
-    voxel: float,
-    count: Any,
-    views: Any,
-    distances: Any,
-    quorum: int,
-    out_depths: Any,
-    device: Any,
-) -> None:
-    """Write the depths at all points of some blocks, ``BLOCK_POINTS`` each."""
-    launch(
-        fill_blocks_kernel,
-        len(out_depths),
-        inputs=[blocks, origin, voxel, count, views, distances, quorum],
-        outputs=[out_depths],
-        device=device,
-    )
+def launch_fill_blocks(blocks: Any, grid: Grid, silhouettes: Silhouettes, out_depths: Any, device: Any) -> None:
+    """Write the depths at all points of some blocks, ``BLOCK_POINTS`` each; the grid's cubes are voxels."""
+    inputs = [blocks, grid, silhouettes]
+    launch(fill_blocks_kernel, len(out_depths), inputs=inputs, outputs=[out_depths], device=device)
 
 
 def launch_find_cells(depths: Any, out_crossed: Any, device: Any) -> None:

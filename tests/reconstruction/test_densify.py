@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
+from support.float32 import EPSILON
 from support.moving_ball import ball_cloud
 
 from beam_warp.image.color import LINEAR_REC709
@@ -12,8 +13,6 @@ from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, hidden,
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-
-EPSILON = 2.0**-24
 
 
 def rows_of(rng, count):
@@ -67,12 +66,6 @@ class TestSplit:
     def test_variance_along_the_axis_is_four_fifths(self):
         assert pytest.approx(0.8, abs=0.02) == SPLIT_OFFSET**2 + SPLIT_SHRINK**2
 
-    def test_none_is_none(self, rng):
-        rows = rows_of(rng, 5)
-        before = copied(rows)
-        split(rows, np.zeros(0, int), np.zeros(0, int))
-        assert all((rows[name] == before[name]).all() for name in rows)
-
     @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
     def test_the_image_of_a_disc_hardly_changes(self, device, opacity):
         """The image keeps its middle and its height; it gets up to 1.3 times as bright: halves hold 2 x 0.65 of it.
@@ -111,7 +104,7 @@ class TestSplit:
 
 class TestHidden:
     def test_those_that_show_least(self):
-        """At most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
+        """Those that show least, at most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
         shares = np.array([50.0, 1.0, 10.0, 2.0, 36.0, 1.0])
         assert np.flatnonzero(hidden(shares, 0.05)).tolist() == [1, 3, 5]
         assert np.flatnonzero(hidden(shares, 0.01)).tolist() == [1]  # of the equal ones, the first

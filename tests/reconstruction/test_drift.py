@@ -31,6 +31,12 @@ def cloud(positions, turn=None, ids=None, **changes):
     return GaussianCloud(**(fields | changes))
 
 
+def drift(clouds, meshes=None, device="cpu", **options):
+    """The drift over the sphere, which stays as it is unless ``meshes`` say otherwise."""
+    meshes = [SPHERE.vertices] * len(clouds) if meshes is None else meshes
+    return tracking_drift(clouds, meshes, SPHERE.faces, device=device, **options)
+
+
 @pytest.fixture
 def points(rng):
     """Points up to 5 mm above or below the sphere's facets."""
@@ -44,9 +50,7 @@ class TestDrift:
         turn = Rotation.from_euler("xyz", (20, -35, 50), degrees=True)
         move = np.array([0.3, -0.1, 0.2])
         meshes = [SPHERE.vertices, turn.apply(SPHERE.vertices) + move]
-        found = tracking_drift(
-            [cloud(points), cloud(turn.apply(points) + move, turn)], meshes, SPHERE.faces, device=device
-        )
+        found = drift([cloud(points), cloud(turn.apply(points) + move, turn)], meshes, device)
         for frame in found:
             assert frame.followed == 1.0
             assert frame.gaussians.p95_mm < ROUNDING_MM
@@ -56,9 +60,7 @@ class TestDrift:
 
     def test_a_slip_is_found_as_it_is(self, device, points):
         turn = Rotation.from_euler("z", 0.02)  # a slide over the surface, 0.02 times the distance to the axis
-        found = tracking_drift(
-            [cloud(points), cloud(turn.apply(points), turn)], [SPHERE.vertices] * 2, SPHERE.faces, device=device
-        )[1]
+        found = drift([cloud(points), cloud(turn.apply(points), turn)], device=device)[1]
         slip = 1e3 * 2.0 * np.sin(0.01) * np.linalg.norm(points[:, :2], axis=1)
         assert found.gaussians.mean_mm == pytest.approx(slip.mean(), abs=ROUNDING_MM)
         assert found.gaussians.median_mm == pytest.approx(np.median(slip), abs=ROUNDING_MM)
@@ -70,19 +72,19 @@ class TestDrift:
         stretched = SPHERE.vertices * (1.1, 1.0, 0.9)
         on = SPHERE.triangles.mean(axis=1)
         after = stretched[SPHERE.faces].mean(axis=1)
-        found = tracking_drift([cloud(on), cloud(after)], [SPHERE.vertices, stretched], SPHERE.faces, device=device)[1]
+        found = drift([cloud(on), cloud(after)], [SPHERE.vertices, stretched], device)[1]
         assert found.gaussians.p95_mm < ROUNDING_MM
 
     def test_rows_are_matched_by_identity(self, points, rng):
         order = rng.permutation(500)
         ids = 7 * np.arange(500) + 3
         later = cloud(points[order], ids=ids[order])
-        found = tracking_drift([cloud(points, ids=ids), later], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        found = drift([cloud(points, ids=ids), later])[1]
         assert found.gaussians.p95_mm < ROUNDING_MM
 
     def test_what_is_gone_is_not_followed(self, points):
         later = cloud(np.concatenate([points[:400], points[:50]]), ids=np.r_[0:400, 1000:1050])
-        found = tracking_drift([cloud(points), later], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        found = drift([cloud(points), later])[1]
         assert found.followed == 0.8
         assert found.gaussians.count == 400
 
@@ -92,33 +94,32 @@ class TestDrift:
         opacities = np.full(500, 0.9)
         opacities[-50:] = 0.01
         start = cloud(away, opacities=opacities)
-        found = tracking_drift([start, start], [SPHERE.vertices] * 2, SPHERE.faces, device="cpu")[1]
+        found = drift([start, start])[1]
         assert found.gaussians.count == 350
 
     def test_only_vertices_that_a_camera_sees_count(self, points):
         camera = Camera.orbit((0, 0, 0), 4.0, 90.0, 0.0, width=64, height=64, vertical_fov=40.0)
-        found = tracking_drift([cloud(points)], [SPHERE.vertices], SPHERE.faces, cameras=[camera], device="cpu")[0]
+        found = drift([cloud(points)], cameras=[camera])[0]
         assert 0.3 < found.vertices.count / len(SPHERE.vertices) < 0.55
 
 
 class TestErrors:
-    def test_clouds_without_ids_are_refused(self, points):
-        with pytest.raises(InvalidArrayError, match="clouds must have ids, got none in frame 0"):
-            tracking_drift([cloud(points).with_arrays(ids=None)], [SPHERE.vertices], SPHERE.faces, device="cpu")
-
-    def test_new_identities_are_refused(self, points):
-        with pytest.raises(InvalidArrayError, match="clouds must keep ids of the first frame, got none in frame 1"):
-            tracking_drift(
-                [cloud(points), cloud(points, ids=np.arange(500) + 500)],
-                [SPHERE.vertices] * 2,
-                SPHERE.faces,
-                device="cpu",
-            )
-
-    def test_clouds_elsewhere_are_refused(self, points):
-        with pytest.raises(InvalidArrayError, match="clouds must start within"):
-            tracking_drift([cloud(points + 9.0)], [SPHERE.vertices], SPHERE.faces, device="cpu")
+    @pytest.mark.parametrize(
+        ("shift", "ids", "match"),
+        [
+            (0.0, [None], "clouds must have ids, got none in frame 0"),
+            (
+                0.0,
+                [np.arange(500), np.arange(500) + 500],
+                "clouds must keep ids of the first frame, got none in frame 1",
+            ),
+            (9.0, [np.arange(500)], "clouds must start within"),
+        ],
+    )
+    def test_clouds_that_cannot_be_followed_are_refused(self, points, shift, ids, match):
+        with pytest.raises(InvalidArrayError, match=match):
+            drift([cloud(points + shift).with_arrays(ids=own) for own in ids])
 
     def test_another_topology_is_refused(self, points):
         with pytest.raises(InvalidArrayError, match="vertices must have"):
-            tracking_drift([cloud(points)] * 2, [SPHERE.vertices, SPHERE.vertices[:-1]], SPHERE.faces, device="cpu")
+            drift([cloud(points)] * 2, [SPHERE.vertices, SPHERE.vertices[:-1]])

@@ -8,7 +8,7 @@ import pytest
 
 from beam_warp.reconstruction import steps
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.frames.protocols import no_step_progress
+from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.steps import MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
 
@@ -34,7 +34,7 @@ def advanced(monkeypatch, views, *, before, after, gap=0.0, lost=""):
     following = SimpleNamespace(cloud=cloud, joints=joints + after)
     report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
     monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
-    return STEPS.advance(track, views, no_step_progress)[1]
+    return STEPS.advance(track, views, no_progress)[1]
 
 
 class TestTrackedFrames:
@@ -70,19 +70,19 @@ class TestTrackedFrames:
 
 class TestKeyFrames:
     def test_cameras_too_few_for_the_surface_are_said(self, views):
-        _, report = STEPS.begin(views, no_step_progress)
+        _, report = STEPS.begin(views, no_progress)
         assert report["findings"] == []
         assert report["unpaired"] <= MOST_UNPAIRED
-        _, report = STEPS.begin(views[::3], no_step_progress)  # two, on opposite sides
+        _, report = STEPS.begin(views[::3], no_progress)  # two, on opposite sides
         assert [finding["code"] for finding in report["findings"]] == ["few-cameras"]
         assert report["unpaired"] > 0.9
 
     def test_a_fit_with_a_matched_view_is_nearer_to_the_sound_one(self, monkeypatch, views):
         wrong = list(views)
         wrong[2] = replace(wrong[2], color=wrong[2].color * np.float32(2.0))
-        (sound, _), (mended, report) = STEPS.begin(views, no_step_progress), STEPS.begin(wrong, no_step_progress)
+        (sound, _), (mended, report) = STEPS.begin(views, no_progress), STEPS.begin(wrong, no_progress)
         assert [(f["code"], f["where"]) for f in report["findings"]] == [("camera-exposure", views[2].name)]
         monkeypatch.setattr(steps, "matched", lambda views, gains: list(views))
-        naive, _ = STEPS.begin(wrong, no_step_progress)
+        naive, _ = STEPS.begin(wrong, no_progress)
         apart, naively = (np.abs(t.cloud.radiance - sound.cloud.radiance)[:, 0].mean() for t in (mended, naive))
         assert apart < naively

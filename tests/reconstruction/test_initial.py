@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from support.capture_scenes import ball_view, ball_views, cameras_around
 
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
@@ -188,11 +187,8 @@ class TestRefusals:
 
 
 def test_walker_is_opaque_and_of_its_colors(data_dir, device):
-    views = []
-    for record in Capture.read(data_dir / "captures" / "walker").select(split="train", frames=[0]):
-        rgba = record.image().linear_rgba()
-        alpha = np.clip(rgba[..., 3], 0.0, 1.0)
-        views.append(CapturedView(name=record.name, camera=record.camera, color=rgba[..., :3], alpha=alpha).reduced(2))
+    records = Capture.read(data_dir / "captures" / "walker").select(split="train", frames=[0])
+    views = [record.view().reduced(2) for record in records]
     cloud = initial_gaussians(views, 6000, device=device)
     for view in views[:3]:
         drawn = rasterize(cloud, view.camera, channels=("radiance",), device=device)

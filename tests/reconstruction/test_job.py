@@ -55,6 +55,12 @@ def paired(folder, tmp_path_factory):
     return steps, out, reconstruct(Capture.read(folder), out, steps, PAIRS)
 
 
+@pytest.fixture
+def continued(followed, tmp_path):
+    """A folder with all that the run of one segment wrote."""
+    return shutil.copytree(followed[1], tmp_path / "out")
+
+
 def results(out):
     """Every byte that a run promises, by file: all but times and what is remembered of the images."""
     return {
@@ -239,19 +245,12 @@ class TestResuming:
 
     @pytest.mark.slow
     def test_sigkill(self, folder, capture, tmp_path):
-        """A process killed while it works, with a frame half written."""
+        """A process killed while it works."""
         script = (
-            "import sys, time\n"
-            "import beam_warp.reconstruction.job as module\n"
             "from beam_warp.capture.capture import Capture\n"
-            "from support.fake_steps import FakeSteps\n"
-            "class Slow(FakeSteps):\n"
-            "    def advance(self, track, views, progress):\n"
-            "        from pathlib import Path\n"
-            f"        Path({str(tmp_path / 'out/frames/.frame_000001.h5.1.tmp')!r}).write_bytes(b'half')\n"
-            "        print('working', flush=True)\n"
-            "        time.sleep(600)\n"
-            f"module.reconstruct(Capture.read({str(folder)!r}), {str(tmp_path / 'out')!r}, Slow())\n"
+            "from beam_warp.reconstruction.job import reconstruct\n"
+            "from support.fake_steps import StuckSteps\n"
+            f"reconstruct(Capture.read({str(folder)!r}), {str(tmp_path / 'out')!r}, StuckSteps())\n"
         )
         paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
         process = subprocess.Popen(
@@ -264,8 +263,7 @@ class TestResuming:
             process.wait()
             process.stdout.close()
         assert not (tmp_path / "out" / "gaussians.usda").exists()
-        (tmp_path / "out" / ".gaussians.abc").mkdir()  # as a kill within the asset's writer leaves
-        (tmp_path / "out" / ".gaussians.abc" / "half.usdc").write_bytes(b"half")
+        leave_half_written(tmp_path / "out")
         found = reconstruct(capture, tmp_path / "out", FakeSteps())
         assert found.report["resumed_frames"] == 1
         reconstruct(capture, tmp_path / "whole", FakeSteps())
@@ -275,44 +273,38 @@ class TestResuming:
         assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(2, 2), PAIRS) == (2, 3)
         assert not (tmp_path / "out" / "gaussians.usda").exists()
         assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2), PAIRS) == (0, 1)
+        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(3, 3), PAIRS) == ()
         steps = FakeSteps()
         reconstruct(capture, tmp_path / "out", steps, PAIRS)
         assert steps.calls == []
         assert not differing(results(paired[1]), results(tmp_path / "out"))
 
-    def test_more_parts_than_segments(self, capture, tmp_path):
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(3, 3), PAIRS) == ()
-
-    def test_a_damaged_frame_is_made_again(self, followed, capture, tmp_path):
-        shutil.copytree(followed[1], tmp_path / "out")
-        path = tmp_path / "out" / "frames" / "frame_000001.h5"
-        path.write_bytes(path.read_bytes()[:400])
+    @pytest.mark.parametrize(
+        ("name", "kept", "calls"),
+        [("frames/frame_000001.h5", 400, ["advance"]), ("previews/frame_000002.png", None, [])],
+    )
+    def test_what_is_damaged_or_missing_is_made_again(self, followed, continued, capture, name, kept, calls):
+        whole = (continued / name).read_bytes()
+        if kept is None:
+            (continued / name).unlink()
+        else:
+            (continued / name).write_bytes(whole[:kept])
         steps = FakeSteps()
-        reconstruct(capture, tmp_path / "out", steps)
-        assert steps.calls == ["advance"]
-        assert not differing(results(followed[1]), results(tmp_path / "out"))
-
-    def test_a_missing_preview_is_drawn_again(self, followed, capture, tmp_path):
-        shutil.copytree(followed[1], tmp_path / "out")
-        (tmp_path / "out" / "previews" / "frame_000002.png").unlink()
-        steps = FakeSteps()
-        reconstruct(capture, tmp_path / "out", steps)
-        assert steps.calls == []
-        assert not differing(results(followed[1]), results(tmp_path / "out"))
+        reconstruct(capture, continued, steps)
+        assert steps.calls == calls
+        assert not differing(results(followed[1]), results(continued))
 
 
 class TestStaleness:
     """Nothing that was made from something else is taken, and nothing is made twice from the same."""
 
-    def test_other_options_start_over(self, followed, capture, tmp_path):
-        shutil.copytree(followed[1], tmp_path / "out")
-        assert reconstruct(capture, tmp_path / "out", FakeSteps(seed=1)).report["resumed_frames"] == 0
-        assert reconstruct(capture, tmp_path / "out", FakeSteps(count=50), PAIRS).report["resumed_frames"] == 0
+    def test_other_options_start_over(self, continued, capture):
+        assert reconstruct(capture, continued, FakeSteps(seed=1)).report["resumed_frames"] == 0
+        assert reconstruct(capture, continued, FakeSteps(count=50), PAIRS).report["resumed_frames"] == 0
 
-    def test_other_segments_keep_what_they_may(self, followed, capture, tmp_path):
-        shutil.copytree(followed[1], tmp_path / "out")
+    def test_other_segments_keep_what_they_may(self, continued, capture):
         steps = FakeSteps()
-        reconstruct(capture, tmp_path / "out", steps, PAIRS)
+        reconstruct(capture, continued, steps, PAIRS)
         assert steps.calls == ["begin", "advance"]  # 0 and 1 are as they were; 2 is a key frame now, and 3 follows it
 
     def test_an_image_that_changes_costs_its_frame_and_those_after_it(self, tmp_path):
@@ -331,18 +323,12 @@ class TestStaleness:
         assert not differing(results(tmp_path / "fresh"), results(tmp_path / "out"))
         assert found.report["resumed_frames"] == 2
 
-    def test_a_camera_that_changes(self, followed, tmp_path):
-        folder = write_capture(tmp_path / "capture", FRAMES)
-        shutil.copytree(followed[1], tmp_path / "out")
+    @pytest.mark.parametrize(("focal_length", "resumed"), [(24.0, 4), (24.5, 0)])
+    def test_a_moved_capture_is_the_same_unless_a_camera_changed(self, continued, tmp_path, focal_length, resumed):
+        folder = write_capture(tmp_path / "moved", FRAMES)
         content = json.loads((folder / "transforms.json").read_text())
-        content["fl_x"] = 24.5
-        (folder / "transforms.json").write_text(json.dumps(content))
-        assert reconstruct(Capture.read(folder), tmp_path / "out", FakeSteps()).report["resumed_frames"] == 0
-
-    def test_a_moved_capture_is_the_same(self, followed, tmp_path):
-        shutil.copytree(followed[1], tmp_path / "out")
-        moved = Capture.read(write_capture(tmp_path / "moved", FRAMES))
-        assert reconstruct(moved, tmp_path / "out", FakeSteps()).report["resumed_frames"] == 4
+        (folder / "transforms.json").write_text(json.dumps({**content, "fl_x": focal_length}))
+        assert reconstruct(Capture.read(folder), continued, FakeSteps()).report["resumed_frames"] == resumed
 
     def test_settled_images_are_read_once_for_their_digest(self, tmp_path, monkeypatch):
         folder = write_capture(tmp_path / "capture", (0, 1))

@@ -6,13 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from support.float32 import EPSILON
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
 from beam_warp.reconstruction.joints.selection import select_joints
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
 
 
 def sphere(rng, count):

@@ -1,4 +1,4 @@
-"""Energies of motion: closed forms, float64 twins and their differences, threads, refusals."""
+"""Terms of motion: closed forms, float64 twins and their differences, threads, refusals."""
 
 import numpy as np
 import pytest
@@ -6,28 +6,19 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import motion_losses as twin
+from reference.image_losses import slope
 from reference.skinning import product
 from scipy.spatial.transform import Rotation
+from support.float32 import EPSILON, relative_error, require_same_in_a_graph, single, vectors, zeros
+from support.moving_ball import ball_cloud
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
-from beam_warp.reconstruction.temporal import TemporalLoss
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
+from beam_warp.reconstruction.parameters import GaussianParameters
+from beam_warp.reconstruction.temporal import TemporalTerms
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-
-
-def vectors(array, device):
-    array = np.asarray(array, np.float32)
-    return wp.array(array, dtype=wp.vec3 if array.shape[1] == 3 else wp.quat, device=device)
-
-
-def single(array):
-    """Values that float32 holds, in float64."""
-    return np.asarray(array, np.float32).astype(float)
 
 
 def value(loss):
@@ -37,25 +28,11 @@ def value(loss):
 def rigidity(graph, poses, device, weight=1.0):
     """Value and gradients of rotations and positions."""
     count = len(poses[0])
-    out = wp.zeros(count, dtype=wp.quat, device=device), wp.zeros(count, dtype=wp.vec3, device=device)
+    out = zeros(count, 4, device), zeros(count, 3, device)
     found = RigidityLoss(graph, device=device)(
         *(vectors(pose, device) for pose in poses), weight=weight, rotation_gradients=out[0], position_gradients=out[1]
     )
     return value(found), out[0].numpy().astype(float), out[1].numpy().astype(float)
-
-
-def slope(loss, array, step=1e-5):
-    """Central differences."""
-    found = np.empty(array.shape)
-    for i in np.ndindex(*array.shape):
-        moved = np.zeros(array.shape)
-        moved[i] = step
-        found[i] = (loss(array + moved) - loss(array - moved)) / (2.0 * step)
-    return found
-
-
-def relative_error(found, expected):
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
 def turns(rng, count, angle):
@@ -133,7 +110,7 @@ class TestRigidity:
     def test_adds(self, device, rng):
         poses = [vectors(pose, device) for pose in motion(rng, 30, angle=0.5, shift=0.1)]
         loss = RigidityLoss(JointGraph.build(poses[3].numpy()), device=device)
-        once, twice = (wp.zeros(30, dtype=wp.vec3, device=device) for _ in range(2))
+        once, twice = (zeros(30, 3, device) for _ in range(2))
         loss(*poses, position_gradients=once)
         for _ in range(2):
             loss(*poses, position_gradients=twice)
@@ -162,18 +139,10 @@ class TestRigidity:
         assert found == pytest.approx(one, rel=2.0 * 4.0 * 200.0 * EPSILON / 0.1)
 
     def test_capture_in_a_graph(self, device, rng):
-        if device == "cpu":
-            pytest.skip("CUDA graphs are for CUDA")
         poses = [vectors(pose, device) for pose in motion(rng, 30, angle=0.5, shift=0.1)]
         loss = RigidityLoss(JointGraph.build(poses[3].numpy()), device=device)
-        gradient, again = (wp.zeros(30, dtype=wp.vec3, device=device) for _ in range(2))
-        before = value(loss(*poses, position_gradients=again))
-        with wp.ScopedCapture(device) as capture:
-            result = loss(*poses, position_gradients=gradient)
-        gradient.zero_()
-        wp.capture_launch(capture.graph)
-        assert value(result) == before
-        assert (gradient.numpy() == again.numpy()).all()
+        gradient, result = zeros(30, 3, device), loss(*poses)
+        require_same_in_a_graph(lambda: loss(*poses, position_gradients=gradient), [gradient, result], device)
 
     def test_refusals(self, rng):
         poses = [vectors(pose, "cpu") for pose in motion(rng, 5, angle=0.5, shift=0.1)]
@@ -187,41 +156,28 @@ class TestRigidity:
 
 
 class TestTemporal:
-    def test_closed_form(self, device):
-        values, reference = (wp.full(4, x, dtype=float, device=device) for x in (0.75, 0.5))
-        gradient = wp.zeros(4, dtype=float, device=device)
-        loss = TemporalLoss((4, 1), device=device)(values, reference, weight=2.0, unit=0.5, gradient=gradient)
-        assert value(loss) == 0.5
-        assert (gradient.numpy() == 2.0 * 2.0 * 0.25 / 0.25 / 4.0).all()
-
-    @pytest.mark.parametrize(("kind", "width"), [(float, None), (float, 5), (wp.vec3, 3), (wp.quat, 4), (wp.vec4, 4)])
     @pytest.mark.parametrize("count", [1, 1025])
-    def test_twin(self, device, rng, kind, width, count):
-        shape = (count,) if width is None else (count, width)
-        now, before = (single(rng.standard_normal(shape)) for _ in range(2))
-        arrays = [wp.array(a.astype(np.float32), dtype=kind, device=device) for a in (now, before, 0.0 * now)]
-        loss = TemporalLoss((count, width or 1), device=device)(*arrays[:2], weight=0.3, unit=0.1, gradient=arrays[2])
-        assert value(loss) == pytest.approx(0.3 * twin.temporal(now, before, 0.1), rel=8.0 * EPSILON)
-        expected = 2.0 * 0.3 * (now - before) / 0.1**2 / now.size
-        assert relative_error(arrays[2].numpy(), expected) <= 8.0 * EPSILON
+    def test_each_attribute_is_held_in_its_own_unit(self, device, rng, count):
+        """Gradients of means of squares add up; orientations are free, and so are rows held to what they became."""
+        parameters = GaussianParameters(ball_cloud(count), wp.get_device(device))
+        terms, before = TemporalTerms(parameters, 0.5), parameters.rows()
+        before = {name: array.copy() for name, array in before.items()}
+        parameters.set_rows({name: array + rng.normal(size=array.shape) for name, array in before.items()})
+        for _ in range(2):
+            terms.add_gradients(0.3)
+        for name, unit in {"positions": 0.05, **TemporalTerms.UNITS}.items():
+            change = parameters.rows()[name].astype(float) - before[name]
+            expected = 2.0 * 2.0 * 0.3 * change / unit**2 / change.size
+            assert relative_error(parameters.gradient(name).numpy(), expected) <= 8.0 * EPSILON
+        assert not parameters.gradient("orientations").numpy().any()
+        parameters.zero_gradients()
+        terms.hold(np.arange(count) % 2 == 0)
+        terms.add_gradients(0.3)
+        found = parameters.gradient("logits").numpy()
+        assert not found[::2].any()
+        assert found[1::2].all()
 
-    def test_some_columns(self, device, rng):
-        """Spherical harmonics beyond degree 0 are some columns of all."""
-        rows = wp.array(rng.standard_normal((7, 6)).astype(np.float32), dtype=float, device=device)
-        reference = wp.zeros((7, 4), dtype=float, device=device)
-        gradient = wp.zeros((7, 6), dtype=float, device=device)
-        loss = TemporalLoss((7, 4), device=device)(rows[:, 2:], reference, gradient=gradient[:, 2:])
-        assert value(loss) == pytest.approx((rows.numpy()[:, 2:].astype(float) ** 2).mean(), rel=8.0 * EPSILON)
-        assert (gradient.numpy()[:, :2] == 0.0).all()
-        assert relative_error(gradient.numpy()[:, 2:], 2.0 * rows.numpy()[:, 2:] / 28.0) <= 8.0 * EPSILON
-
-    def test_refusals(self):
-        loss, rows = TemporalLoss((4, 3), device="cpu"), wp.zeros(4, dtype=wp.vec3, device="cpu")
-        with pytest.raises(InvalidArrayError, match=r"reference must have \(4, 3\) floats, got \(4, 4\)"):
-            loss(rows, wp.zeros(4, dtype=wp.quat, device="cpu"))
-        with pytest.raises(InvalidArrayError, match="values must be a warp array on cpu, got ndarray"):
-            loss(rows.numpy(), rows)
-        with pytest.raises(InvalidOptionError, match="unit must be a number in"):
-            loss(rows, rows, unit=0.0)
-        with pytest.raises(InvalidOptionError, match=r"shape\[1\] must be an integer in"):
-            TemporalLoss((4, 0), device="cpu")
+    def test_gaussians_that_are_points_are_refused(self):
+        parameters = GaussianParameters(ball_cloud(2), wp.get_device("cpu"))
+        with pytest.raises(InvalidOptionError, match="spacing must be a number in"):
+            TemporalTerms(parameters, 0.0)

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from skimage.metrics import structural_similarity
 
-from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingFileError
+from beam_warp.errors import InvalidArrayError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
 from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
@@ -130,12 +130,6 @@ class TestViews:
         assert fine["whole_psnr"] != once["whole_psnr"]
         for name in ("normals_mean_degrees", "normals_median_degrees", "depth_median_mm", "median_depth_median_mm"):
             assert fine[name] == once[name]
-
-    def test_samples_out_of_range_are_refused(self, tiny_capture, discs, device):
-        records = tiny_capture.select(split="test", frames=[0])
-        for samples in (0, -1, 1.5):
-            with pytest.raises(InvalidOptionError, match="factor must be an integer"):
-                score_frame(discs, records, samples=samples, device=device)
 
     def test_no_views_are_refused(self, discs):
         with pytest.raises(InvalidArrayError, match="records must hold at least one view"):

@@ -8,7 +8,7 @@ from support.moving_ball import ball_views, rig
 
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.frames.protocols import no_step_progress
+from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
@@ -21,23 +21,18 @@ TRACKING = TrackOptions(
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread(monkeypatch):
-    """Images here are so small that threads only wait for one another."""
-    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
-
-
 @pytest.mark.parametrize("changes", [{}, {"samples": 2}, {"raster": RasterOptions()}])
 def test_a_track_begins_where_its_key_frame_ended(device, changes):
     """The same views of the same Gaussians, drawn in the same way: the same PSNR."""
     steps = FitAndTrack(fitting=replace(FITTING, **changes), tracking=TRACKING, device=device)
-    track, report = steps.begin(ball_views(rig(3)), no_step_progress)
+    track, report = steps.begin(ball_views(rig(3)), no_progress)
     assert track.baseline[0] == pytest.approx(report["psnr"], abs=1e-3)
 
 
 def test_a_frame_follows_from_arrays(device):
     steps, views = FitAndTrack(fitting=FITTING, tracking=TRACKING, device=device), ball_views(rig(3))
-    track, _ = steps.begin(views, no_step_progress)
-    ends = [steps.advance(begin, views, no_step_progress)[0] for begin in (track, steps.restore(track.arrays()))]
+    track, _ = steps.begin(views, no_progress)
+    ends = [steps.advance(begin, views, no_progress)[0] for begin in (track, steps.restore(track.arrays()))]
     for one, other in zip(*(end.arrays().values() for end in ends), strict=True):
+        assert one.dtype == other.dtype
         np.testing.assert_array_equal(one, other)

@@ -10,7 +10,7 @@ from reference.activation import activate, thin_axes
 from reference.depth_normals import depth_normals, has_normal
 from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
-from support.moving_ball import ball_cloud, ball_views, rig
+from support.moving_ball import ball_cloud, ball_views, block_means, rig
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
@@ -33,12 +33,6 @@ from beam_warp.world.gaussians import GaussianCloud
 RASTER = RasterOptions(antialiased=True, low_pass=0.1)
 
 NAMES = ("positions", "orientations", "radiance", "log_scales", "logits")
-
-
-@pytest.fixture(autouse=True)
-def one_thread(monkeypatch):
-    """Images here are so small that threads only wait for one another."""
-    monkeypatch.setenv("BEAM_WARP_THREADS", "1")
 
 
 def camera_of(width, height):
@@ -136,14 +130,15 @@ def random_view(rng, camera):
     return CapturedView(name="a", camera=camera, color=rng.uniform(size=(*size, 3)), alpha=alpha)
 
 
+def set_up(views, cloud, device, samples=1, kind=TargetSet, **options):
+    """Targets and the Gaussians to draw for them."""
+    target = wp.get_device(device)
+    return kind(views, len(cloud), RASTER, samples, target), GaussianParameters(cloud, target, **options)
+
+
 def encode(values):
     low = 12.92 * values
     return np.where(values > 0.0031308, 1.055 * np.maximum(values, 0.0031308) ** (1.0 / 2.4) - 0.055, low)
-
-
-def block_means(image, side):
-    height, width = image.shape[0] // side, image.shape[1] // side
-    return image.reshape(height, side, width, side, -1).mean(axis=(1, 3))
 
 
 class Twin:
@@ -185,13 +180,7 @@ class Twin:
         return total + weights.normal * image_losses.normal(drawn.normals, surface, self.mask)
 
     def gradient(self, name, step=1e-6):
-        array = self.rows[name]
-        found = np.empty(array.shape)
-        for at in np.ndindex(array.shape):
-            moved = np.zeros(array.shape)
-            moved[at] = step
-            found[at] = (self.loss(**{name: array + moved}) - self.loss(**{name: array - moved})) / (2.0 * step)
-        return found
+        return image_losses.slope(lambda moved: self.loss(**{name: moved}), self.rows[name], step)
 
 
 @pytest.mark.parametrize(
@@ -209,12 +198,10 @@ def test_the_gradient_of_a_step_is_that_of_its_loss(device, samples, weights):
     """
     rng = np.random.default_rng(3)
     view = random_view(rng, camera_of(19, 14))
-    target = wp.get_device(device)
-    parameters = GaussianParameters(near_cloud(rng), target, sh_degree=1)
+    targets, parameters = set_up([view], near_cloud(rng), device, samples, ViewTargets, sh_degree=1)
     filters = rng.uniform(0.0, 0.1, 6).astype(np.float32)
     parameters.filters.assign(filters)
     parameters.activate()
-    targets = ViewTargets([view], 6, RASTER, samples, target)
     targets.draw(0, parameters.drawn)
     terms = targets.add_losses(0, weights)
     parameters.zero_gradients()
@@ -234,9 +221,7 @@ def test_terms_that_count_nothing_ask_for_nothing(device):
     """All weights 0: no derivative anywhere. No term of coverage without alpha, whatever it weighs."""
     rng = np.random.default_rng(5)
     view = random_view(rng, camera_of(19, 14))
-    target = wp.get_device(device)
-    parameters = GaussianParameters(near_cloud(rng), target)
-    targets = ViewTargets([view, replace(view, alpha=None)], 6, RASTER, 1, target)
+    targets, parameters = set_up([view, replace(view, alpha=None)], near_cloud(rng), device, kind=ViewTargets)
     for index, weights in ((0, LossWeights(0.0, 0.0, 0.0, 0.0)), (1, LossWeights(0.0, 0.0, 1.0, 0.0))):
         targets.draw(index, parameters.drawn)
         terms = targets.add_losses(index, weights)
@@ -249,9 +234,8 @@ def test_terms_that_count_nothing_ask_for_nothing(device):
 @pytest.mark.parametrize("samples", [1, 2])
 def test_small_images(device, rng, size, samples):
     """Every loss and gradient of small, reduced photographs is finite."""
-    target = wp.get_device(device)
-    parameters = GaussianParameters(near_cloud(rng), target)
-    targets = ViewTargets([random_view(rng, camera_of(*size))], 6, RASTER, samples, target)
+    cloud = near_cloud(rng)
+    targets, parameters = set_up([random_view(rng, camera_of(*size))], cloud, device, samples, ViewTargets)
     targets.draw(0, parameters.drawn)
     terms = targets.add_losses(0, LossWeights(normal=1.0))
     parameters.add_gradients(targets.rasterizer.backward())
@@ -262,16 +246,15 @@ def test_small_images(device, rng, size, samples):
 
 def test_steps_of_several_views_do_not_mix(device):
     """Looking from one view after another gives the bits of targets that have that view only."""
-    views, target = ball_views(rig(3)), wp.get_device(device)
-    parameters = GaussianParameters(ball_cloud(60, painted=False), target)
-    together = ViewTargets(views, 60, RASTER, 2, target)
+    views, cloud = ball_views(rig(3)), ball_cloud(60, painted=False)
+    together, parameters = set_up(views, cloud, device, 2, ViewTargets)
     together.draw(0, parameters.drawn)
     for index in (0, 2, 1, 0):
         together.select(index)
         together.rasterizer.redraw()
         found = [term.numpy().copy() for term in together.add_losses(index, LossWeights(normal=0.3))]
         found += [getattr(together.rasterizer.backward(), name).numpy().copy() for name in ("positions", "opacities")]
-        alone = ViewTargets([views[index]], 60, RASTER, 2, target)
+        alone, _ = set_up([views[index]], cloud, device, 2, ViewTargets)
         alone.draw(0, parameters.drawn)
         expected = [term.numpy() for term in alone.add_losses(0, LossWeights(normal=0.3))]
         expected += [getattr(alone.rasterizer.backward(), name).numpy() for name in ("positions", "opacities")]
@@ -283,9 +266,7 @@ class TestMeasure:
     def test_psnr_is_that_of_the_crops(self, device):
         """Two resolutions, numbered as they were given: what `rasterize` draws for each crop, encoded and compared."""
         views = [view for pair in zip(ball_views(rig(2)), ball_views(rig(2, 56)), strict=True) for view in pair]
-        cloud, target = ball_cloud(60), wp.get_device(device)
-        parameters = GaussianParameters(cloud, target)
-        targets = TargetSet(views, 60, RASTER, 1, target)
+        targets, parameters = set_up(views, ball_cloud(60), device)
         psnr, _ = targets.make_room(parameters.drawn)
         assert psnr.shape == targets.gaps(parameters.drawn).shape == (4,)
         for found, part in zip(psnr, crop_views(views), strict=True):
@@ -296,42 +277,38 @@ class TestMeasure:
 
     def test_what_is_not_covered(self, device):
         """A half of the ball that nobody drew is the largest gap; what covers it all leaves none."""
-        views, target = ball_views(rig(2)), wp.get_device(device)
         cloud = ball_cloud(200)
         half = cloud.with_arrays(opacities=np.where(cloud.positions[:, 2] > 0.0, 0.8, 0.0))
         for given, low, high in ((cloud, 0.0, 0.0), (half, 0.2, 0.8)):
-            gaps = TargetSet(views, 200, RASTER, 1, target).gaps(GaussianParameters(given, target).drawn)
+            targets, parameters = set_up(ball_views(rig(2)), given, device)
+            gaps = targets.gaps(parameters.drawn)
             assert ((low <= gaps) & (gaps <= high)).all()
 
     def test_without_alpha_nothing_is_known_to_be_missing(self, device):
-        target = wp.get_device(device)
-        views = ball_views(rig(2), with_alpha=False)
         cloud = ball_cloud(20).with_arrays(opacities=np.zeros(20))
-        targets, drawn = TargetSet(views, 20, RASTER, 1, target), GaussianParameters(cloud, target).drawn
-        assert not targets.gaps(drawn).any()
-        assert np.isfinite(targets.make_room(drawn)[0]).all()
+        targets, parameters = set_up(ball_views(rig(2), with_alpha=False), cloud, device)
+        assert not targets.gaps(parameters.drawn).any()
+        assert np.isfinite(targets.make_room(parameters.drawn)[0]).all()
 
     def test_a_black_view(self, device):
         """An empty mask and black pixels are met by nothing at all: they say nothing of what was drawn."""
-        target = wp.get_device(device)
         (view,) = ball_views(rig(1))
         black = replace(view, color=0.0 * view.color, alpha=0.0 * view.alpha)
         cloud = ball_cloud(20).with_arrays(opacities=np.zeros(20))
-        targets, drawn = TargetSet([black, view], 20, RASTER, 1, target), GaussianParameters(cloud, target).drawn
-        psnr, _ = targets.make_room(drawn)
+        targets, parameters = set_up([black, view], cloud, device)
+        psnr, _ = targets.make_room(parameters.drawn)
         assert np.isnan(psnr).tolist() == [True, False]
-        assert targets.gaps(drawn)[0] == 0.0
+        assert targets.gaps(parameters.drawn)[0] == 0.0
 
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_shares_are_weights_summed_over_pixels(device, samples):
     """Together they are the sum of alpha over the pixels of all crops; those that nobody sees have none."""
-    target = wp.get_device(device)
     views = [*ball_views(rig(2)), *ball_views(rig(1, 56))]
     cloud = ball_cloud(60)
     cloud = cloud.with_arrays(positions=np.where(np.arange(60)[:, None] == 7, 50.0, cloud.positions))
-    drawn = GaussianParameters(cloud, target).drawn
-    found = TargetSet(views, 60, RASTER, samples, target).shares(drawn)
+    targets, parameters = set_up(views, cloud, device, samples)
+    found = targets.shares(parameters.drawn)
     assert found.shape == (60,)
     assert (found >= 0.0).all()
     assert found[7] == 0.0
@@ -346,9 +323,7 @@ def test_shares_are_weights_summed_over_pixels(device, samples):
 
 
 def test_room_is_made_when_more_is_drawn(device):
-    target = wp.get_device(device)
-    parameters = GaussianParameters(ball_cloud(60), target)
-    targets = TargetSet(ball_views(rig(2)), 60, RASTER, 1, target)
+    targets, parameters = set_up(ball_views(rig(2)), ball_cloud(60), device)
     assert targets.make_room(parameters.drawn)[1]
     assert not targets.make_room(parameters.drawn)[1]
     parameters.set_rows({"log_scales": parameters.rows()["log_scales"] + np.float32(1.5)})

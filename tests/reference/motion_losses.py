@@ -10,7 +10,3 @@ def rigidity(neighbors, weights, spacing, rotations, positions, previous_rotatio
     now = positions[:, None] - positions[neighbors]
     residual = np.einsum("mij,mkj->mki", turn, before) - now
     return (weights * (residual**2).sum(-1)).sum() / (len(positions) * spacing**2)
-
-
-def temporal(values, reference, unit):
-    return (((values - reference) / unit) ** 2).mean()

@@ -1,6 +1,7 @@
 """A small capture on disk, and steps that model it cheaply and repeatably: tests of all that surrounds optimisation."""
 
 import json
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,3 +115,11 @@ class FakeSteps:
     @staticmethod
     def level(views):
         return float(np.mean([view.color.max() for view in views]))
+
+
+class StuckSteps(FakeSteps):
+    """Steps that say so when they begin to track, and never end."""
+
+    def advance(self, track, views, progress):
+        print("working", flush=True)
+        time.sleep(600)

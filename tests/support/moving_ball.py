@@ -39,7 +39,7 @@ def ball_view(camera, center=(0.0, 0.0, 0.0), turn=None, *, with_alpha=True, nam
     normals = (offset + distance[..., None] * rays) / RADIUS
     own = normals.reshape(-1, 3) @ (turn or Rotation.identity()).as_matrix()  # R^T n, row by row
     image = np.where(hit[..., None], paint(own.reshape(normals.shape)), 0.0)
-    color, alpha = (block_means(array) for array in (image, hit[..., None].astype(float)))
+    color, alpha = (block_means(array, SAMPLES) for array in (image, hit[..., None].astype(float)))
     return CapturedView(
         name=name,
         camera=camera,
@@ -52,9 +52,9 @@ def ball_views(cameras, center=(0.0, 0.0, 0.0), turn=None, **options):
     return [ball_view(camera, center, turn, name=f"view {k}", **options) for k, camera in enumerate(cameras)]
 
 
-def block_means(image):
-    height, width = image.shape[0] // SAMPLES, image.shape[1] // SAMPLES
-    return image.reshape(height, SAMPLES, width, SAMPLES, -1).mean(axis=(1, 3))
+def block_means(image, side):
+    height, width = image.shape[0] // side, image.shape[1] // side
+    return image.reshape(height, side, width, side, -1).mean(axis=(1, 3))
 
 
 def ball_cloud(count=300, *, radius=RADIUS, painted=True):

@@ -78,9 +78,5 @@ class FrameSteps(Protocol):
         ...
 
 
-def no_progress(stage: str, done: int, total: int, note: str = "") -> None:
-    """Report to nobody."""
-
-
-def no_step_progress(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:
-    """Report to nobody."""
+def no_progress(*step: Any, **facts: Any) -> None:
+    """Report to nobody: a `Progress` and a `StepProgress`."""

@@ -1,11 +1,12 @@
 """The folder of a reconstruction that may be stopped at any time and continued: finished frames and their previews.
 
 Each finished frame is one file with its Gaussians and all that the next frame needs, under a key that covers
-everything it depends on; see `beam_warp.reconstruction.frames.keys`.
+everything it depends on: a frame is taken from the store only under the same key.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -17,11 +18,13 @@ from numpy.typing import NDArray
 
 from beam_warp._version import __version__
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.digests import code_digest
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import frame_key, frame_names, make_folders, read_frame, write_frame
 from beam_warp.reconstruction.frames.model import FrameModel
+from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud, GaussianSequence
 
 ID_BITS = 32
@@ -148,3 +151,22 @@ def stored_cloud(path: Path) -> GaussianCloud:
     """Read the Gaussians of a frame of the store."""
     names = tuple(name for name in frame_names(path) if name in ATTRIBUTES)
     return GaussianCloud(**read_frame(path, names), axes=WORLD_AXES, radiance_color_space=LINEAR_REC709)
+
+
+def common_inputs(steps: FrameSteps, device: Any) -> str:
+    """Return all that every frame of a job depends on, as JSON: the code, the kind of Warp device, the options."""
+    content = {"code": code_digest(), "device": "cuda" if device.is_cuda else "cpu", "options": steps.options()}
+    return json.dumps(content, sort_keys=True)
+
+
+def key_of_frame(common: str, frame: int, digest: str, previous: str) -> str:
+    """Return the key of a frame.
+
+    Args:
+        common: See `common_inputs`.
+        frame: Number of the frame.
+        digest: Digest of its records and images.
+        previous: Key of the frame before in its segment; empty for the first of a segment.
+    """
+    text = f"{common}\n{frame}\n{digest}\n{previous}"
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -7,6 +7,7 @@ metres: a subject of 2 m and one of 2 mm get the same graph.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,10 @@ CANDIDATES = 3
 """Neighbours looked at for each one that is kept, where normals may rule some out: of two sheets in contact, half."""
 
 
+Facing = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+"""A test which joints of some edges do not face apart from the points that these leave."""
+
+
 @dataclass(frozen=True, eq=False)
 class JointGraph:
     """Directed edges from every joint to its nearest ones.
@@ -37,7 +42,7 @@ class JointGraph:
             the joint itself and weight 0. k is at most M - 1.
         weights: Positive, each row adds up to 1 (to 0 without edges), ``(M, k)`` float32.
         incoming: Edges by the joint at their end, as numbers ``joint * k + slot``, ``(E,)`` int32, ascending for each
-            joint. What an energy of the edges tells a joint is read off these, so no sum is shared.
+            joint. A joint's gradient is a sum over these, so no two threads add to one sum.
         incoming_starts: Where each joint's begin, and the end of the last, ``(M + 1,)`` int32.
         spacing: Median length of the shortest edge of a joint, in the units of the positions; 1 for one joint.
     """
@@ -197,27 +202,23 @@ def _spacing(squared: NDArray[np.float64]) -> float:
     return spacing
 
 
-@dataclass(frozen=True, eq=False)
-class _Facing:
-    """Directions that points and joints face, of unit length or 0, and the least cosine of those that go together."""
-
-    points: NDArray[np.float64]
-    joints: NDArray[np.float64]
-    smallest_cosine: float
-
-    def together(self, ends: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the joints ``ends``, ``(N, k)``, go with each point; all do where a direction is unknown."""
-        cosines = np.einsum("nc,nkc->nk", self.points, self.joints[ends])
-        known = (np.abs(self.points).max(axis=1) > 0.0)[:, None] & (np.abs(self.joints).max(axis=1) > 0.0)[ends]
-        return (cosines >= self.smallest_cosine) | ~known
-
-
 def _facing(
     points: NDArray[np.float64] | None, joints: NDArray[np.float64] | None, smallest_cosine: float
-) -> _Facing | None:
-    """Return the directions of both, or None if either is not known."""
+) -> Facing | None:
+    """Return the test which joints ``ends``, ``(N, k)``, do not face apart from each point.
+
+    Directions have unit length, or 0 where they are unknown: those go with all. None if either has no directions.
+    """
     cosine = require_number("smallest_cosine", smallest_cosine, -1.0, 1.0)
-    return None if points is None or joints is None else _Facing(points, joints, cosine)
+    if points is None or joints is None:
+        return None
+
+    def together(ends: NDArray[np.int64]) -> NDArray[np.bool_]:
+        cosines = np.einsum("nc,nkc->nk", points, joints[ends])
+        known = (np.abs(points).max(axis=1) > 0.0)[:, None] & (np.abs(joints).max(axis=1) > 0.0)[ends]
+        return (cosines >= cosine) | ~known
+
+    return together
 
 
 def _directions(name: str, value: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
@@ -231,7 +232,7 @@ def _directions(name: str, value: ArrayLike | None, count: int) -> NDArray[np.fl
 
 
 def _nearest(
-    points: NDArray[np.float64], joints: NDArray[np.float64], count: int, facing: _Facing | None, *, themselves: bool
+    points: NDArray[np.float64], joints: NDArray[np.float64], count: int, facing: Facing | None, *, themselves: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the nearest joints that go with each point, ``(N, count)``; ``themselves``: points are the joints."""
     if count == 0:
@@ -243,7 +244,7 @@ def _nearest(
     if themselves:
         allowed &= ends != np.arange(len(points))[:, None]
     if facing is not None:
-        agree = allowed & facing.together(ends)
+        agree = allowed & facing(ends)
         allowed = np.where(agree.any(axis=1, keepdims=True), agree, allowed)
     squared = np.where(allowed, squared, np.inf)
     order = np.argsort(squared, axis=1, kind="stable")[:, :count]

@@ -83,15 +83,10 @@ class RigidityLoss:
             InvalidOptionError: ``weight`` is negative.
         """
         scale = require_number("weight", weight, 0.0) / (self._count * self._spacing**2)
-        now, previous = JointPoses(), JointPoses()
-        now.rotations = self._vectors("rotations", rotations, 4)
-        now.positions = self._vectors("positions", positions, 3)
-        previous.rotations = self._vectors("previous_rotations", previous_rotations, 4)
-        previous.positions = self._vectors("previous_positions", previous_positions, 3)
         launch_add_rigidity(
             self._edges,
-            now,
-            previous,
+            joint_poses("", rotations, positions, self._count, self.device),
+            joint_poses("previous_", previous_rotations, previous_positions, self._count, self.device),
             scale,
             self._terms,
             None if rotation_gradients is None else self._vectors("rotation_gradients", rotation_gradients, 4),
@@ -103,3 +98,15 @@ class RigidityLoss:
 
     def _vectors(self, name: str, value: wp.array, width: int) -> wp.array:
         return require_vectors(name, value, self._count, width, self.device)
+
+
+def joint_poses(prefix: str, rotations: Any, positions: Any, count: int, device: Any) -> JointPoses:
+    """Return the poses of ``count`` joints as kernels read them; a prefix of both names says which poses these are.
+
+    Raises:
+        InvalidArrayError: An array has another type, length or device.
+    """
+    poses = JointPoses()
+    poses.rotations = require_vectors(f"{prefix}rotations", rotations, count, 4, device)
+    poses.positions = require_vectors(f"{prefix}positions", positions, count, 3, device)
+    return poses

@@ -17,12 +17,11 @@ from beam_warp.kernels.reconstruction.skinning import (
     MESSAGE,
     MOST_JOINTS,
     RUN,
+    Messages,
     RestSkin,
     Runs,
-    launch_add_joint_gradients,
-    launch_sum_runs,
+    launch_add_pose_gradients,
     launch_warp_skin,
-    launch_write_messages,
 )
 from beam_warp.reconstruction.joints.graph import (
     REACH,
@@ -33,6 +32,7 @@ from beam_warp.reconstruction.joints.graph import (
     proximity_weights,
     require_points,
 )
+from beam_warp.reconstruction.joints.rigidity import joint_poses
 
 BLENDS = ("linear", "dual")
 """Ways to blend the motions of several joints: of the points that they move, or of dual quaternions."""
@@ -157,10 +157,11 @@ class Skin:
         self._rest.dual = int(self.blend == "dual")
         order = np.argsort(slots[:, 0], kind="stable")
         self._rest.places = upload(np.argsort(order).astype(np.int32), int, self.device)
-        self._runs, run_count = _runs(slots[order], weights[order], len(joints), self.device)
-        self._messages = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
-        self._run_rotations = wp.empty(run_count, dtype=wp.vec4, device=self.device)
-        self._run_positions = wp.empty(run_count, dtype=wp.vec3, device=self.device)
+        self._runs = _runs(slots[order], weights[order], len(joints), self.device)
+        self._messages = Messages()
+        self._messages.skins = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
+        self._messages.run_rotations = wp.empty(len(self._runs.joints), dtype=wp.vec4, device=self.device)
+        self._messages.run_positions = wp.empty(len(self._runs.joints), dtype=wp.vec3, device=self.device)
 
     def warp(
         self, joint_rotations: wp.array, joint_positions: wp.array, out_positions: wp.array, out_orientations: wp.array
@@ -176,11 +177,9 @@ class Skin:
         Raises:
             InvalidArrayError: An array has another type, length or device.
         """
-        rotations, positions = self._poses(joint_rotations, joint_positions)
         launch_warp_skin(
             self._rest,
-            rotations,
-            positions,
+            joint_poses("joint_", joint_rotations, joint_positions, self._counts[1], self.device),
             require_vectors("out_positions", out_positions, self._counts[0], 3, self.device),
             require_vectors("out_orientations", out_orientations, self._counts[0], 4, self.device),
             self.device,
@@ -212,39 +211,22 @@ class Skin:
             InvalidArrayError: An array has another type, length or device.
         """
         skin_count, joint_count = self._counts
-        rotations, positions = self._poses(joint_rotations, joint_positions)
-        to_positions = to_orientations = None
-        if position_gradients is not None:
-            to_positions = require_vectors("position_gradients", position_gradients, skin_count, 3, self.device)
-        if orientation_gradients is not None:
-            to_orientations = require_vectors(
-                "orientation_gradients", orientation_gradients, skin_count, 4, self.device
+        upstream = [
+            None if array is None else require_vectors(name, array, skin_count, width, self.device)
+            for name, array, width in (
+                ("position_gradients", position_gradients, 3),
+                ("orientation_gradients", orientation_gradients, 4),
             )
-        out_rotations = require_vectors("out_rotation_gradients", out_rotation_gradients, joint_count, 4, self.device)
-        out_positions = require_vectors("out_position_gradients", out_position_gradients, joint_count, 3, self.device)
-        launch_write_messages(
-            self._rest, rotations, positions, to_positions, to_orientations, self._messages, self.device
-        )
-        launch_sum_runs(
+        ]
+        launch_add_pose_gradients(
             self._rest,
             self._runs,
-            rotations,
-            positions,
+            joint_poses("joint_", joint_rotations, joint_positions, joint_count, self.device),
+            *upstream,
             self._messages,
-            self._run_rotations,
-            self._run_positions,
+            require_vectors("out_rotation_gradients", out_rotation_gradients, joint_count, 4, self.device),
+            require_vectors("out_position_gradients", out_position_gradients, joint_count, 3, self.device),
             self.device,
-        )
-        launch_add_joint_gradients(
-            self._runs, rotations, self._run_rotations, self._run_positions, out_rotations, out_positions, self.device
-        )
-
-    def _poses(self, rotations: wp.array, positions: wp.array) -> tuple[wp.array, wp.array]:
-        """Return the joints' poses as kernels read them."""
-        count = self._counts[1]
-        return (
-            require_vectors("joint_rotations", rotations, count, 4, self.device),
-            require_vectors("joint_positions", positions, count, 3, self.device),
         )
 
 
@@ -267,8 +249,8 @@ def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray
     return joints, weights
 
 
-def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> tuple[Runs, int]:
-    """Return what hangs on each joint in runs of at most `RUN` skins, and how many; skins as their messages lie."""
+def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> Runs:
+    """Return what hangs on each joint in runs of at most `RUN` skins; skins as their messages lie."""
     pairs, starts = group_by(slots.ravel(), np.flatnonzero(weights.ravel() > 0.0), joint_count)
     runs_of = -(-np.diff(starts) // RUN)
     first_runs = np.concatenate([[0], np.cumsum(runs_of)])
@@ -280,4 +262,4 @@ def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: i
     runs.first_pairs = upload(np.append(first_pairs, len(pairs)).astype(np.int32), int, device)
     runs.joints = upload(joints.astype(np.int32), int, device)
     runs.first_runs = upload(first_runs.astype(np.int32), int, device)
-    return runs, len(joints)
+    return runs

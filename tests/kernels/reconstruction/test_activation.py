@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.activation import activate, thin_axes
+from support.float32 import EPSILON
 
-from beam_warp.kernels.reconstruction.activation import (
-    Shapes,
-    launch_activate,
-    launch_add_rows,
-    launch_add_shape_gradients,
-)
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
+from beam_warp.kernels.reconstruction.activation import Shapes, launch_activate, launch_add_shape_gradients
 
 ROUNDINGS = 64
 """An exponential is within 2 ulp, 4 roundings; of an opacity there are three, two roots and nine other operations."""
@@ -58,11 +51,6 @@ def random_shapes(rng, count):
 
 
 class TestClosedForms:
-    def test_without_a_filter(self, device):
-        scales, opacities = activated(np.log([[2.0, 3.0, 0.5]]), [0.0], [0.0], device)
-        np.testing.assert_allclose(scales, [[2.0, 3.0, 0.5]], rtol=8 * EPSILON)
-        np.testing.assert_allclose(opacities, [0.5], rtol=8 * EPSILON)
-
     @pytest.mark.parametrize("thin", range(3))
     def test_three_four_five(self, device, thin):
         """A filter of 4 makes 3 to 5, and leaves 3/5 of the opacity for each; the smallest axis stays."""
@@ -73,11 +61,6 @@ class TestClosedForms:
         found, opacities = activated(np.log(scales), [np.log(3.0)], [4.0], device)
         np.testing.assert_allclose(found, wide, rtol=16 * EPSILON)
         np.testing.assert_allclose(opacities, [0.75 * 0.36], rtol=ROUNDINGS * EPSILON)
-
-    def test_a_far_wider_filter_takes_nearly_all_opacity(self, device):
-        scales, opacities = activated(np.log([[1e-3, 1e-3, 1e-5]]), [9.0], [1.0], device)
-        np.testing.assert_allclose(scales, [[1.0, 1.0, 1e-5]], rtol=1e-6)
-        np.testing.assert_allclose(opacities, [1e-6], rtol=2e-4)  # 1 - sigmoid(9) = 1.2e-4
 
     @pytest.mark.parametrize(
         ("scales", "thin"),
@@ -155,11 +138,3 @@ class TestEndsOfTheRange:
     def test_without_a_filter_opacity_is_the_sigmoid_however_small_a_scale(self, device):
         _, opacities = activated([[-60.0, -61.0, -62.0]], [0.0], [0.0], device)
         assert opacities[0] == pytest.approx(0.5, rel=8 * EPSILON)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 27), (1025, 4)])
-def test_rows_are_added(device, rng, shape):
-    rows, before = rng.normal(size=(2, *shape)).astype(np.float32)
-    out = wp.array(before, dtype=float, device=device)
-    launch_add_rows(wp.array(rows, dtype=float, device=device), out, device)
-    np.testing.assert_array_equal(out.numpy(), before + rows)

@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
+from support.float32 import EPSILON
+from support.moving_ball import block_means
 
 from beam_warp.image.color import linear_to_srgb
-from beam_warp.kernels.reconstruction.display_encoding import (
-    launch_add_sample_gradients,
-    launch_average,
-    launch_encode,
-    launch_spread,
-)
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
+from beam_warp.kernels.reconstruction.display_encoding import launch_add_sample_gradients, launch_average
 
 KNEE = 0.0031308
 
@@ -33,16 +27,13 @@ def strided(array, device, columns=7):
 
 
 def means(samples, factor):
-    height, width = samples.shape[0] // factor, samples.shape[1] // factor
-    blocks = samples.astype(np.float64).reshape(height, factor, width, factor, -1)
-    return blocks.mean(axis=(1, 3))
+    return block_means(samples.astype(np.float64), factor)
 
 
-def encoded(samples, factor, device, bring=upload):
-    out = wp.zeros(
-        (samples.shape[0] // factor, samples.shape[1] // factor, samples.shape[2]), dtype=float, device=device
-    )
-    launch_encode(bring(samples, device), factor, out, device)
+def averaged(samples, factor, device, bring=upload, *, is_color=True):
+    shape = (samples.shape[0] // factor, samples.shape[1] // factor, samples.shape[2])
+    out = wp.zeros(shape, dtype=float, device=device)
+    launch_average(bring(samples, device), factor, is_color, out, device)
     return out.numpy()
 
 
@@ -50,17 +41,10 @@ def slopes(values):
     return np.where(values > KNEE, 1.055 / 2.4 * np.maximum(values, KNEE) ** (1.0 / 2.4 - 1.0), 12.92)
 
 
-@pytest.mark.parametrize(
-    ("linear", "display"), [(0.0, 0.0), (0.001, 0.01292), (1.0, 1.0), (0.5, 0.735356983052), (4.0, 1.824796295276)]
-)
-def test_values_of_the_curve(device, linear, display):
-    assert encoded(np.full((1, 1, 1), linear), 1, device)[0, 0, 0] == pytest.approx(display, rel=ROUNDINGS * EPSILON)
-
-
 def test_the_knee_is_no_step(device):
     """The standard's rounded constants leave a step of 3e-8 there, less than a float's digits at 0.04."""
     values = np.float32(KNEE) * (1.0 + np.float32(2e-7) * np.arange(-8, 9, dtype=np.float32))
-    found = encoded(values[None, :, None], 1, device)[0, :, 0]
+    found = averaged(values[None, :, None], 1, device)[0, :, 0]
     assert (np.abs(np.diff(found)) <= 12.92 * np.diff(values).max() + ROUNDINGS * EPSILON * 0.0405).all()
     np.testing.assert_allclose(found, linear_to_srgb(values.astype(np.float64)), rtol=ROUNDINGS * EPSILON)
 
@@ -73,13 +57,12 @@ class TestImages:
         """A pixel half black, half white is encoded 0.5, not the mean of encoded 0 and 1."""
         samples = rng.gamma(0.5, 0.5, (size[0] * factor, size[1] * factor, 3)).astype(np.float32)
         expected = linear_to_srgb(means(samples, factor))
-        np.testing.assert_allclose(encoded(samples, factor, device, bring), expected, rtol=ROUNDINGS * EPSILON)
+        np.testing.assert_allclose(averaged(samples, factor, device, bring), expected, rtol=ROUNDINGS * EPSILON)
 
     def test_average(self, device, rng, size, factor, bring):
         samples = rng.uniform(size=(size[0] * factor, size[1] * factor, 1)).astype(np.float32)
-        out = wp.zeros((*size, 1), dtype=float, device=device)
-        launch_average(bring(samples, device), factor, out, device)
-        np.testing.assert_allclose(out.numpy(), means(samples, factor), rtol=(factor**2 + 1) * EPSILON)
+        found = averaged(samples, factor, device, bring, is_color=False)
+        np.testing.assert_allclose(found, means(samples, factor), rtol=(factor**2 + 1) * EPSILON)
 
     def test_gradients(self, device, rng, size, factor, bring):
         """The slope at the mean, shared by its samples, and added to what is there."""
@@ -88,32 +71,9 @@ class TestImages:
         upstream, before = rng.normal(size=(*size, 3)).astype(np.float32), rng.normal(size=fine).astype(np.float32)
         values = means(samples, factor)
         upstream[np.abs(values / KNEE - 1.0) < 1e-5] = 0.0  # which side of the knee a mean is on, float32 may not see
-        for launch, slope in ((launch_add_sample_gradients, slopes(values)), (launch_spread, np.ones_like(values))):
+        for is_color, slope in ((True, slopes(values)), (False, np.ones_like(values))):
             out = bring(before, device)
-            inputs = [bring(samples, device)] if launch is launch_add_sample_gradients else []
-            launch(
-                *inputs,
-                *([factor, upload(upstream, device)] if inputs else [upload(upstream, device), factor]),
-                out,
-                device,
-            )
+            launch_add_sample_gradients(bring(samples, device), factor, is_color, upload(upstream, device), out, device)
             share = (slope * upstream / factor**2).repeat(factor, axis=0).repeat(factor, axis=1)
             bound = ROUNDINGS * EPSILON * np.abs(share) + 2 * EPSILON * (np.abs(share) + np.abs(before))
             assert (np.abs(out.numpy() - (before + share)) <= bound).all()
-
-
-def test_gradients_are_central_differences(device, rng):
-    """Differences of the float64 curve do not reach its step at the knee: means stay 1e-3 of it away."""
-    samples = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (6, 8, 3))).astype(np.float32)
-    values = means(samples, 2)
-    samples[0::2, 0::2][np.abs(values / KNEE - 1.0) < 0.1] += 1e-3
-    upstream = rng.normal(size=(3, 4, 3)).astype(np.float32)
-    out = wp.zeros((6, 8, 3), dtype=float, device=device)
-    launch_add_sample_gradients(upload(samples, device), 2, upload(upstream, device), out, device)
-    expected, wide = np.zeros((6, 8, 3)), samples.astype(np.float64)
-    for at in np.ndindex(6, 8, 3):
-        step = np.zeros((6, 8, 3))
-        step[at] = 1e-5 * wide[at]
-        change = linear_to_srgb(means(wide + step, 2)) - linear_to_srgb(means(wide - step, 2))
-        expected[at] = (upstream * change).sum() / (2.0 * step[at])
-    assert np.linalg.norm(out.numpy() - expected) <= 1e-5 * np.linalg.norm(expected)
