@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from raster_readable import ReadableRasterizer
 from raster_scenes import RasterScene
 from timing import Task, Times, take_turns
 
@@ -68,7 +69,7 @@ class Drawing:
     ) -> None:
         values = scene.values() if values is None else values
         self.device = device
-        self.rasterizer = Rasterizer(
+        self.rasterizer = (ReadableRasterizer if readable else Rasterizer)(
             len(scene.cloud),
             [scene.camera],
             value_count=values.shape[1],
@@ -76,7 +77,6 @@ class Drawing:
             normals=normals,
             options=options,
             device=device,
-            readable=readable,
         )
         self.channel_count = self.rasterizer.value_channels.stop
         self.gaussians = upload_gaussians(scene.cloud, device, values=values, radiance=radiance)

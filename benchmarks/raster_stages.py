@@ -29,7 +29,6 @@ STAGES = {
     "launch_count_pairs": "count and emit",
     "launch_emit_pairs": "count and emit",
     "launch_find_ranges": "ranges",
-    "launch_composite_pixels": "composite",
     "launch_composite_cpu": "composite",
     "launch_composite_cuda": "composite",
     "launch_composite_adjoint_cpu": "composite adjoint",

@@ -13,7 +13,7 @@ import numpy as np
 
 from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import BeamError, InvalidArrayError, InvalidOptionError
-from beam_warp.interop.torch import TorchImages, TorchRasterizer  # says what is missing, where torch is
+from beam_warp.interop.torch import TorchRasterizer, describe, require_tensor  # says what is missing, where torch is
 from beam_warp.raster.records import DepthMode, RasterOptions
 from beam_warp.world.camera import Camera
 
@@ -124,8 +124,7 @@ def rasterization(
     _refuse(others)
     require_choice("render_mode", render_mode, RENDER_MODES)
     require_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-    count = _require_means(means)
-    _require_tensor("quats", quats, (count, 4), means.device)
+    count = _require_gaussians(means, quats)
     cameras = _cameras(viewmats, Ks, width, height)
     options = RasterOptions(rasterize_mode == "antialiased", eps2d, near_plane, depth)
     drawn = _require_colors(colors, count, len(cameras), sh_degree, means.device)
@@ -138,13 +137,15 @@ def rasterization(
     alphas = images.alpha.view(*shape, 1)
     layers = []
     if drawn is not None:
-        rgb = _colors_of(images).view(*shape, -1)
-        layers.append(rgb if backgrounds is None else rgb + (1.0 - alphas) * _background(backgrounds, rgb))
+        rgb: Any = images.values if images.colors is None else images.colors
+        rgb = rgb.view(*shape, -1)
+        if backgrounds is not None:
+            require_tensor("backgrounds", backgrounds, (len(cameras), rgb.shape[3]), rgb.device)
+            rgb = rgb + (1.0 - alphas) * backgrounds[:, None, None, :]
+        layers.append(rgb)
     mean_depth = images.depth.view(*shape, 1)
-    if render_mode.endswith("ED"):
-        layers.append(mean_depth)
-    elif render_mode.endswith("D"):
-        layers.append(mean_depth * alphas)
+    if render_mode.endswith("D"):
+        layers.append(mean_depth if render_mode.endswith("ED") else mean_depth * alphas)
     meta = {
         "depth": mean_depth,
         "median_depth": images.median_depth.view(*shape, 1),
@@ -205,28 +206,19 @@ def _refuse(others: dict[str, Any]) -> None:
         plain = getattr(value, "name", value) if name == "rolling_shutter" else value
         if plain is not nothing and not (isinstance(plain, (bool, int, float, str)) and plain == nothing):
             raise InvalidOptionError(
-                f"{name} must be {nothing!r}, the only one that is drawn here, got {_describe(value)}. {remedy}."
+                f"{name} must be {nothing!r}, the only one that is drawn here, got {describe(value)}. {remedy}."
             )
 
 
-def _require_tensor(name: str, tensor: Any, shape: tuple[int, ...], device: Any) -> None:
-    """Refuse anything but a float32 tensor of a shape on a device."""
-    fits = isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == shape
-    if not (fits and tensor.dtype == torch.float32 and tensor.device == device):
-        raise InvalidArrayError(
-            f"{name} must be a tensor of torch.float32 of shape {shape} on {device}, got {_describe(tensor)}. Convert, "
-            "reshape or move it."
-        )
-
-
-def _require_means(means: Any) -> int:
+def _require_gaussians(means: Any, quats: Any) -> int:
     """Return N."""
     if not isinstance(means, torch.Tensor) or means.ndim != 2:
         raise InvalidArrayError(
-            f"means must be a tensor of shape (N, 3), got {_describe(means)}. Draw sets of Gaussians one by one."
+            f"means must be a tensor of shape (N, 3), got {describe(means)}. Draw sets of Gaussians one by one."
         )
-    _require_tensor("means", means, (means.shape[0], 3), means.device)
-    return means.shape[0]
+    require_tensor("means", means, (len(means), 3), means.device)
+    require_tensor("quats", quats, (len(means), 4), means.device)
+    return len(means)
 
 
 def _require_colors(colors: Any, count: int, camera_count: int, sh_degree: int | None, device: Any) -> torch.Tensor:
@@ -239,12 +231,12 @@ def _require_colors(colors: Any, count: int, camera_count: int, sh_degree: int |
     if not (len(shape) == dimensions and shape[1] > 0):
         raise InvalidArrayError(
             f"colors must be a tensor of shape {'(N, D)' if sh_degree is None else '(N, K, 3)'}, the same for every "
-            f"camera, got {_describe(colors)}. Draw cameras with colours of their own one by one."
+            f"camera, got {describe(colors)}. Draw cameras with colours of their own one by one."
         )
     if sh_degree is None:
-        _require_tensor("colors", tensor, (count, shape[1]), device)
+        require_tensor("colors", tensor, (count, shape[1]), device)
         return tensor
-    _require_tensor("colors", tensor, (count, shape[1], 3), device)
+    require_tensor("colors", tensor, (count, shape[1], 3), device)
     bases = (require_count("sh_degree", sh_degree, 0, MAX_DEGREE) + 1) ** 2
     if bases > shape[1]:
         raise InvalidArrayError(
@@ -253,24 +245,13 @@ def _require_colors(colors: Any, count: int, camera_count: int, sh_degree: int |
     return tensor[:, :bases]
 
 
-def _colors_of(images: TorchImages) -> torch.Tensor:
-    """Return the colours of a draw that has some."""
-    return images.values if images.colors is None else images.colors  # pyright: ignore[reportReturnType]
-
-
-def _background(backgrounds: Any, rgb: torch.Tensor) -> torch.Tensor:
-    """Return the background behind every pixel."""
-    _require_tensor("backgrounds", backgrounds, (rgb.shape[0], rgb.shape[3]), rgb.device)
-    return backgrounds[:, None, None, :]
-
-
 def _cameras(viewmats: Any, intrinsics: Any, width: int, height: int) -> tuple[Camera, ...]:
     """Read cameras; a GPU is waited for once if either is there."""
     for name, tensor, side in (("viewmats", viewmats, 4), ("Ks", intrinsics, 3)):
         fits = isinstance(tensor, torch.Tensor) and tensor.ndim == 3 and tuple(tensor.shape[1:]) == (side, side)
         if not fits:
             raise InvalidArrayError(
-                f"{name} must be a tensor of shape (C, {side}, {side}), got {_describe(tensor)}. Reshape it."
+                f"{name} must be a tensor of shape (C, {side}, {side}), got {describe(tensor)}. Reshape it."
             )
         if tensor.requires_grad and torch.is_grad_enabled():
             raise InvalidArrayError(
@@ -308,10 +289,3 @@ def _camera(width: int, height: int, matrices: bytes) -> Camera:
     pose[:3, :3] = np.linalg.inv(view[:3, :3])
     pose[:3, 3] = -pose[:3, :3] @ view[:3, 3]
     return Camera(width, height, float(lens[0, 0]), float(lens[1, 1]), float(lens[0, 2]), float(lens[1, 2]), pose)
-
-
-def _describe(value: Any) -> str:
-    """Describe an argument in an error."""
-    if isinstance(value, torch.Tensor):
-        return f"a tensor of {value.dtype} of shape {tuple(value.shape)} on {value.device}"
-    return repr(value) if isinstance(value, (bool, int, float, str)) else type(value).__name__

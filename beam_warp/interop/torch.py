@@ -172,7 +172,7 @@ class TorchRasterizer:
         views = self.cameras if cameras is None else tuple(cameras)
         given = (positions, orientations, scales, opacities, values, radiance)
         tensors = [
-            _require_tensor(name, tensor, shape, self.device)
+            _compact_rows(name, tensor, shape, self.device)
             for (name, shape), tensor in zip(self._shapes.items(), given, strict=True)
         ]
         return TorchImages(*_Draw.apply(self, _Ticket(views), *tensors))
@@ -247,8 +247,7 @@ class TorchRasterizer:
             for target, gradient in zip(flat, upstream[3:6], strict=True):
                 _put(target, gradient)
             found = self._rasterizer.backward()
-            arrays = (found.positions, found.orientations, found.scales, found.opacities, found.values, found.radiance)
-            gradients = self._share("gradients", found, arrays)
+            gradients = self._share("gradients", found, found)
             return [gradient.clone() if want else None for gradient, want in zip(gradients, wanted, strict=True)]
 
     def _share(self, name: str, owner: Any, arrays: Sequence[Any]) -> list[Any]:
@@ -285,24 +284,34 @@ class _Draw(torch.autograd.Function):
         return None, None, *ctx.owner._backward(ctx.ticket, ctx.saved_tensors, upstream, ctx.needs_input_grad[2:])
 
 
-def _require_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device: torch.device) -> torch.Tensor | None:
-    """Refuse a tensor that kernels would misread, and bring its rows together; a shape of None wants no tensor."""
-    if shape is None:
-        if tensor is not None:
-            raise InvalidArrayError(
-                f"{name} must be left out of what draws none, got a tensor. Make another TorchRasterizer."
-            )
-        return None
-    if not isinstance(tensor, torch.Tensor):
+def require_tensor(name: str, tensor: Any, shape: tuple[int, ...], device: Any) -> None:
+    """Refuse anything but a float32 tensor of a shape on a device."""
+    fits = isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == shape
+    if not (fits and tensor.dtype == torch.float32 and tensor.device == device):
         raise InvalidArrayError(
-            f"{name} must be a torch tensor of shape {shape}, got {type(tensor).__name__}. Pass torch.as_tensor."
+            f"{name} must be a tensor of torch.float32 of shape {shape} on {device}, got {describe(tensor)}. Convert, "
+            "reshape or move it."
         )
-    if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device != device:
+
+
+def describe(value: Any) -> str:
+    """Describe an argument in an error."""
+    if isinstance(value, torch.Tensor):
+        return f"a tensor of {value.dtype} of shape {tuple(value.shape)} on {value.device}"
+    return repr(value) if isinstance(value, (bool, int, float, str)) else type(value).__name__
+
+
+def _compact_rows(
+    name: str, tensor: torch.Tensor | None, shape: tuple[int, ...] | None, device: torch.device
+) -> torch.Tensor | None:
+    """Return a tensor that kernels read, its rows brought together; a shape of None wants no tensor."""
+    if shape is not None:
+        require_tensor(name, tensor, shape, device)
+    elif tensor is not None:
         raise InvalidArrayError(
-            f"{name} must be a tensor of float32 of shape {shape} on {device}, got {tensor.dtype} of shape "
-            f"{tuple(tensor.shape)} on {tensor.device}. Convert, reshape or move it."
+            f"{name} must be left out of what draws none, got a tensor. Make another TorchRasterizer."
         )
-    return tensor if tensor.ndim == 1 or tensor.stride(-1) == 1 else tensor.contiguous()
+    return tensor if tensor is None or tensor.ndim == 1 or tensor.stride(-1) == 1 else tensor.contiguous()
 
 
 def _cuts(channels: range) -> Iterator[tuple[int, slice, slice]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,26 +103,12 @@ def depth_consistency(images: DepthImages, *, tolerance: float = TOLERANCE) -> D
     """
     require_number("tolerance", tolerance, 0.0, 1e6)
     total = len(images.pixels)
-    confirmed = wp.empty(total, dtype=int, device=images.device)
-    contradicted = wp.empty(total, dtype=int, device=images.device)
-    residuals = wp.empty(total, dtype=float, device=images.device)
+    found = [wp.empty(total, dtype=dtype, device=images.device) for dtype in (int, int, float)]
     for index, camera in enumerate(images.cameras):
-        launch_compare_depths(
-            index,
-            camera.width * camera.height,
-            images.views,
-            images.pixels,
-            tolerance,
-            confirmed,
-            contradicted,
-            residuals,
-            images.device,
-        )
-    summaries = []
-    for index in range(len(images.cameras)):
-        part = slice(images.first_pixels[index], images.first_pixels[index + 1])
-        summaries.append(_summary(*(array[part].numpy() for array in (confirmed, contradicted, residuals))))
-    return DepthConsistency(confirmed, contradicted, residuals, tuple(summaries))
+        pixel_count = camera.width * camera.height
+        launch_compare_depths(index, pixel_count, images.views, images.pixels, tolerance, *found, images.device)
+    parts = itertools.starmap(slice, itertools.pairwise(images.first_pixels))
+    return DepthConsistency(*found, tuple(_summary(*(array[part].numpy() for array in found)) for part in parts))
 
 
 def _summary(

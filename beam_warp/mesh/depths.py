@@ -137,15 +137,8 @@ class DepthImages:
         if view.normals is not None:
             normals = _rows("normals", view.normals, shape, self.device)
         alpha = _flat("alpha", view.alpha, shape, self.device)
-        launch_write_depth_pixels(
-            _flat("depth", view.depth, shape, self.device),
-            alpha,
-            normals,
-            self._views[index],
-            MINIMUM_ALPHA,
-            self.pixels,
-            self.device,
-        )
+        depth = _flat("depth", view.depth, shape, self.device)
+        launch_write_depth_pixels(depth, alpha, normals, self._views[index], MINIMUM_ALPHA, self.pixels, self.device)
         if len(self.colors):
             rows = _rows("color", view.color, shape, self.device)
             launch_write_pixel_colors(rows, alpha, self.first_pixels[index], self.colors, self.device)

@@ -123,16 +123,14 @@ def draw_depths(
         drawn = rasterizer.draw(gaussians)
         rows = drawn.channels[0]
         colors = rasterizer.color_channels or rasterizer.value_channels
-        images.write(
-            index,
-            DepthView(
-                camera=camera,
-                depth=drawn.median_depth if depth == "median" else drawn.depth,
-                alpha=drawn.alpha,
-                normals=rows[:, rasterizer.normal_channels.start :],
-                color=rows[:, colors.start :] if colors else None,
-            ),
+        view = DepthView(
+            camera=camera,
+            depth=drawn.median_depth if depth == "median" else drawn.depth,
+            alpha=drawn.alpha,
+            normals=rows[:, rasterizer.normal_channels.start :],
+            color=rows[:, colors.start :] if colors else None,
         )
+        images.write(index, view)
     return images
 
 

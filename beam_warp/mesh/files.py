@@ -38,7 +38,9 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
         OutputError: The file cannot be written; nothing is left behind.
     """
     target = Path(path)
-    suffix = _require_suffix(target)
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidOptionError(f"mesh must end in one of {', '.join(SUFFIXES)}, got {target.name}. Rename it.")
     if not len(mesh.faces):
         raise InvalidArrayError("mesh must hold at least one triangle, got none. Write one with a surface.")
     content = _content(mesh, suffix)
@@ -70,14 +72,6 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     if source.suffix.lower() in (".glb", ".gltf"):
         loaded.apply_transform(TO_GLTF.T)
     return loaded
-
-
-def _require_suffix(path: Path) -> str:
-    """Return a suffix that is written."""
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InvalidOptionError(f"mesh must end in one of {', '.join(SUFFIXES)}, got {path.name}. Rename it.")
-    return suffix
 
 
 def _content(mesh: trimesh.Trimesh, suffix: str) -> bytes:

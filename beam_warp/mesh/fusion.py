@@ -15,9 +15,9 @@ from beam_warp.checks import require_number
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.kernels.mesh.tsdf import (
-    HALF_SIDE,
     NO_KEY,
     SIDE,
+    TRUNCATION,
     VOXELS,
     launch_find_neighbors,
     launch_find_pixel_keys,
@@ -199,16 +199,9 @@ def _largest_parts(
 
 def _vertex_colors(images: DepthImages, points: NDArray[np.float32], voxel: float) -> NDArray[np.uint8]:
     """Return the colour that the views show at every vertex, as bytes of display sRGB; grey where none shows it."""
-    found = wp.empty(len(points), dtype=wp.vec4)
-    launch_gather_colors(
-        wp.array(points, dtype=wp.vec3),
-        images.views,
-        images.pixels,
-        images.colors,
-        HALF_SIDE * voxel,
-        found,
-        images.device,
-    )
+    found, places = wp.empty(len(points), dtype=wp.vec4), wp.array(points, dtype=wp.vec3)
+    seen = (images.views, images.pixels, images.colors)
+    launch_gather_colors(places, *seen, TRUNCATION * voxel, found, images.device)
     colors = found.numpy()
     straight = np.clip(colors[:, :3], 0.0, 1.0)
     if images.color_space == LINEAR_REC709:

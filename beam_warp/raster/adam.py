@@ -13,13 +13,7 @@ from beam_warp.checks import require_array, require_choice, require_number, requ
 from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.raster.adam import (
-    AdamOptions,
-    ParameterGroup,
-    launch_clear_rows,
-    launch_clear_steps,
-    launch_step,
-)
+from beam_warp.kernels.raster.adam import AdamOptions, ParameterGroup, launch_clear, launch_step
 
 MOST_FLOATS = 2**31 - 1
 """Most floats that one optimiser moves: their indices are 32-bit."""
@@ -136,16 +130,8 @@ class Adam:
             raise InvalidArrayError(
                 f"visible must be a warp array of {self._row_count} bool on {self.device}, got {got}. Convert it."
             )
-        launch_step(
-            visible,
-            self._table,
-            self._rates,
-            self._options,
-            self._float_count,
-            self._steps,
-            self._corrections,
-            self.device,
-        )
+        state = (self._rates, self._options, self._float_count, self._steps, self._corrections)
+        launch_step(visible, self._table, *state, self.device)
 
     def set_learning_rate(self, name: str, learning_rate: float) -> None:
         """Change the learning rate of a group from the next step on, also of a captured one.
@@ -166,10 +152,7 @@ class Adam:
             InvalidArrayError: ``rows`` has another shape.
         """
         marks = upload(require_array("rows", rows, (self._row_count,), np.bool_), wp.bool, self.device)
-        for group in self._groups:
-            launch_clear_rows(marks, group.means, self.device)
-            launch_clear_rows(marks, group.squares, self.device)
-        launch_clear_steps(marks, self._steps, self.device)
+        launch_clear(marks, self._groups, self._steps, self.device)
 
 
 def _rows(name: str, array: Any, count: int, device: Any) -> wp.array:

@@ -52,40 +52,34 @@ def require_gaussians(gaussians: GaussianArrays, count: int, channels: ChannelRa
         wanted["radiance"] = (wp.vec3, (rows, COEFFICIENT_COUNTS))
     for name, (dtype, sides) in wanted.items():
         array = getattr(gaussians, name)
-        if not isinstance(array, wp.array):
-            got = "none" if array is None else type(array).__name__
-        elif array.dtype is dtype and array.device == device and _fits(array.shape, sides):
-            continue
-        else:
-            got = _described(array)
-        size = " x ".join(" or ".join(map(str, lengths)) for lengths in sides)
-        raise InvalidArrayError(
-            f"{name} must be a warp array of {dtype.__name__}, {size}, on {device}, got {got}. Convert it."
-        )
+        fits = isinstance(array, wp.array) and array.dtype is dtype and array.device == device
+        if not (fits and _has_sides(array.shape, sides)):
+            size = " x ".join(" or ".join(map(str, lengths)) for lengths in sides)
+            raise InvalidArrayError(
+                f"{name} must be a warp array of {dtype.__name__}, {size}, on {device}, got {_described(array)}. "
+                "Convert it."
+            )
 
 
 def require_matrix(name: str, array: Any, count: int, lengths: tuple[int, ...], device: wp.Device) -> None:
     """Refuse anything but a compact matrix of float32 with ``count`` rows of one of ``lengths``, or of any if empty."""
-    if not isinstance(array, wp.array):
-        got = type(array).__name__
-    elif not array.is_contiguous:
-        got = f"{_described(array)}, a part of another array"
-    else:
-        fits = array.ndim == 2 and array.shape[0] == count and (not lengths or array.shape[1] in lengths)
-        if fits and array.dtype is wp.float32 and array.device == device:
-            return
-        got = _described(array)
-    size = f"{count} x {' or '.join(map(str, lengths)) or 'K'}"
-    raise InvalidArrayError(
-        f"{name} must be a compact warp array of float32, {size}, on {device}, got {got}. Convert it."
-    )
+    fits = isinstance(array, wp.array) and array.dtype is wp.float32 and array.device == device
+    fits = fits and array.is_contiguous and array.ndim == 2
+    if not (fits and _has_sides(array.shape, ((count,), lengths or array.shape[1:]))):
+        part = ", a part of another array" if isinstance(array, wp.array) and not array.is_contiguous else ""
+        raise InvalidArrayError(
+            f"{name} must be a compact warp array of float32, {count} x {' or '.join(map(str, lengths)) or 'K'}, on "
+            f"{device}, got {_described(array)}{part}. Convert it."
+        )
 
 
-def _fits(shape: tuple[int, ...], sides: tuple[tuple[int, ...], ...]) -> bool:
+def _has_sides(shape: tuple[int, ...], sides: tuple[tuple[int, ...], ...]) -> bool:
     """Tell whether each side of a shape has one of the lengths that it may have."""
     return len(shape) == len(sides) and all(n in lengths for n, lengths in zip(shape, sides, strict=True))
 
 
-def _described(array: wp.array) -> str:
-    """Describe an array in an error."""
-    return f"{array.dtype.__name__} {array.shape} on {array.device}"
+def _described(array: Any) -> str:
+    """Describe an array, or what came instead of one, in an error."""
+    if isinstance(array, wp.array):
+        return f"{array.dtype.__name__} {array.shape} on {array.device}"
+    return "none" if array is None else type(array).__name__

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import warp as wp
 
 from beam_warp.kernels.raster.back_projection_cpu import launch_back_project_cpu
@@ -40,14 +38,8 @@ class BackwardBuffers:
             self._sums = [wp.zeros((splat_count, length), dtype=float) for length in lengths]
             self._splats = zero_splats(splat_count)
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
-            self.gaussians = GaussianGradients(
-                wp.zeros(count, dtype=wp.vec3),
-                wp.zeros(count, dtype=wp.quat),
-                wp.zeros(count, dtype=wp.vec3),
-                wp.zeros(count, dtype=float),
-                self._blocks.values if drawn.channels.values else None,
-                None,
-            )
+            geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
+            self.gaussians = GaussianGradients(*geometry, self._blocks.values if drawn.channels.values else None)
         self._tracked = _with_gradients(drawn.splats, self._splats)
 
     def begin(self, gaussians: GaussianArrays) -> None:
@@ -55,10 +47,10 @@ class BackwardBuffers:
         if self._drawn.channels.colors and gaussians.radiance is not None:
             held = self.gaussians.radiance
             if held is None or held.shape != gaussians.radiance.shape:
-                self.gaussians = replace(self.gaussians, radiance=wp.zeros_like(gaussians.radiance))
-        found, splats = self.gaussians, self._splats
-        summed = (found.positions, found.orientations, found.scales, found.opacities, found.radiance)
-        for array in (*summed, splats.centers, splats.shapes, splats.slopes, splats.bends, *self._sums):
+                self.gaussians = self.gaussians._replace(radiance=wp.zeros_like(gaussians.radiance))
+        splats = self._splats
+        summed = (*self.gaussians[:4], self.gaussians.radiance, *self._sums)
+        for array in (*summed, splats.centers, splats.shapes, splats.slopes, splats.bends):
             if array is not None:
                 array.zero_()
 
@@ -86,18 +78,10 @@ class BackwardBuffers:
             columns = range(MOMENTS, MOMENTS + rows.length)
             launch_scatter_channels(sums, columns, i * CHANNEL_COUNTS[-1], drawn.view_count, self._blocks, device)
         if drawn.channels.colors:
-            launch_evaluate_colors_adjoint(
-                gaussians.positions,
-                gaussians.radiance,
-                drawn.views,
-                drawn.blocks.colors,
-                self._blocks.colors,
-                found.positions,
-                found.radiance,
-                device,
-            )
-        gradients = [found.positions, found.orientations, found.scales, found.opacities]
-        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, gradients, device)
+            inputs = (gaussians.positions, gaussians.radiance, drawn.views)
+            colors = (drawn.blocks.colors, self._blocks.colors)
+            launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device)
+        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device)
         return found
 
 

@@ -142,12 +142,8 @@ class FrameBuffers:
         else:
             self.drawn = _first_pixels_of(images_of.drawn, self.pixel_count)
             self.channel_images = [Rows.of(rows.matrix[: self.pixel_count]) for rows in images_of.channel_images]
-        self.images = RasterImages(
-            tuple(image.matrix for image in self.channel_images),
-            self.drawn.alpha,
-            self.drawn.depth,
-            self.drawn.median_depth,
-        )
+        channels = tuple(image.matrix for image in self.channel_images)
+        self.images = RasterImages(channels, self.drawn.alpha, self.drawn.depth, self.drawn.median_depth)
 
     def _describe_frame(self, options: RasterOptions) -> None:
         """Fill in the structs that kernels read: views, projection and frame."""
@@ -167,9 +163,9 @@ class FrameBuffers:
 def zero_splats(count: int) -> Splats:
     """Allocate splats on the current device."""
     splats = Splats()
-    for name, dtype in (("centers", wp.vec4), ("shapes", wp.vec4), ("slopes", wp.vec4), ("bends", float)):
+    kinds = {"centers": wp.vec4, "shapes": wp.vec4, "slopes": wp.vec4, "bends": float, "normals": wp.vec3}
+    for name, dtype in kinds.items():
         setattr(splats, name, wp.zeros(count, dtype=dtype))
-    splats.normals = wp.zeros(count, dtype=wp.vec3)
     return splats
 
 

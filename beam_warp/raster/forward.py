@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -14,7 +16,7 @@ from beam_warp.kernels.raster.bin_tiles import (
     launch_key_splats,
 )
 from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors, launch_gather_channels
-from beam_warp.kernels.raster.composite import CHANNEL_COUNTS, launch_composite_pixels
+from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
 from beam_warp.kernels.raster.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.raster.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.raster.project import launch_project
@@ -120,10 +122,8 @@ def list_pairs(buffers: FrameBuffers) -> None:
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
 
 
-def composite(buffers: FrameBuffers, *, readable: bool) -> None:
-    """Draw the tiles of the band that was listed last."""
-    draw = launch_composite_cuda if buffers.device.is_cuda else launch_composite_cpu
-    if readable:
-        draw = launch_composite_pixels
+def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:
+    """Draw the tiles of the band that was listed last, with the composite of the device or another launcher."""
+    draw = draw or (launch_composite_cuda if buffers.device.is_cuda else launch_composite_cpu)
     for rows, image in zip(buffers.rows, buffers.channel_images, strict=True):
         draw(buffers.frame, rows.vectors, buffers.exact, image.vectors, buffers.drawn, buffers.device)

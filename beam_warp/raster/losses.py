@@ -77,44 +77,53 @@ class _Term:
         return self._value
 
 
-class L1Loss(_Term):
-    """Mean absolute difference. Its buffers take 4 bytes a pixel."""
+class _ImageTerm(_Term):
+    """A mean over the channels of an image and its target, of what two pixels or windows differ by."""
 
     def __call__(
         self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
     ) -> wp.array:
-        """Return weight * sum over pixels of mask * |image - target| / (H W C), and add its gradient.
+        """Return weight * sum over pixels of mask * difference / (H W C), and add its gradient.
 
         Args:
             image: ``(H, W, C)`` float32.
             target: The image to match, like ``image``.
             weight: The factor of the term, at least 0.
-            mask: Weight of each pixel, ``(H, W)`` float32, usually in [0, 1]; 1 without. It has no gradient.
-            gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32; 0 where the
-                images are equal.
+            mask: Weight of each pixel, or of the window around it, ``(H, W)`` float32, usually in [0, 1]; 1 without. It
+                has no gradient.
+            gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32.
 
         Raises:
             InvalidArrayError: An array has another type, shape or device.
             InvalidOptionError: ``weight`` is negative.
         """
+        picture, truth = self._input("image", image), self._input("target", target)
+        out = self._output("gradient", gradient)
         scale = _scale(weight, self.shape)
-        launch_add_l1(
-            self._input("image", image),
-            self._input("target", target),
-            self._mask(mask),
-            scale,
-            self._terms,
-            self._output("gradient", gradient),
-            self.device,
-        )
+        self._compare(picture, truth, self._mask(mask), scale, out)
         return self._finish(self._terms, scale)
 
+    def _compare(self, image: wp.array, target: wp.array, mask: Any, scale: float, gradient: Any) -> None:
+        """Write the differences to ``_terms``, and add ``scale`` times their gradient."""
+        raise NotImplementedError
 
-class SsimLoss(_Term):
+
+class L1Loss(_ImageTerm):
+    """Mean absolute difference, |image - target|; its gradient is 0 where the images are equal.
+
+    Buffers take 4 bytes a pixel.
+    """
+
+    def _compare(self, image: wp.array, target: wp.array, mask: Any, scale: float, gradient: Any) -> None:
+        launch_add_l1(image, target, mask, scale, self._terms, gradient, self.device)
+
+
+class SsimLoss(_ImageTerm):
     """One minus the mean structural similarity, of values in [0, 1].
 
     Windows are Gaussian, 11 x 11 pixels with a standard deviation of 1.5, and everything beyond the image is 0, as in
     3DGS (Kerbl et al. 2023): only 5 pixels and more from the border does it equal `beam_warp.image.metrics.ssim`'s map.
+    A window that counts sees all its pixels, masked or not.
 
     Channels are compared one by one. Buffers take about 12 bytes a pixel and channel.
 
@@ -126,31 +135,11 @@ class SsimLoss(_Term):
         self._terms = wp.empty(strip_count(height, width, channels), dtype=float, device=self.device)
         self._slopes = wp.empty((3, height, width, channels), dtype=float, device=self.device)
 
-    def __call__(
-        self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
-    ) -> wp.array:
-        """Return weight * sum over pixels of mask * (1 - similarity) / (H W C), and add its gradient.
-
-        Args:
-            image: ``(H, W, C)`` float32.
-            target: The image to match, like ``image``.
-            weight: The factor of the term, at least 0.
-            mask: Weight of the window around each pixel, ``(H, W)`` float32; 1 without. It has no gradient. A window
-                that counts sees all its pixels, masked or not.
-            gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32.
-
-        Raises:
-            InvalidArrayError: An array has another type, shape or device.
-            InvalidOptionError: ``weight`` is negative.
-        """
-        picture, truth = self._input("image", image), self._input("target", target)
-        out = self._output("gradient", gradient)
-        scale = _scale(weight, self.shape)
-        slopes = None if out is None else self._slopes
-        launch_compare_windows(picture, truth, self._mask(mask), scale, self._terms, slopes, self.device)
-        if out is not None:
-            launch_add_window_gradients(picture, truth, slopes, out, self.device)
-        return self._finish(self._terms, scale)
+    def _compare(self, image: wp.array, target: wp.array, mask: Any, scale: float, gradient: Any) -> None:
+        slopes = None if gradient is None else self._slopes
+        launch_compare_windows(image, target, mask, scale, self._terms, slopes, self.device)
+        if gradient is not None:
+            launch_add_window_gradients(image, target, slopes, gradient, self.device)
 
 
 class NormalLoss(_Term):

@@ -57,7 +57,6 @@ class Rasterizer:
         normals: bool = False,
         options: RasterOptions | None = None,
         device: Any = None,
-        readable: bool = False,
         images_of: Rasterizer | None = None,
     ) -> None:
         """Allocate the arrays of every frame.
@@ -70,7 +69,6 @@ class Rasterizer:
             normals: Whether the normal of the geometry is.
             options: How splats are drawn.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
-            readable: Composite with the readable kernel, the oracle of the fast ones.
             images_of: Another rasteriser on the device, of as many channels and of at least as many pixels, to draw
                 into the first of its pixels instead of images of its own. What either shows, and what `backward` and
                 `back_project` start from, lasts until the other draws.
@@ -89,7 +87,6 @@ class Rasterizer:
             radiance=radiance, normals=normals, value_count=require_count("value_count", value_count, 0)
         )
         self.color_channels, self.normal_channels, self.value_channels = channels
-        self._readable = readable
         room = None if images_of is None else images_of._buffers
         self._buffers = FrameBuffers(self._count, self.cameras, channels, self.options, self.device, room)
         self.images = self._buffers.images
@@ -162,7 +159,7 @@ class Rasterizer:
                 if len(self._bands) > 1:
                     forward.count_pairs(self._buffers, band)
                 forward.list_pairs(self._buffers)
-                forward.composite(self._buffers, readable=self._readable)
+                self._composite()
         self._gaussians = gaussians
         return self.images
 
@@ -182,7 +179,7 @@ class Rasterizer:
             forward.project(self._buffers, gaussians)
             forward.count_pairs(self._buffers, self._bands[0])
             forward.list_pairs(self._buffers)
-            forward.composite(self._buffers, readable=self._readable)
+            self._composite()
         return self.images
 
     def redraw_values(self) -> RasterImages:
@@ -198,7 +195,7 @@ class Rasterizer:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
             forward.gather_channels(self._buffers)
-            forward.composite(self._buffers, readable=self._readable)
+            self._composite()
         return self.images
 
     def adjoints(self) -> RasterImages:
@@ -263,6 +260,10 @@ class Rasterizer:
         require_matrix("rows", rows, self._buffers.splat_count, (), self.device)
         require_matrix("out", out, self._count, (rows.shape[1],), self.device)
         launch_sum_views(rows, out, self.device)
+
+    def _composite(self) -> None:
+        """Draw the band that was listed last."""
+        forward.composite(self._buffers)
 
     def _backward_buffers(self) -> BackwardBuffers:
         """Return the buffers of the way back, made when first asked for."""

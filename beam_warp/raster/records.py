@@ -108,16 +108,8 @@ class RasterImages:
             array.zero_()
 
 
-@dataclass(frozen=True, eq=False)
-class GaussianGradients:
-    """Derivatives of a loss with respect to Gaussians, on the device; attributes as in `GaussianArrays`.
+class GaussianGradients(GaussianArrays):
+    """Derivatives of a loss with respect to Gaussians, on the device, in the shapes and order of `GaussianArrays`.
 
     ``orientations`` are to the quaternions as given, and orthogonal to them.
     """
-
-    positions: wp.array
-    orientations: wp.array
-    scales: wp.array
-    opacities: wp.array
-    values: wp.array | None
-    radiance: wp.array | None

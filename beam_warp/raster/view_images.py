@@ -104,10 +104,5 @@ def host_images(view: ViewImages, channel_count: int) -> ValueImages:
     """Bring one view's images to the host; of its channels the first ones, without padding."""
     passes = [image.numpy() for image in view.channels]
     values = passes[0] if len(passes) == 1 else np.concatenate(passes, axis=-1)
-    return ValueImages(
-        view.alpha.numpy(),
-        view.depth.numpy(),
-        view.median_depth.numpy(),
-        view.gaussian_ids.numpy(),
-        values[..., :channel_count],
-    )
+    flat = (view.alpha, view.depth, view.median_depth, view.gaussian_ids)
+    return ValueImages(*(image.numpy() for image in flat), values[..., :channel_count])

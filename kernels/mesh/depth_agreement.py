@@ -90,10 +90,6 @@ def launch_flag_agreed(confirmed, contradicted, confirmations, flags, device):
 
 def launch_compare_depths(view, pixel_count, cameras, pixels, tolerance, confirmed, contradicted, residuals, device):
     """Compare the points of one view with all others."""
-    launch(
-        compare_depths_kernel,
-        pixel_count,
-        inputs=[view, cameras, pixels, tolerance],
-        outputs=[confirmed, contradicted, residuals],
-        device=device,
-    )
+    inputs = [view, cameras, pixels, tolerance]
+    outputs = [confirmed, contradicted, residuals]
+    launch(compare_depths_kernel, pixel_count, inputs=inputs, outputs=outputs, device=device)

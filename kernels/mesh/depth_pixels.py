@@ -191,18 +191,12 @@ def write_depth_pixels_kernel(
             other = covered_inverse_depth(depth, alpha, camera, minimum_alpha, x + dx, y + dy)
             if not inside or is_near(camera, q, other):  # the image's border is no edge of the surface
                 near += 1
-    along = step_of(
-        camera,
-        covered_inverse_depth(depth, alpha, camera, minimum_alpha, x - 1, y),
-        q,
-        covered_inverse_depth(depth, alpha, camera, minimum_alpha, x + 1, y),
-    )
-    down = step_of(
-        camera,
-        covered_inverse_depth(depth, alpha, camera, minimum_alpha, x, y - 1),
-        q,
-        covered_inverse_depth(depth, alpha, camera, minimum_alpha, x, y + 1),
-    )
+    left = covered_inverse_depth(depth, alpha, camera, minimum_alpha, x - 1, y)
+    right = covered_inverse_depth(depth, alpha, camera, minimum_alpha, x + 1, y)
+    above = covered_inverse_depth(depth, alpha, camera, minimum_alpha, x, y - 1)
+    below = covered_inverse_depth(depth, alpha, camera, minimum_alpha, x, y + 1)
+    along = step_of(camera, left, q, right)
+    down = step_of(camera, above, q, below)
     ray = pixel_ray(camera, float(x) + 0.5, float(y) + 0.5)
     a = camera.focal[0] * along[0]
     b = camera.focal[1] * down[0]
@@ -245,13 +239,8 @@ def drop_pixels_kernel(first: int, keep: wp.array[int], out_pixels: wp.array[wp.
 
 def launch_write_depth_pixels(depth, alpha, normals, camera, minimum_alpha, out_pixels, device):
     """Write the pixels of one view among those of all."""
-    launch(
-        write_depth_pixels_kernel,
-        camera.width * camera.height,
-        inputs=[depth, alpha, normals, camera, minimum_alpha],
-        outputs=[out_pixels],
-        device=device,
-    )
+    inputs = [depth, alpha, normals, camera, minimum_alpha]
+    launch(write_depth_pixels_kernel, camera.width * camera.height, inputs=inputs, outputs=[out_pixels], device=device)
 
 
 def launch_write_pixel_colors(color, alpha, first_pixel, out_colors, device):

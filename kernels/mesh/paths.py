@@ -148,11 +148,5 @@ def launch_trace_pixels(lit, rays, seed, sample_count, bounce_count, out_radianc
 
 def launch_trace_outgoing(lit, faces, weights, directions, seed, sample_count, bounce_count, out_radiance):
     """Estimate the radiance that leaves every point in each of its directions."""
-    launch(
-        trace_outgoing_kernel,
-        len(faces),
-        inputs=[lit, faces, weights, directions, wp.uint32(seed), sample_count, bounce_count],
-        outputs=[out_radiance],
-        device=faces.device,
-        block_dim=64,
-    )
+    inputs = [lit, faces, weights, directions, wp.uint32(seed), sample_count, bounce_count]
+    launch(trace_outgoing_kernel, len(faces), inputs=inputs, outputs=[out_radiance], device=faces.device, block_dim=64)

@@ -55,11 +55,5 @@ def shade_mesh_kernel(
 
 def launch_shade_mesh(mesh, normals, colors, camera, background, out_colors, device):
     """Write the linear colour of every pixel."""
-    launch(
-        shade_mesh_kernel,
-        len(out_colors),
-        inputs=[mesh, normals, colors, camera, background],
-        outputs=[out_colors],
-        device=device,
-        block_dim=64,
-    )
+    inputs = [mesh, normals, colors, camera, background]
+    launch(shade_mesh_kernel, len(out_colors), inputs=inputs, outputs=[out_colors], device=device, block_dim=64)

@@ -30,11 +30,6 @@ def cast_rays_kernel(
 
 def launch_cast_rays(mesh, origins, directions, out_distances):
     """Find how far every ray goes."""
-    launch(
-        cast_rays_kernel,
-        len(origins),
-        inputs=[mesh, origins, directions],
-        outputs=[out_distances],
-        device=origins.device,
-        min_chunk=RAY_CHUNK,
-    )
+    inputs = [mesh, origins, directions]
+    outputs = [out_distances]
+    launch(cast_rays_kernel, len(origins), inputs=inputs, outputs=outputs, device=origins.device, min_chunk=RAY_CHUNK)

@@ -12,15 +12,15 @@ from beam_warp.kernels.mesh.depth_pixels import DepthCamera, is_background, pixe
 
 wp.set_module_options({"enable_backward": False})
 
-SIDE = 8
+SIDE = wp.constant(8)
 """Voxels along a block's side."""
 
-VOXELS = SIDE**3
-HALF_SIDE = 4.0
+VOXELS = wp.constant(SIDE**3)
+TRUNCATION = wp.constant(4.0)
 """Truncation in voxels: half a block, so that the cube of that reach around a point lies in 2 x 2 x 2 blocks."""
 
 KEY_BITS = 21
-KEY_OFFSET = 2**20
+OFFSET = wp.constant(2**20)
 """Block coordinates are from -2^20 to 2^20 - 1."""
 
 NO_KEY = 2**63 - 1
@@ -32,11 +32,7 @@ LEAST_WEIGHT = wp.constant(1.0e-4)
 LEAST_DISTANCE = wp.constant(1.0e-3)
 """Smallest distance at a voxel, in voxels: vertices on a grid point would collapse triangles to nothing."""
 
-BLOCK_SIDE = wp.constant(SIDE)
-BLOCK_VOXELS = wp.constant(VOXELS)
-TRUNCATION = wp.constant(HALF_SIDE)
 BITS = wp.constant(wp.int64(KEY_BITS))
-OFFSET = wp.constant(KEY_OFFSET)
 MISSING = wp.constant(wp.int64(NO_KEY))
 MASK = wp.constant(wp.int64(2**KEY_BITS - 1))
 
@@ -81,10 +77,10 @@ def low_key(pixels: wp.array[wp.vec3], camera: DepthCamera, voxel: float, pixel:
     y = float(pixel / camera.width) + 0.5
     low = pixel_point(camera, x, y, value[0]) / voxel - wp.vec3(TRUNCATION, TRUNCATION, TRUNCATION)
     # The blocks above, and marching cubes' corners above them, have keys too.
-    limit = float(OFFSET - 4) * float(BLOCK_SIDE)
+    limit = float(OFFSET - 4) * float(SIDE)
     if not (wp.max(wp.max(wp.abs(low[0]), wp.abs(low[1])), wp.abs(low[2])) < limit):
         return MISSING
-    side = float(BLOCK_SIDE)
+    side = float(SIDE)
     return key_of(wp.vec3i(int(wp.floor(low[0] / side)), int(wp.floor(low[1] / side)), int(wp.floor(low[2] / side))))
 
 
@@ -151,13 +147,13 @@ def find_neighbors_kernel(first: int, keys: wp.array[wp.int64], out_neighbors: w
 
 @wp.func
 def local_of(voxel: int) -> wp.vec3i:
-    return wp.vec3i(voxel / (BLOCK_SIDE * BLOCK_SIDE), (voxel / BLOCK_SIDE) % BLOCK_SIDE, voxel % BLOCK_SIDE)
+    return wp.vec3i(voxel / (SIDE * SIDE), (voxel / SIDE) % SIDE, voxel % SIDE)
 
 
 @wp.func
 def grid_of(keys: wp.array[wp.int64], index: int) -> wp.vec3i:
     """Grid coordinates of a voxel."""
-    return block_of(keys[index / BLOCK_VOXELS]) * BLOCK_SIDE + local_of(index % BLOCK_VOXELS)
+    return block_of(keys[index / VOXELS]) * SIDE + local_of(index % VOXELS)
 
 
 @wp.kernel
@@ -209,16 +205,16 @@ def integrate_kernel(
 @wp.func
 def corner_distance(neighbors: wp.array[int], distances: wp.array[float], index: int, corner: int) -> float:
     """Distance at a corner of the cell above a voxel; 0 where it is not observed."""
-    block = index / BLOCK_VOXELS
-    at = local_of(index % BLOCK_VOXELS) + corner_of(corner)
-    over = wp.vec3i(at[0] / BLOCK_SIDE, at[1] / BLOCK_SIDE, at[2] / BLOCK_SIDE)
+    block = index / VOXELS
+    at = local_of(index % VOXELS) + corner_of(corner)
+    over = wp.vec3i(at[0] / SIDE, at[1] / SIDE, at[2] / SIDE)
     # Corners of a square are counted around it: 0, 1, 2, 3 are (0, 0), (1, 0), (1, 1), (0, 1).
     side = over[0] + 3 * over[1] - 2 * over[0] * over[1]
     found = neighbors[8 * block + 4 * over[2] + side]
     if found < 0:
         return 0.0
-    local = at - over * BLOCK_SIDE
-    return distances[found * BLOCK_VOXELS + (local[0] * BLOCK_SIDE + local[1]) * BLOCK_SIDE + local[2]]
+    local = at - over * SIDE
+    return distances[found * VOXELS + (local[0] * SIDE + local[1]) * SIDE + local[2]]
 
 
 @wp.kernel
@@ -290,13 +286,8 @@ def gather_colors_kernel(
 
 def launch_find_pixel_keys(pixels, camera, voxel, keys, flags, device):
     """Find the lowest block of every pixel of a view, and which of them begin a run."""
-    launch(
-        find_pixel_keys_kernel,
-        camera.width * camera.height,
-        inputs=[pixels, camera, voxel],
-        outputs=[keys, flags],
-        device=device,
-    )
+    inputs = [pixels, camera, voxel]
+    launch(find_pixel_keys_kernel, camera.width * camera.height, inputs=inputs, outputs=[keys, flags], device=device)
 
 
 def launch_flag_first_keys(keys, count, flags, device):
@@ -321,13 +312,8 @@ def launch_find_neighbors(keys, neighbors, device):
 
 def launch_integrate(keys, cameras, pixels, voxel, distances, weights, device):
     """Write distance and weight of every voxel of all blocks."""
-    launch(
-        integrate_kernel,
-        VOXELS * len(keys),
-        inputs=[keys, cameras, pixels, voxel],
-        outputs=[distances, weights],
-        device=device,
-    )
+    inputs = [keys, cameras, pixels, voxel]
+    launch(integrate_kernel, VOXELS * len(keys), inputs=inputs, outputs=[distances, weights], device=device)
 
 
 def launch_flag_cells(neighbors, distances, flags, device):
@@ -337,21 +323,11 @@ def launch_flag_cells(neighbors, distances, flags, device):
 
 def launch_write_cells(keys, neighbors, distances, flags, ends, cells, values, device):
     """Write place and corners of the flagged cells."""
-    launch(
-        write_cells_kernel,
-        len(flags),
-        inputs=[keys, neighbors, distances, flags, ends],
-        outputs=[cells, values],
-        device=device,
-    )
+    inputs = [keys, neighbors, distances, flags, ends]
+    launch(write_cells_kernel, len(flags), inputs=inputs, outputs=[cells, values], device=device)
 
 
 def launch_gather_colors(points, cameras, pixels, colors, reach, out_colors, device):
     """Write the colour of points of the surface."""
-    launch(
-        gather_colors_kernel,
-        len(points),
-        inputs=[points, cameras, pixels, colors, reach],
-        outputs=[out_colors],
-        device=device,
-    )
+    inputs = [points, cameras, pixels, colors, reach]
+    launch(gather_colors_kernel, len(points), inputs=inputs, outputs=[out_colors], device=device)

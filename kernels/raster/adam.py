@@ -4,8 +4,6 @@ Two kernels: one a row, which counts its step and works out the bias corrections
 to lose in float32); one a float of any group, which moves it.
 """
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -102,38 +100,17 @@ def clear_steps_kernel(first: int, marks: wp.array[bool], out_steps: wp.array[in
         out_steps[item] = 0
 
 
-def launch_step(
-    visible: Any,
-    groups: Any,
-    rates: Any,
-    options: AdamOptions,
-    float_count: int,
-    out_steps: Any,
-    out_corrections: Any,
-    device: Any,
-) -> None:
+def launch_step(visible, groups, rates, options, float_count, out_steps, out_corrections, device):
     """Count the step of every visible row, and move its parameters and moments."""
-    launch(
-        count_steps_kernel,
-        out_steps.size,
-        inputs=[visible, options],
-        outputs=[out_steps, out_corrections],
-        device=device,
-    )
-    launch(
-        move_parameters_kernel,
-        float_count,
-        inputs=[groups, rates, out_corrections, options],
-        outputs=[],  # through the groups
-        device=device,
-    )
+    inputs = [visible, options]
+    launch(count_steps_kernel, out_steps.size, inputs=inputs, outputs=[out_steps, out_corrections], device=device)
+    inputs = [groups, rates, out_corrections, options]  # its output goes through the groups
+    launch(move_parameters_kernel, float_count, inputs=inputs, outputs=[], device=device)
 
 
-def launch_clear_rows(marks: Any, out_rows: Any, device: Any) -> None:
-    """Set marked rows to 0."""
-    launch(clear_rows_kernel, out_rows.size, inputs=[marks], outputs=[out_rows], device=device)
-
-
-def launch_clear_steps(marks: Any, out_steps: Any, device: Any) -> None:
-    """Set marked counts to 0."""
+def launch_clear(marks, groups, out_steps, device):
+    """Set the moments and the counts of marked rows to 0."""
+    for group in groups:
+        for rows in (group.means, group.squares):
+            launch(clear_rows_kernel, rows.size, inputs=[marks], outputs=[rows], device=device)
     launch(clear_steps_kernel, out_steps.size, inputs=[marks], outputs=[out_steps], device=device)

@@ -197,32 +197,17 @@ def launch_key_splats(splats, keys, order, device):
 
 def launch_count_pairs(order, splats, views, gaussian_count, band, counts, device):
     """Count the tiles of a band that each splat reaches, in depth order."""
-    launch(
-        count_pairs_kernel,
-        len(splats.centers),
-        inputs=[order, splats, views, gaussian_count, band],
-        outputs=[counts],
-        device=device,
-    )
+    inputs = [order, splats, views, gaussian_count, band]
+    launch(count_pairs_kernel, len(splats.centers), inputs=inputs, outputs=[counts], device=device)
 
 
 def launch_emit_pairs(order, splats, views, gaussian_count, band, out_pairs, device):
     """Write the tile, slot and splat of every pair, in depth order."""
-    launch(
-        emit_pairs_kernel,
-        len(splats.centers),
-        inputs=[order, splats, views, gaussian_count, band],
-        outputs=[out_pairs],
-        device=device,
-    )
+    inputs = [order, splats, views, gaussian_count, band]
+    launch(emit_pairs_kernel, len(splats.centers), inputs=inputs, outputs=[out_pairs], device=device)
 
 
 def launch_find_ranges(pairs, tile_count, lists, device):
     """Write each tile's range among the sorted pairs, and the pairs' splats."""
-    launch(
-        find_ranges_kernel,
-        len(pairs.owners),
-        inputs=[pairs, tile_count],
-        outputs=[lists.splats, lists.ranges],
-        device=device,
-    )
+    inputs = [pairs, tile_count]
+    launch(find_ranges_kernel, len(pairs.owners), inputs=inputs, outputs=[lists.splats, lists.ranges], device=device)

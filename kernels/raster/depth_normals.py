@@ -10,8 +10,6 @@ in camera axes, at the pixel's own (u, v). Nothing cancels but the two differenc
 another subtract exactly; n r = -1 before normalising, so that every normal faces the camera; and it has no zero.
 """
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -165,19 +163,12 @@ def add_depth_gradients_kernel(
     out_depth_gradients[y, x] += total
 
 
-def launch_write_depth_normals(depth: Any, alpha: Any, view: DepthNormalCamera, out_normals: Any, device: Any) -> None:
+def launch_write_depth_normals(depth, alpha, view, out_normals, device):
     """Write the normals of every pixel."""
     launch(write_depth_normals_kernel, depth.size, inputs=[depth, alpha, view], outputs=[out_normals], device=device)
 
 
-def launch_add_depth_gradients(
-    depth: Any, alpha: Any, view: DepthNormalCamera, normal_gradients: Any, out_depth_gradients: Any, device: Any
-) -> None:
+def launch_add_depth_gradients(depth, alpha, view, normal_gradients, out_depth_gradients, device):
     """Add to the gradients of every pixel's depth, from those of the normals."""
-    launch(
-        add_depth_gradients_kernel,
-        depth.size,
-        inputs=[depth, alpha, view, normal_gradients],
-        outputs=[out_depth_gradients],
-        device=device,
-    )
+    inputs = [depth, alpha, view, normal_gradients]
+    launch(add_depth_gradients_kernel, depth.size, inputs=inputs, outputs=[out_depth_gradients], device=device)

@@ -3,8 +3,6 @@
 A pixel writes what it adds to the loss, and adds its gradients; `fixed_sums` adds the former up.
 """
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -91,34 +89,14 @@ def add_normal_kernel(
         add_vector(out_expected_gradient, y, x, upstream * direction)
 
 
-def launch_add_l1(
-    image: Any, target: Any, mask: Any, scale: float, out_terms: Any, out_gradient: Any, device: Any
-) -> None:
+def launch_add_l1(image, target, mask, scale, out_terms, out_gradient, device):
     """Write every pixel's sum of absolute differences, and add ``scale`` times their gradients."""
-    launch(
-        add_l1_kernel,
-        out_terms.size,
-        inputs=[image, target, mask, scale],
-        outputs=[out_terms, out_gradient],
-        device=device,
-    )
+    inputs = [image, target, mask, scale]
+    launch(add_l1_kernel, out_terms.size, inputs=inputs, outputs=[out_terms, out_gradient], device=device)
 
 
-def launch_add_normal(
-    rendered: Any,
-    expected: Any,
-    mask: Any,
-    scale: float,
-    out_terms: Any,
-    out_rendered_gradient: Any,
-    out_expected_gradient: Any,
-    device: Any,
-) -> None:
+def launch_add_normal(rendered, expected, mask, scale, out_terms, out_rendered_gradient, out_expected_gradient, device):
     """Write every pixel's disagreement of normals, and add ``scale`` times its gradients."""
-    launch(
-        add_normal_kernel,
-        out_terms.size,
-        inputs=[rendered, expected, mask, scale],
-        outputs=[out_terms, out_rendered_gradient, out_expected_gradient],
-        device=device,
-    )
+    inputs = [rendered, expected, mask, scale]
+    outputs = [out_terms, out_rendered_gradient, out_expected_gradient]
+    launch(add_normal_kernel, out_terms.size, inputs=inputs, outputs=outputs, device=device)

@@ -74,10 +74,5 @@ def launch_sum_pairs(pair_rows, order, out_sums, device):
 
 def launch_resolve_sums(sums, splats, channel_count, exact, gradients, device):
     """Add to the gradients of all splats' rows, from their summed moments."""
-    launch(
-        resolve_sums_kernel,
-        sums.shape[0],
-        inputs=[sums, splats, channel_count, exact],
-        outputs=[gradients],
-        device=device,
-    )
+    inputs = [sums, splats, channel_count, exact]
+    launch(resolve_sums_kernel, sums.shape[0], inputs=inputs, outputs=[gradients], device=device)

@@ -154,13 +154,8 @@ def project_gaussians_kernel(
 
 def launch_project(gaussians, views, projection, out_splats, device):
     """Project every Gaussian into every view; ``gaussians`` are positions, orientations, scales and opacities."""
-    launch(
-        project_gaussians_kernel,
-        len(out_splats.centers),
-        inputs=[*gaussians, views, projection],
-        outputs=[out_splats],
-        device=device,
-    )
+    inputs = [*gaussians, views, projection]
+    launch(project_gaussians_kernel, len(out_splats.centers), inputs=inputs, outputs=[out_splats], device=device)
 
 
 def launch_project_adjoint(gaussians, views, projection, splats, out_gradients, device):

@@ -22,7 +22,6 @@ so that (m - e mean(x) + c mean(d), e, c) is what a window stores, times its wei
 """
 
 import math
-from typing import Any
 
 import warp as wp
 
@@ -179,25 +178,14 @@ def strip_count(height: int, width: int, channels: int) -> int:
     return -(-height // STRIP) * width * channels
 
 
-def launch_compare_windows(
-    image: Any, target: Any, mask: Any, scale: float, out_terms: Any, out_slopes: Any, device: Any
-) -> None:
+def launch_compare_windows(image, target, mask, scale, out_terms, out_slopes, device):
     """Write every strip's sum of 1 - similarity, and ``scale`` times its derivatives."""
-    launch(
-        compare_windows_kernel,
-        strip_count(*image.shape),
-        inputs=[image, target, mask, scale],
-        outputs=[out_terms, out_slopes],
-        device=device,
-    )
+    inputs = [image, target, mask, scale]
+    outputs = [out_terms, out_slopes]
+    launch(compare_windows_kernel, strip_count(*image.shape), inputs=inputs, outputs=outputs, device=device)
 
 
-def launch_add_window_gradients(image: Any, target: Any, slopes: Any, out_gradient: Any, device: Any) -> None:
+def launch_add_window_gradients(image, target, slopes, out_gradient, device):
     """Add the gradient to every pixel that stored derivatives lead to."""
-    launch(
-        add_window_gradients_kernel,
-        strip_count(*image.shape),
-        inputs=[image, target, slopes],
-        outputs=[out_gradient],
-        device=device,
-    )
+    inputs = [image, target, slopes]
+    launch(add_window_gradients_kernel, strip_count(*image.shape), inputs=inputs, outputs=[out_gradient], device=device)

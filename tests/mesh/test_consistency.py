@@ -53,9 +53,9 @@ def test_a_plane_hidden_by_a_sphere_is_not_contradicted():
     """A sphere, seen from above, hides a disc of the plane below it; the disc is seen from the side."""
     above, aside = around((0.0, 0.0, 0.0), width=64, azimuths=1, elevations=(89.0, 40.0))
     floor = plane_view(aside, -0.6)
-    found = depth_consistency(DepthImages.of([sphere_view(above, RADIUS), floor], device="cpu"))
-    # Of the floor, the view from above sees the sphere in front, or nothing: where it sees nothing it objects.
     images = DepthImages.of([sphere_view(above, RADIUS), floor], device="cpu")
+    found = depth_consistency(images)
+    # Of the floor, the view from above sees the sphere in front, or nothing: where it sees nothing it objects.
     rows = part(images, 1)
     points = above.project(_points(floor))
     hidden = sphere_at(above, points[:, :2])

@@ -12,6 +12,8 @@ FLOAT32_STEP = 2.0**-23
 
 SMALL = {"width": 64, "height": 64, "vertical_fov": 40.0}
 
+ABOVE = Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), **SMALL)
+
 
 def dome(distance=4.0, elevations=(-50.0, 0.0, 50.0)):
     return [
@@ -121,20 +123,18 @@ class TestSurfaceDistances:
         assert found.to_truth_p95_mm == pytest.approx(10.0, abs=0.06)
 
     def test_what_is_missing_counts_from_the_truth_only(self, device):
-        above = [Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), width=64, height=64, vertical_fov=40.0)]
         half = square()
         half = trimesh.Trimesh(half.vertices * (0.5, 1.0, 1.0) - (0.5, 0.0, 0.0), half.faces, process=False)
-        found = surface_distances(half, square(), above, sample_count=20_000, device=device)
+        found = surface_distances(half, square(), [ABOVE], sample_count=20_000, device=device)
         assert found.to_truth_mm < 1e3 * 10.0 * FLOAT32_STEP
         # Half of the square is missing, 0.5 m away in the mean: 250 mm; a standard error of 2 mm over 20,000 points.
         assert found.to_reconstruction_mm == pytest.approx(250.0, abs=10.0)
 
     def test_what_no_camera_sees_counts_on_neither_side(self, device):
-        above = [Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), width=64, height=64, vertical_fov=40.0)]
         box = trimesh.creation.box((1.0, 1.0, 1.0))
         lid = box.vertices[:, 2] > 0.0
         wrong_below = trimesh.Trimesh(np.where(lid[:, None], box.vertices, box.vertices - (0, 0, 0.4)), box.faces)
-        found = surface_distances(wrong_below, box, above, sample_count=5000, device=device)
+        found = surface_distances(wrong_below, box, [ABOVE], sample_count=5000, device=device)
         assert found.seen_share == pytest.approx(1.0 / 6.0, abs=0.01)
         assert found.chamfer_mm < 1e3 * 10.0 * FLOAT32_STEP
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.raster_splats import RasterScene, see
-from reference.rasterizing import decide, pair_terms, pixel_centers
+from reference.rasterizing import decide, pair_terms
 from support.raster_clouds import around, cloud
 
 from beam_warp import Camera, GaussianCloud
@@ -60,24 +60,6 @@ def roundings(cameras):
     return 2 + TILE * TILE + tiles + len(cameras)
 
 
-@pytest.mark.parametrize(
-    ("length", "width", "height"),
-    [(4, 17, 15), (4, 1, 50), (4, 129, 3), (4, 1, 1), (8, 16, 16), (12, 40, 36), (16, 40, 36)],
-)
-def test_a_ball_on_the_axis_is_its_closed_form(device, length, width, height):
-    """One Gaussian, whose weights are its alphas."""
-    camera = Camera(width, height, 20.0, 20.0, 0.5 * width, 0.5 * height, np.eye(4))
-    ball = GaussianCloud(positions=[[0, 0, 2.0]], orientations=[[0, 0, 0, 1]], scales=[[0.3] * 3], opacities=[0.7])
-    square = ((pixel_centers(camera) - (camera.center_x, camera.center_y)) ** 2).sum(-1)
-    alpha = 0.7 * np.exp(-0.5 * square / ((20.0 * 0.3 / 2.0) ** 2 + 0.3))
-    alpha[alpha < 1.0 / 255.0] = 0.0
-    pixels = np.arange(1.0, width * height * length + 1).reshape(-1, length) / (width * height * length)
-    found = back_projected(drawn(ball, [camera], device), pixels)
-    # The exponent, at most ln 255, of a few rounded products; the sum.
-    relative = (10 * np.log(255.0) + roundings([camera])) * ROUNDING
-    np.testing.assert_allclose(found[0, 0], alpha @ pixels, rtol=relative)
-
-
 @pytest.mark.parametrize("opacity", [0.3, 0.999])
 def test_weights_are_those_of_drawing_to_the_last_bit(device, rng, opacity):
     """Drawing a Gaussian that holds 1 gives its weights; so does back-projecting a pixel that holds 1."""
@@ -94,7 +76,7 @@ def test_weights_are_those_of_drawing_to_the_last_bit(device, rng, opacity):
         np.testing.assert_array_equal(back_projected(drawer, pixels)[0].T, weights[start : start + 16])
 
 
-@pytest.mark.parametrize(("length", "antialiased"), [(4, False), (16, True)])
+@pytest.mark.parametrize(("length", "antialiased"), [(4, False), (8, False), (12, False), (16, True)])
 def test_against_float64(device, rng, length, antialiased):
     """Every weight anew in double precision, pixel by pixel; views of several sizes at once."""
     made, options = cloud(rng), RasterOptions(antialiased=antialiased)
@@ -117,20 +99,6 @@ def test_against_float64(device, rng, length, antialiased):
         assert np.linalg.norm(got - want) <= TWIN_ERROR * np.linalg.norm(want)
         np.testing.assert_array_equal(got[~want.any(axis=1)], 0.0)
     assert min(np.abs(want).max() for want in wanted) > 0.0
-
-
-@pytest.mark.parametrize("length", [8, 12])
-def test_it_is_the_transpose_of_drawing(device, rng, length):
-    """<A x, y> = <x, A^T y>: both sum the same weights, a pixel's over Gaussians, a Gaussian's over pixels."""
-    made = cloud(rng)
-    values = rng.normal(size=(COUNT, length)).astype(np.float32)
-    pixels = rng.normal(size=(sum(camera.width * camera.height for camera in VIEWS), length)).astype(np.float32)
-    drawer = drawn(made, VIEWS, device, values)
-    forwards = (drawer.images.channels[0].numpy().astype(float) * pixels).sum()
-    backwards = (summed(drawer, back_projected(drawer, pixels)).astype(float) * values).sum()
-    weighed = (summed(drawer, back_projected(drawer, np.abs(pixels))) * np.abs(values)).sum()
-    assert abs(forwards - backwards) <= (COUNT + roundings(VIEWS)) * ROUNDING * weighed
-    assert abs(forwards) > 1e-3 * weighed
 
 
 @pytest.mark.parametrize("depth", ["plane", "exact"])
@@ -178,8 +146,7 @@ def test_many_splats_on_a_tile(device, rng):
     np.testing.assert_allclose(found.sum(axis=0, dtype=float), alpha, rtol=(count + roundings([camera])) * ROUNDING)
 
 
-@pytest.mark.parametrize("length", [4])
-def test_what_no_view_sees_gets_nothing(device, length):
+def test_what_no_view_sees_gets_nothing(device):
     """Behind the camera, beside the image, transparent; and no Gaussian at all."""
     camera = Camera(20, 12, 20.0, 20.0, 10.0, 6.0, np.eye(4))
     made = GaussianCloud(
@@ -188,17 +155,17 @@ def test_what_no_view_sees_gets_nothing(device, length):
         scales=[[0.1] * 3] * 3,
         opacities=[0.5] * 3,
     )
-    pixels = np.ones((240, length))
+    pixels = np.ones((240, 4))
     found = back_projected(drawn(made, [camera], device), pixels)
     np.testing.assert_array_equal(found[0, [0, 2]], 0.0)
     assert (found[0, 1] > 0.1).all()
     unseen = made.with_arrays(positions=made.positions * np.float32([1, 1, -1]), opacities=np.zeros(3, np.float32))
     drawer = drawn(unseen, [camera, camera], device)
     assert drawer.pair_capacity == 0
-    np.testing.assert_array_equal(back_projected(drawer, np.ones((480, length))), np.zeros((2, 3, length)))
+    np.testing.assert_array_equal(back_projected(drawer, np.ones((480, 4))), np.zeros((2, 3, 4)))
     nothing = drawn(cloud(np.random.default_rng(1), 0), [camera, camera], device)
-    assert back_projected(nothing, np.ones((480, length))).shape == (2, 0, length)
-    assert summed(nothing, np.zeros((0, length), np.float32)).shape == (0, length)
+    assert back_projected(nothing, np.ones((480, 4))).shape == (2, 0, 4)
+    assert summed(nothing, np.zeros((0, 4), np.float32)).shape == (0, 4)
 
 
 def test_any_number_of_threads_gives_the_same_bits(rng, monkeypatch):

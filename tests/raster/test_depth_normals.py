@@ -1,4 +1,4 @@
-"""Depth to normals: planes and spheres in closed form, the float64 twin, gradients, edges, sizes, broken depths."""
+"""Depth to normals: planes in closed form, the float64 twin, gradients, edges, sizes, broken depths."""
 
 import numpy as np
 import pytest
@@ -40,15 +40,6 @@ def gradients_of(depth, camera, upstream, device, alpha=None, **options):
     return gradients.numpy()
 
 
-def sphere_depth(camera, center, radius):
-    """Depth of a sphere whose centre is in camera axes; 0 beside it, and the points in camera axes."""
-    directions = rays(camera)
-    a, b = (directions**2).sum(-1), directions @ center
-    root = b**2 - a * (center @ center - radius**2)
-    depth = np.where(root > 0.0, (b - np.sqrt(np.maximum(root, 0.0))) / a, 0.0)
-    return depth, depth[..., None] * directions
-
-
 def bumpy_depth(rng, camera):
     """A smooth surface with every slope, and a rectangle in front of it, as float32."""
     y, x = np.mgrid[: camera.height, : camera.width]
@@ -68,38 +59,6 @@ class TestClosedForm:
         # normal by no more than the two together; another 4 roundings of a length of at most 1 for the rotation.
         tolerance = (np.hypot(camera.focal_x, camera.focal_y) + 8.0) * EPSILON
         assert np.abs(found - camera.camera_to_world[:3, :3] @ normal).max() <= tolerance
-
-    def test_sphere(self, device):
-        center, radius = np.array([0.1, -0.05, 2.0]), 0.5
-        errors = []
-        for camera in (camera_of(64, 48), camera_of(256, 192, focal=320.0)):
-            depth, points = sphere_depth(camera, center, radius)
-            truth = (points - center) / radius
-            found = normals_of(depth, camera, device, alpha=depth > 0.0, largest_jump=0.2)
-            gentle = (depth > 0.0) & (truth[..., 2] < -0.6)
-            assert gentle.sum() > 200
-            errors.append(np.abs(found @ camera.camera_to_world[:3, :3] - truth)[gentle].max())
-        # Central differences are wrong by h^2 / 6 of the third derivative: with h = z / f on a sphere whose slope s is
-        # below 4/3, |z'''| = 3 s (1 + s^2)^(5/2) / R^2 is below 52 / R^2, and the normal turns by no more than that.
-        assert errors[0] <= 52.0 / 6.0 * (2.0 / 80.0 / radius) ** 2
-        assert errors[1] < errors[0] / 12.0  # second order: a quarter of the step, a sixteenth of the error
-
-    def test_faces_the_camera_in_world_axes(self, device, rng):
-        camera = camera_of(40, 30)
-        normals = normals_of(bumpy_depth(rng, camera), camera, device)
-        there = np.abs(normals).max(axis=-1) > 0.0
-        toward = camera.directions()[there]
-        assert (np.einsum("ij,ij->i", normals[there], toward) < 0.0).all()
-        assert np.abs(np.linalg.norm(normals[there], axis=-1) - 1.0).max() <= 8.0 * EPSILON
-
-    def test_gradient_of_one_pixel(self, device):
-        """A wall ahead has n = (p, q, -1) to first order: dn_x / dz_right = f / (2 z)."""
-        camera = Camera(3, 3, 50.0, 40.0, 1.5, 1.5, np.eye(4))
-        upstream = np.zeros((3, 3, 3))
-        upstream[1, 1] = 3.0, 5.0, 7.0
-        found = gradients_of(np.full((3, 3), 2.0), camera, upstream, device)
-        x, y = 3.0 * 50.0 / 4.0, 5.0 * 40.0 / 4.0
-        assert found == pytest.approx(np.array([[0, -y, 0], [-x, 0, x], [0, y, 0]]), rel=8.0 * EPSILON)
 
 
 class TestTwin:

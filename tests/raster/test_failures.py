@@ -9,6 +9,7 @@ from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import see
 from reference.rasterizing import RasterImage, decide, replay
 from reference.single_precision import ROUNDING, rounded
+from support.raster_clouds import set_upstream
 from support.raster_hazards import HAZARDS, ahead, make
 
 from beam_warp.device.arrays import upload
@@ -60,19 +61,7 @@ class Drawn:
         )
 
     def gradients(self, upstream):
-        adjoints = self.rasterizer.adjoints()
-        for name in ("alpha", "depth", "median_depth"):
-            getattr(adjoints, name).assign(getattr(upstream, name).astype(np.float32).ravel())
-        start = 0
-        for rows in adjoints.channels:
-            columns = np.zeros((rows.shape[0], start + rows.shape[1]), np.float32)
-            for places, array in (
-                (self.rasterizer.value_channels, upstream.channels),
-                (self.rasterizer.normal_channels, upstream.normals),
-            ):
-                columns[:, list(places)] = array.reshape(rows.shape[0], -1)
-            rows.assign(np.ascontiguousarray(columns[:, start:]))
-            start += rows.shape[1]
+        set_upstream(self.rasterizer, upstream)
         found = self.rasterizer.backward()
         return {name: getattr(found, name).numpy() for name in self.scene.arrays()}
 
@@ -133,19 +122,6 @@ def test_what_is_nowhere_leaves_no_trace(device, rng, name):
     ones = RasterImage(*(np.ones_like(getattr(image, output)) for output in OUTPUTS))
     for array in drawn.gradients(ones).values():
         assert not array.any()
-
-
-@pytest.mark.parametrize("name", ["at_one_depth", "copies"])
-def test_one_depth_is_drawn_in_the_order_of_rows(device, rng, name):
-    scene = HAZARDS[name](rng)
-    order = rng.permutation(len(scene.positions))
-    other = replace(scene, **{key: array[order] for key, array in scene.arrays().items()})
-    first, second = draw(scene, device).channels, draw(other, device).channels
-    assert np.abs(first - second).max() > 0.01
-    decisions = decide(other)
-    clear = ~decisions.near_jump
-    # A weight of at most one, of values of at most one, rounded at each of forty splats.
-    np.testing.assert_allclose(second[clear], replay(other, decisions).channels[clear], atol=40 * 2 * ROUNDING)
 
 
 @pytest.mark.parametrize("name", ["needles", "around_the_camera", "at_one_depth", "many_layers"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference.raster_differences import gradients, random_upstream
-from reference.raster_splats import RasterScene, harmonics, ray_forms, rotations, see
+from reference.raster_splats import RasterScene, harmonics, rotations
 from reference.rasterizing import RasterImage, decide, draw, pixel_centers, replay
 from support.raster_hazards import HAZARDS
 
@@ -199,47 +199,6 @@ def test_exact_depth_is_where_the_response_is_largest(rng):
     assert worst < 1e-12  # the exponent is rounded by 1e-16 of up to 1e4, the squared ratio of the scales
 
 
-def test_closed_form_of_exact_depth(rng):
-    """1/z* = (l + e / l) / z with l = 1 + g.d linear, e >= 0 quadratic in the pixel, and e without cancellation."""
-    camera = ahead()
-    pixels = pixel_centers(camera)
-    for _ in range(50):
-        scene = RasterScene(*random_gaussian(rng), [0.9], camera, depth_mode="exact")
-        splats = see(scene, decide(scene).splats)
-        along, square = ray_forms(scene, splats, 0, pixels)
-        center, axes = splats.ray[0], rotations(scene.orientations)[0]
-        sigma = axes @ np.diag(scene.scales[0] ** 2) @ axes.T
-        m = np.linalg.inv(sigma) @ center
-        g = m[:2] / (m @ center) / 20.0
-        d = pixels - splats.center[0]
-        delta = np.concatenate([d / 20.0, np.zeros((len(d), 1))], axis=1)
-        moment = np.cross(center, delta)
-        e = np.einsum("pi,ij,pj->p", moment, sigma, moment) / np.prod(scene.scales[0] ** 2) / (m @ center) ** 2
-        ratio = (scene.scales[0].max() / scene.scales[0].min()) ** 2
-        np.testing.assert_allclose(along, 1.0 + d @ g, rtol=ROUNDING * ratio, atol=ROUNDING * ratio)
-        np.testing.assert_allclose(square - along**2, e, rtol=ROUNDING * ratio, atol=ROUNDING * ratio * square.max())
-
-
-def test_plane_touches_the_published_one(rng):
-    """RaDe-GS has ray distance linear in the pixel, t = |p| + g.d: the same plane to first order about the centre."""
-    camera, h = ahead(), 1e-6
-    for _ in range(50):
-        position, orientation, scales = random_gaussian(rng)
-        scene = RasterScene(position, orientation, scales, [0.9], camera)
-        splats = see(scene, decide(scene).splats)
-        center, z = splats.ray[0], position[0, 2]
-        axes = rotations(scene.orientations)[0]
-        q = np.linalg.solve(axes @ np.diag(scales[0] ** 2) @ axes.T, center)
-        q /= q @ center
-        square = center @ center
-        slope = z * np.sqrt(square) * (center / square - q)[:2] / 20.0
-        around_center = splats.center[0] + h * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-        rays = np.concatenate([(around_center - (8.0, 6.0)) / 20.0, np.ones((4, 1))], axis=1)
-        distance = z / ray_forms(scene, splats, 0, around_center)[0] * np.linalg.norm(rays, axis=1)
-        got = (distance[::2] - distance[1::2]) / (2 * h)
-        np.testing.assert_allclose(got, slope, rtol=1e-7, atol=1e-8 * np.abs(slope).max() + 1e-9)
-
-
 def test_harmonics_are_those_of_the_package(rng):
     directions = rng.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -308,40 +267,6 @@ def test_gradients_of_all_splats_at_once_are_those_of_each_entry(rng, depth_mode
         difference = np.array([got[name][entry] for entry in entries]) - expected
         assert np.any(expected)
         assert np.linalg.norm(difference) < 1e-10 * np.linalg.norm(expected), name
-
-
-@pytest.mark.parametrize(("depth_mode", "antialiased"), [("plane", True), ("exact", False)])
-def test_gradients_are_plain_differences_where_nothing_is_decided(rng, depth_mode, antialiased):
-    """Wide, faint splats that all pixels see: the image itself is smooth, and is drawn anew for every difference."""
-    count = 6
-    scene = RasterScene(
-        positions=np.stack([*rng.uniform(-0.2, 0.2, (2, count)), np.linspace(2.0, 3.0, count)], axis=-1),
-        orientations=rng.normal(size=(count, 4)),
-        scales=rng.uniform(0.3, 0.6, (count, 3)),
-        opacities=rng.uniform(0.4, 0.6, count),
-        camera=ahead(6, 5),
-        values=rng.uniform(size=(count, 2)),
-        radiance=rng.normal(0.0, 0.1, (count, 4, 3)),
-        depth_mode=depth_mode,
-        antialiased=antialiased,
-    )
-    upstream, decisions = random_upstream(rng, scene, decide(scene)), decide(scene)
-    assert len(decisions.splat) == count * 30
-    assert not decisions.depth_side.any()
-    assert not decisions.near_jump.any()
-    assert not decisions.near_bend.any()
-    got = gradients(scene, upstream)
-    step = 1e-5  # relative truncation is about its square, rounding about 1e-16 over it
-    for name, array in scene.arrays().items():
-        expected = np.zeros(array.shape)
-        for entry in np.ndindex(array.shape):
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = array.copy()
-                moved[entry] += sign * step
-                sides.append(loss(draw(replace(scene, **{name: moved})), upstream))
-            expected[entry] = (sides[0] - sides[1]) / (2 * step)
-        assert np.linalg.norm(got[name] - expected) < 1e-8 * np.linalg.norm(expected), name
 
 
 def test_gradients_know_what_cannot_move(rng):

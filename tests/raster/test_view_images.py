@@ -5,12 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-import warp as wp
+from support.raster_clouds import cloud
 
-from beam_warp.device.arrays import upload
 from beam_warp.errors import BeamError, InvalidOptionError, MissingPackageError
 from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.records import GaussianArrays
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.raster.view_images import view_images
 from beam_warp.world.camera import Camera
 
@@ -22,16 +21,9 @@ def drawn(device, rng, value_count=5):
         for i, (width, height) in enumerate([(24, 17), (9, 20)])
     ]
     rasterizer = Rasterizer(60, cameras, value_count=value_count, radiance=True, normals=True, device=device)
-    target = rasterizer.device
-    arrays = GaussianArrays(
-        upload(rng.uniform(-0.5, 0.5, (60, 3)).astype(np.float32), wp.vec3, target),
-        upload(rng.normal(size=(60, 4)).astype(np.float32), wp.quat, target),
-        upload(rng.uniform(0.05, 0.3, (60, 3)).astype(np.float32), wp.vec3, target),
-        upload(rng.uniform(0.1, 0.9, 60).astype(np.float32), float, target),
-        upload(rng.uniform(0, 1, (60, value_count)).astype(np.float32), float, target),
-        upload(rng.normal(size=(60, 4, 3)).astype(np.float32), wp.vec3, target),
-    )
-    rasterizer.draw(arrays)
+    values = rng.uniform(0, 1, (60, value_count)).astype(np.float32)
+    radiance = rng.normal(size=(60, 4, 3)).astype(np.float32)
+    rasterizer.draw(upload_gaussians(cloud(rng, 60), rasterizer.device, values=values, radiance=radiance))
     return rasterizer
 
 
@@ -85,14 +77,20 @@ def test_channels_of_two_passes_are_selected_from_each(device, rng):
         view.select(rasterizer.value_channels)
 
 
-@pytest.mark.parametrize("room", ["interop", "interop.torch"])
-def test_rooms_of_torch_say_what_to_install(monkeypatch, room):
+@pytest.mark.parametrize(
+    "needs_torch",
+    [
+        lambda: importlib.import_module("beam_warp.interop").rasterization,
+        lambda: importlib.import_module("beam_warp.interop.torch"),
+    ],
+)
+def test_what_needs_torch_says_what_to_install(monkeypatch, needs_torch):
     for name in [n for n in sys.modules if n.partition(".")[0] == "torch" or n.startswith("beam_warp.interop.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
     with pytest.raises(
         MissingPackageError, match=r"torch must be installed .* pip install 'beam-warp\[interop\]'"
     ) as e:
-        importlib.import_module(f"beam_warp.{room}")
+        needs_torch()
     assert isinstance(e.value, BeamError)
     assert isinstance(e.value, ImportError)

@@ -19,3 +19,15 @@ def cloud(rng, count=200, **more):
         opacities=rng.uniform(0.05, 0.95, count),
         **more,
     )
+
+
+def set_upstream(drawer, upstream):
+    """Write the oracle's derivatives of alpha, depths, channels and normals where a rasteriser reads them."""
+    adjoints = drawer.adjoints()
+    for name in ("alpha", "depth", "median_depth"):
+        getattr(adjoints, name).assign(getattr(upstream, name).astype(np.float32).ravel())
+    columns = np.zeros((len(drawer.images.alpha), 16 * len(adjoints.channels)), np.float32)
+    columns[:, list(drawer.color_channels or drawer.value_channels)] = upstream.channels.reshape(len(columns), -1)
+    columns[:, list(drawer.normal_channels)] = upstream.normals.reshape(len(columns), -1)
+    for i, rows in enumerate(adjoints.channels):
+        rows.assign(np.ascontiguousarray(columns[:, 16 * i : 16 * i + rows.shape[1]]))
