@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 LOW_PASS = 0.3
 NEAR = 0.01

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from beam_warp.kernels.common.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
 from beam_warp.kernels.common.launching import launch
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 wp.set_module_options({"enable_backward": False})
 

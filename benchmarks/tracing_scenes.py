@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.kernels.common.constants import ALPHA_MAX, ALPHA_MIN
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 RING_RADIUS = 0.4
 TUBE_RADIUS = 0.13

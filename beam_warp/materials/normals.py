@@ -19,9 +19,9 @@ from beam_warp.kernels.materials.neighborhoods import (
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.trace.occlusion import Progress, ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 NEIGHBOR_COUNT = 16
 """Enough for a stable plane on a surface, few enough to stay local on a finger."""

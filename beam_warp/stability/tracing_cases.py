@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_choice
-from beam_warp.trace.reference import rotation_matrices, visibility_reference
+from beam_warp.trace.reference import visibility_reference
 from beam_warp.trace.transmittance import EXACT, TraceOptions
 from beam_warp.world.gaussians import GaussianCloud, InvalidRows
+from beam_warp.world.quaternions import rotation_matrices
 
 NONE_LEFT_OUT = InvalidRows(np.zeros(0, np.int64), 0, 0, 0)
 

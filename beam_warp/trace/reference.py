@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 ALPHA_MAX, ALPHA_MIN = 0.99, 1.0 / 255.0
 """Cap and cut of one Gaussian's alpha (Kerbl et al. 2023)."""
@@ -28,20 +29,6 @@ FLOAT32_ROUNDOFF = 2.0**-24
 
 PAIRS_AT_ONCE = 1 << 16
 """Ray and Gaussian pairs that are looked at together: arrays of half a megabyte stay in a core's own cache."""
-
-
-def rotation_matrices(orientations: ArrayLike) -> NDArray[np.float64]:
-    """Return rotation matrices ``(N, 3, 3)`` of quaternions xyzw ``(N, 4)``, normalised first."""
-    q = np.asarray(orientations, dtype=np.float64)
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=1,
-    )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_array, require_choice, require_finite, require_range, require_same_length
-from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.arrays import require_rows, resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
 from beam_warp.kernels.trace.occluders import GaussianAndMeshOccluders, GaussianOccluders
@@ -218,12 +218,7 @@ class Scene:
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
     """Return rows on the device; arrays that are there already pass through unread."""
     if isinstance(value, wp.array):
-        if value.dtype is not dtype or value.ndim != 1 or value.device != device:
-            raise InvalidArrayError(
-                f"{name} must be a one-dimensional warp array of {dtype.__name__} on {device}, got dtype "
-                f"{value.dtype.__name__}, {value.ndim} dimensions, on {value.device}. Convert it or pass NumPy."
-            )
-        rows = value
+        rows = require_rows(name, value, dtype, device)
     else:
         rows = upload(require_array(name, value, (None, size)), dtype, device)
     require_same_length(name, rows, "the scene", count)

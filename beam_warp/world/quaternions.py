@@ -33,6 +33,12 @@ def matrix_of(quaternion: ArrayLike) -> NDArray[np.float64]:
     return np.stack(rows, axis=-1).reshape(*x.shape, 3, 3)
 
 
+def rotation_matrices(orientations: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation matrices ``(N, 3, 3)`` of quaternions ``(N, 4)`` of any length but 0."""
+    rows = np.asarray(orientations, np.float64)
+    return matrix_of(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
 def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Hamilton products of one quaternion ``(4,)`` with many ``(N, 4)``, which rotate first."""
     x, y, z, w = left

@@ -13,6 +13,7 @@ Source: disc to point form factor as in Bunnell 2005; the ratio is ours.
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.render.gaussian_light import (
@@ -27,7 +28,6 @@ from beam_warp.kernels.render.gaussian_light import (
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 
 MEAN_COSINE = wp.constant(0.6666667)
 """Mean cosine of cosine-weighted directions: the specular lobe's albedo there stands for that of diffuse light."""

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.light.shading import (
@@ -27,7 +28,6 @@ from beam_warp.kernels.render.surface_lighting import DistantLight, lit_radiance
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 
 SHADE_CHUNK = 256
 """Fewest pixels of one launch on the CPU."""

@@ -16,9 +16,9 @@ from reference import rasterizing as reference
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.raster import records
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import rotation_matrices
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 

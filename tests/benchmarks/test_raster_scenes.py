@@ -8,7 +8,7 @@ from gsplat_peer import GsplatPeer, GsplatUnavailableError, arguments
 from raster_scenes import BUMP, VALUE_COUNT, bumpy_sphere, cube, figure
 from tracing_scenes import FLATNESS
 
-from beam_warp.trace.reference import rotation_matrices
+from beam_warp.world.quaternions import rotation_matrices
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 

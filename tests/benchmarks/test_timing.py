@@ -25,7 +25,8 @@ from tracing_scenes import (
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.kernels.common.launching import thread_count
-from beam_warp.trace.reference import rotation_matrices, visibility_reference
+from beam_warp.trace.reference import visibility_reference
+from beam_warp.world.quaternions import rotation_matrices
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 

@@ -21,9 +21,9 @@ from beam_warp.reconstruction.initial import (
     even_surface_points,
     initial_gaussians,
 )
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.gaussians import WORLD_AXES
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import rotation_matrices
 
 RADIUS = 0.5
 

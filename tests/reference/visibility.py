@@ -5,7 +5,7 @@ Which Gaussians count on which ray is decided once and held still; what is diffe
 
 import numpy as np
 
-from beam_warp.trace.reference import rotation_matrices
+from beam_warp.world.quaternions import rotation_matrices
 
 ALPHA_MIN, ALPHA_MAX = 1.0 / 255.0, 0.99
 STEP = 1e-5  # relative truncation is about STEP^2, rounding about 1e-16 / STEP

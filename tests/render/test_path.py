@@ -264,9 +264,6 @@ def test_an_interrupted_render_ends_with_the_same_bits(corner, tmp_path):
     whole = PathRenderer(options, device="cpu").draw(corner)
     path = tmp_path / "frame.checkpoint"
 
-    class Stop(Exception):
-        pass
-
     def stop(done, most):
         if done >= PASS_SAMPLES:
             raise KeyboardInterrupt

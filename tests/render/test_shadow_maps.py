@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from support.flat_scenes import UP, discs, nothing, plate
+from support.kernel_runs import run_kernel
 from support.shapes import sphere_points
 
 from beam_warp.device.arrays import resolve_device
@@ -40,18 +41,10 @@ def visible(drawer, points, normals, light=None, turned=True):
     angles = np.random.default_rng(1).random(len(points)) * 2 * np.pi * turned
     device = drawer.maps.texels.device
     turns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
-    out = wp.zeros(len(points), dtype=float, device=device)
-    arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=device) for a in (points, normals)]
     around = len(drawer.cameras) == 6
     middle = wp.vec3(*light.position) if around else wp.vec3()
-    wp.launch(
-        share_kernel,
-        len(points),
-        inputs=[drawer.maps, int(around), middle, *arrays, wp.array(turns, dtype=wp.vec2, device=device)],
-        outputs=[out],
-        device=device,
-    )
-    return out.numpy()
+    inputs = [drawer.maps, int(around), middle, (points, wp.vec3), (normals, wp.vec3), (turns, wp.vec2)]
+    return run_kernel(share_kernel, len(points), inputs, [float], device)[0]
 
 
 def drawn(light, cloud, subject, device, size=128, mesh=None):

@@ -24,8 +24,9 @@ from beam_warp.stability import tracing_cases as stress_cases
 from beam_warp.stability.page import HOW_TO_READ, OCCLUSION_TEXT
 from beam_warp.stability.tracing import HIERARCHIES, run_case, scene_under
 from beam_warp.stability.tracing_cases import CASES, case_of
-from beam_warp.trace.reference import rotation_matrices, visibility_enclosure, visibility_reference
+from beam_warp.trace.reference import visibility_enclosure, visibility_reference
 from beam_warp.trace.transmittance import EXACT, TraceOptions
+from beam_warp.world.quaternions import rotation_matrices
 
 SMALL = [case for case in CASES if not case.large]
 
@@ -339,7 +340,9 @@ class TestOnTheDevice:
         gaussians.degree = 2
         for name, dtype in (("lower", wp.vec3), ("upper", wp.vec3), ("fate", int), ("takes_part", int)):
             setattr(bounds, name, wp.zeros(1, dtype=dtype, device=device))
-        launch_pack_gaussians(cloud, wp.vec3(), 1e-7, 1e-4, gaussians, bounds, wp.get_device(device))
+        launch_pack_gaussians(
+            len(cloud.positions), cloud, wp.vec3(), 1e-7, 1e-4, gaussians, bounds, wp.get_device(device)
+        )
         packed = [getattr(gaussians, f"whitening_{k}").numpy() for k in range(3)]
         values = [gaussians.center_opacity.numpy()[:, :3], bounds.lower.numpy(), bounds.upper.numpy(), *packed]
         return int(bounds.fate.numpy()[0]), float(packed[0][0, 3]), all(np.isfinite(value).all() for value in values)

@@ -90,7 +90,7 @@ class TestShapes:
         assert (np.abs(cloud.positions[:, :2]) <= 1.0 + 1e-6).all()
         assert cloud.positions[:, 2].min() > -1e-6
         # The shortest axis is the normal's
-        from beam_warp.trace.reference import rotation_matrices
+        from beam_warp.world.quaternions import rotation_matrices
 
         shortest = rotation_matrices(cloud.orientations)[:, :, 2]
         np.testing.assert_allclose(np.einsum("nk,nk->n", shortest, cloud.normals), 1.0, atol=1e-6)

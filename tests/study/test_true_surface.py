@@ -10,9 +10,9 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.study.true_surface import FLATNESS, colored_by_views, gaussians_on_mesh
-from beam_warp.trace.reference import rotation_matrices
 from beam_warp.world.camera import Camera
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import rotation_matrices
 from beam_warp.world.shapes import TANGENTIAL
 
 SHARP = RasterOptions(antialiased=True, low_pass=0.1)

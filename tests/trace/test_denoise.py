@@ -165,6 +165,7 @@ class TestBilateral:
         variances = rng.uniform(1e7, 2e7, HEIGHT * WIDTH).astype(np.float32)
         out, spread = (wp.zeros(HEIGHT * WIDTH, dtype=t, device=wall.device) for t in (wp.vec3, float))
         launch_filter_round(
+            len(colors),
             denoising._kernel_guides(wall.guides),
             2,
             upload(colors, wp.vec3, wall.device),
