@@ -211,6 +211,6 @@ class ArrivingLight:
         radiosity = self._clusters.sent
         for bounce in range(self._options.bounces - 1):
             following = self._radiosity[bounce % 2]
-            launch_bounce_clusters(self._clusters, radiosity, following, self._device)
+            launch_bounce_clusters(len(following), self._clusters, radiosity, following, self._device)
             radiosity = following
         return radiosity

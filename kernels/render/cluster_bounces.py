@@ -14,7 +14,7 @@ Source: disc to point form factor as in Bunnell 2005; the ratio is ours.
 import warp as wp
 
 from beam_warp.kernels.common.constants import PI
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.render.gaussian_light import (
     ARRIVING,
@@ -162,17 +162,8 @@ def launch_sum_clusters(gaussians, lit, albedo_table, out_clusters, device):
     )
 
 
-def launch_bounce_clusters(clusters, radiosity, out_radiosity, device):
-    """Let light bounce once between clusters."""
-    launch(
-        bounce_clusters_kernel,
-        len(out_radiosity),
-        inputs=[clusters, radiosity],
-        outputs=[out_radiosity],
-        device=device,
-        block_dim=32,
-        min_chunk=16,
-    )
+launch_bounce_clusters = launcher(bounce_clusters_kernel, block_dim=32, min_chunk=16)
+"""Let light bounce once between clusters."""
 
 
 def launch_gather_bounces(positions, arriving, clusters, radiosity, out_values, device):

@@ -113,7 +113,7 @@ def trace_rays_wide_kernel(
     share: int,
     out_visibility: wp.array[float],
 ):
-    """By the default rules, in pools of ``lanes`` times ``share`` neighbouring rays."""
+    """Trace rays by the default rules, in pools of ``lanes`` times ``share`` neighbouring rays."""
     thread = first + wp.tid()
     count = rays.origins.shape[0]
     begin = (thread / lanes) * lanes * share

@@ -132,7 +132,7 @@ def test_taps_are_spread_over_the_disc():
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (0.4, 0.2, -1.0)])
 def test_the_shadow_of_a_square(device, direction):
-    """Of triangles, under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
+    """Triangles under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
     light = DirectionalLight(direction=direction, irradiance=(1, 1, 1), angular_diameter=0.0)
     drawer = drawn(light, nothing(), SUBJECT, device, mesh=plate(0.5, 0.25))
     x = np.linspace(-0.6, 0.6, 121)

@@ -9,6 +9,7 @@ from reference.latlong import lookup
 from reference.light_sampling import cosine_hemisphere_to_square, product_to_square, square_to_product_pdf
 from scipy import stats
 from scipy.stats import qmc
+from support.estimates import SIGNIFICANCE
 from support.kernel_runs import run_kernel
 from support.split_sum import sunny_sky, texels_of
 
@@ -35,9 +36,6 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.light.sampled import suited_height
 from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
 from beam_warp.world.environment import EnvironmentMap
-
-SIGNIFICANCE = 1e-4
-"""Of each statistical test here; seeds are fixed, so a failure is a change of code, not bad luck."""
 
 
 @wp.kernel
@@ -246,7 +244,7 @@ def test_cosine_map_inverts_and_has_its_density(device, rng):
 
 
 def test_cosine_density_integrates_to_one(device):
-    """By midpoints of a fine lat-long grid, which the equator does not cut: exact to their second order."""
+    """A sum over midpoints of a fine lat-long grid, which the equator does not cut: exact to second order."""
     sphere = EnvironmentMap.constant((1.0, 1.0, 1.0), height=256)
     directions = sphere.directions().reshape(-1, 3).astype(np.float32)
     (density,) = run_kernel(cosine_pdf_kernel, len(directions), [(directions, wp.vec3)], [float], device)

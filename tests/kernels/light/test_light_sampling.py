@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from reference.light_sampling import environment_to_square, visible_reflection_to_square
 from scipy import stats
+from support.estimates import SIGNIFICANCE
 from support.kernel_runs import run_kernel
 from support.split_sum import texels_of
 
@@ -16,8 +17,6 @@ from beam_warp.kernels.light.environment_sampling import (
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.light.sampled import environment_distribution
 from beam_warp.world.environment import EnvironmentMap
-
-SIGNIFICANCE = 1e-4
 
 
 @wp.kernel
