@@ -66,17 +66,40 @@ def _init_warp() -> None:
 def upload_vectors(name: str, value: Any, device: Any, *, unit_length: bool = False) -> wp.array:
     """Bring ``(N, 3)`` float32 vectors to a device; arrays that are there already pass through unread."""
     if isinstance(value, wp.array):
-        if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != device:
-            raise InvalidArrayError(
-                f"{name} must be a one-dimensional warp array of vec3 on {device}, got dtype {value.dtype.__name__}, "
-                f"{value.ndim} dimensions, on {value.device}. Convert it or pass a NumPy array."
-            )
-        return value
+        return require_rows(name, value, wp.vec3, device)
     array = require_array(name, value, (None, 3))
     require_finite(name, array)
     if unit_length:
         require_unit(name, array)
     return wp.array(array, dtype=wp.vec3, device=device)
+
+
+def require_rows(name: str, value: wp.array, dtype: Any, device: Any) -> wp.array:
+    """Return a warp array after checking that it is one-dimensional, of a type and on a device; it is not read.
+
+    Raises:
+        InvalidArrayError: It is not.
+    """
+    if value.dtype is not dtype or value.ndim != 1 or value.device != device:
+        raise InvalidArrayError(
+            f"{name} must be a one-dimensional warp array of {dtype.__name__} on {device}, got dtype "
+            f"{value.dtype.__name__}, {value.ndim} dimensions, on {value.device}. Convert it or pass a NumPy array."
+        )
+    return value
+
+
+def zero_struct(structure: Any, count: int, device: Any) -> Any:
+    """Return a struct of kernels whose one-dimensional arrays have ``count`` rows of zeros on a device."""
+    result = structure()
+    for name, variable in structure.vars.items():
+        if getattr(variable.type, "ndim", 0) == 1:
+            setattr(result, name, wp.zeros(count, dtype=variable.type.dtype, device=device))
+    return result
+
+
+def members(struct: Any) -> dict[str, Any]:
+    """Return the members of a struct of kernels by name."""
+    return {name: getattr(struct, name) for name in struct._cls.vars}
 
 
 def download_like(result: wp.array, *inputs: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.arrays import members, resolve_device, upload
 from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.light.product_tree import ProductTree
@@ -56,7 +56,10 @@ class PreparedEnvironment:
     @cached_property
     def blurred(self) -> EnvironmentLight:
         """Irradiance, and radiance blurred by the specular lobe of every roughness."""
-        return self._form("blurred", EnvironmentLight, ("irradiance", "texels"), self._blurred)
+        scaled = ("irradiance", "texels")
+        return self._form(
+            "blurred", EnvironmentLight, scaled, lambda: blurred_environment(self.environment, self.device)
+        )
 
     @cached_property
     def distribution(self) -> EnvironmentDistribution:
@@ -106,17 +109,13 @@ class PreparedEnvironment:
         """The environment on a grid that blocks divide, and the device."""
         return fitted(self.environment), self.device
 
-    def _blurred(self) -> EnvironmentLight:
-        return blurred_environment(self.environment, self.device)
-
     def _form(self, name: str, structure: Any, scaled: tuple[str, ...], make: Callable[[], Any]) -> Any:
         """Return a form: made, or, of a scaled light, the form before with the arrays of radiance times the factor."""
         if self._unscaled is None:
             return make()
         source, factor = self._unscaled
-        given, result = getattr(source, name), structure()
-        for part in structure.vars:
-            array = getattr(given, part)
+        result = structure()
+        for part, array in members(getattr(source, name)).items():
             if part in scaled:
                 array = upload(array.numpy() * np.float32(factor), array.dtype, self.device)
             setattr(result, part, array)

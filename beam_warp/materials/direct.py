@@ -334,7 +334,7 @@ def lit_points(
     observed.specular = wp.zeros(observed.directions.shape, dtype=wp.vec3, device=device)
     observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
     arriving = _empty(GatheredLight, len(rows), device)
-    launch_sum_unshadowed(light.moments, surface.normals, arriving.unshadowed, device)
+    launch_sum_unshadowed(len(surface.normals), light.moments, surface.normals, arriving.unshadowed, device)
     return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64))
 
 
@@ -378,11 +378,12 @@ def light_batches(
         measured.surface.normals,
         points.offsets[at].contiguous(),
         options.sample_count,
+        stream=stream,
         points_at_once=points_for_weights(device) if is_product else None,
     ):
         cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
         if is_product:
-            launch_accumulate_block_weights(light.blocks, batch.normals, cumulative, device)
+            launch_accumulate_block_weights(len(batch.normals), light.blocks, batch.normals, cumulative, device)
         rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
         found = LightRays()
         found.directions = rays.directions
@@ -390,7 +391,7 @@ def light_batches(
         found.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
         found.paired = int(all(part.samples.columns > 0 for part in parts))
         for part in parts:
-            launch_draw_light(part, light, cumulative, batch, stream, rays, found.weights, device)
+            launch_draw_light(part, light, cumulative, batch, rays, found.weights, device)
         trace_rays(scene, EXACT, rays, found.visibility)
         if bounced is not None:
             launch_trace_bounce(

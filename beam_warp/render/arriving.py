@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from beam_warp.device.arrays import upload
+from beam_warp.device.arrays import members, upload, zero_struct
 from beam_warp.device.morton import morton_order
 from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.render.cluster_bounces import (
@@ -57,7 +57,8 @@ class ArrivingLight:
         with wp.ScopedDevice(device):
             self._arriving = wp.zeros(gaussian_count, dtype=wp.vec4)
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
-            self._clusters = _zero_clusters(gaussian_count, cluster_count)
+            self._clusters = zero_struct(Clusters, cluster_count, device)
+            self._clusters.order = wp.zeros(gaussian_count, dtype=int)
             self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
             self._distant = DistantLight()
             self._distant.turn = wp.zeros(1, dtype=wp.vec2)
@@ -103,8 +104,7 @@ class ArrivingLight:
         """Bring regions to the device."""
         count = 0 if regions is None else len(regions)
         if self._moments.red is None or len(self._moments.red) != count:
-            for name in ("red", "green", "blue"):
-                setattr(self._moments, name, wp.zeros(count, dtype=wp.vec4, device=self._device))
+            self._moments = zero_struct(LightMoments, count, self._device)
             self._region_drawer = None
         views = []
         if regions is not None:
@@ -135,8 +135,9 @@ class ArrivingLight:
             self._light_drawer = None
             self.generation += 1
         else:
-            for name in ("kinds", "positions", "directions", "powers", "sizes", "cones", "shadowed"):
-                wp.copy(getattr(self._lights, name), getattr(uploaded, name))
+            for name, rows in members(uploaded).items():
+                if name != "count":
+                    wp.copy(getattr(self._lights, name), rows)
         self._light_drawer = self._moved(
             self._light_drawer, [view for of_light in views for view in of_light], casters, LIGHT_TAPS
         )
@@ -210,17 +211,6 @@ class ArrivingLight:
         radiosity = self._clusters.sent
         for bounce in range(self._options.bounces - 1):
             following = self._radiosity[bounce % 2]
-            launch_bounce_clusters(self._clusters, radiosity, following, self._device)
+            launch_bounce_clusters(len(following), self._clusters, radiosity, following, self._device)
             radiosity = following
         return radiosity
-
-
-def _zero_clusters(count: int, cluster_count: int) -> Clusters:
-    """Allocate clusters on the current device."""
-    clusters = Clusters()
-    clusters.order = wp.zeros(count, dtype=int)
-    for name in ("positions", "normals", "reflectance", "sent"):
-        setattr(clusters, name, wp.zeros(cluster_count, dtype=wp.vec3))
-    for name in ("areas", "occlusion"):
-        setattr(clusters, name, wp.zeros(cluster_count, dtype=float))
-    return clusters

@@ -22,10 +22,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_choice, require_count, require_number
-from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.arrays import members, resolve_device, upload, zero_struct
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.files import replacing
-from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.kernels.render.path_tracing import PathImages, PathLight, PathPass, launch_trace_paths
 from beam_warp.kernels.render.path_vertices import PathMaterials
 from beam_warp.light.ggx import specular_albedo_table
@@ -33,9 +32,11 @@ from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.light.uploaded import upload_lights
 from beam_warp.trace.camera_rays import pixel_rays
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
+from beam_warp.trace.mesh_paths import mesh_surface
 from beam_warp.trace.scene import NOTHING, Scene
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.quaternions import rotation_matrices
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
 
@@ -59,20 +60,14 @@ the slope of the square root has no bound at black."""
 CHECKPOINT_SECONDS = 10.0
 """Time between two checkpoints."""
 
-IMAGES = {
-    "counts": int,
-    "passes": int,
-    "radiance": wp.vec3,
-    "indirect": wp.vec3,
-    "moments": wp.vec2,
-    "coverage": float,
-    "base_color": wp.vec3,
-    "normals": wp.vec3,
-    "roughness": float,
-    "distance": float,
-    "caught": wp.vec3,
-}
-"""Sums that are kept for each pixel."""
+NO_TRIANGLES = MaterialMesh(
+    vertices=np.zeros((3, 3), np.float32),
+    faces=np.array([[0, 1, 2]], np.int32),
+    normals=np.eye(3, dtype=np.float32),
+    base_color=np.zeros((3, 3), np.float32),
+    roughness=np.ones(3, np.float32),
+)
+"""A mesh that no ray meets: with it kernels need no case for a shot without one."""
 
 SamplesReport = Callable[[int, int], None]
 """Called with (samples per pixel done, samples per pixel at most)."""
@@ -206,7 +201,10 @@ class _Geometry:
         materials.color_roughness, materials.normal_thickness = _material_rows(cloud, device)
         sizes = np.median(cloud.scales, axis=1) if len(cloud) else np.ones(len(NOTHING))
         materials.sizes = upload(sizes.astype(np.float32), float, device)
-        materials.surface = _mesh_surface(mesh, scene, device)
+        surface = mesh_surface(NO_TRIANGLES if mesh is None else mesh.surface, device, scene.origin)
+        if scene.mesh is not None:
+            surface.mesh = scene.mesh.id
+        materials.surface = surface
         catches = np.zeros(1, np.int32) if mesh is None else mesh.catches_shadows.astype(np.int32)
         materials.catches = upload(catches, int, device)
         return cls(cloud, mesh, scene, materials)
@@ -224,34 +222,6 @@ def _material_rows(cloud: GaussianCloud, device: Any) -> tuple[wp.array, wp.arra
     along = np.einsum("nij,ni->nj", rotation_matrices(cloud.orientations), cloud.normals) * cloud.scales
     shapes = np.concatenate([cloud.normals, np.linalg.norm(along, axis=1, keepdims=True)], axis=1)
     return upload(looks.astype(np.float32), wp.vec4, device), upload(shapes.astype(np.float32), wp.vec4, device)
-
-
-def _mesh_surface(mesh: ShotMesh | None, scene: Scene, device: Any) -> MeshSurface:
-    """Return the triangles' materials; a triangle of nothing where there are none."""
-    surface = MeshSurface()
-    if mesh is None:
-        rows = dict.fromkeys(("points", "normals", "base_color"), np.zeros((3, 3), np.float32))
-        rows |= {"faces": np.array([[0, 1, 2]], np.int32), "roughness": np.ones(3, np.float32)}
-    else:
-        given = mesh.surface
-        rows = {
-            "points": (given.vertices.astype(np.float64) - scene.origin).astype(np.float32),
-            "normals": given.normals,
-            "base_color": given.base_color,
-            "faces": given.faces,
-            "roughness": given.roughness,
-        }
-        assert scene.mesh is not None
-        surface.mesh = scene.mesh.id
-    for name, dtype in (
-        ("points", wp.vec3),
-        ("normals", wp.vec3),
-        ("base_color", wp.vec3),
-        ("faces", wp.vec3i),
-        ("roughness", float),
-    ):
-        setattr(surface, name, upload(rows[name], dtype, device))
-    return surface
 
 
 class PathProgress:
@@ -272,9 +242,7 @@ class PathProgress:
         self._device = geometry.scene.device
         self._rays = pixel_rays(shot.camera, geometry.scene.origin)
         pixel_count = shot.camera.width * shot.camera.height
-        self._images = PathImages()
-        for name, dtype in IMAGES.items():
-            setattr(self._images, name, wp.zeros(pixel_count, dtype=dtype, device=self._device))
+        self._images = zero_struct(PathImages, pixel_count, self._device)
         self._pixels = upload(_tiled(shot.camera.width, shot.camera.height), int, self._device)
 
     @property
@@ -292,6 +260,7 @@ class PathProgress:
         tracing = PathPass()
         tracing.seed, tracing.samples, tracing.bounces = self.options.seed, samples, self.options.bounces
         launch_trace_paths(
+            len(self._pixels),
             self._geometry.scene.occluders,
             self._geometry.materials,
             EXACT.settings(self._geometry.scene),
@@ -318,7 +287,7 @@ class PathProgress:
         """
         camera = self.shot.camera
         shape = (camera.height, camera.width)
-        sums = {name: getattr(self._images, name).numpy() for name in IMAGES}
+        sums = {name: rows.numpy() for name, rows in members(self._images).items()}
         count = np.maximum(sums["counts"], 1).astype(np.float32)
         coverage = np.maximum(sums["coverage"], 1.0)
         caught, open_light, shadowed = sums["caught"].T
@@ -348,7 +317,7 @@ class PathProgress:
         Raises:
             OutputError: The file cannot be written.
         """
-        arrays = {name: getattr(self._images, name).numpy() for name in IMAGES}
+        arrays = {name: rows.numpy() for name, rows in members(self._images).items()}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, digest=self.digest(), sample_count=self.sample_count, pixels=self._pixels.numpy(), **arrays)
 
@@ -358,8 +327,8 @@ class PathProgress:
             with np.load(path, allow_pickle=False) as kept:
                 if str(kept["digest"]) != self.digest():
                     return False
-                for name in IMAGES:
-                    getattr(self._images, name).assign(kept[name])
+                for name, rows in members(self._images).items():
+                    rows.assign(kept[name])
                 self._pixels = upload(kept["pixels"], int, self._device)
                 self.sample_count = int(kept["sample_count"])
         except FileNotFoundError:

@@ -195,18 +195,12 @@ class DeferredFrame:
         light, images = self._light.scene_light(), self._rasterizer.images
         launch_shade_gaussians(self._views, images, self._options.lights_gaussians, light, self.samples, self._device)
         if self._traced is not None:
-            launch_shade_mesh(
-                self._views,
-                self._traced.surface,
-                self._catches,
-                light,
-                self._mesh_image,
-                self._mesh_surfaces,
-                self._device,
-            )
-            launch_blend_mesh(images.depth, self._mesh_image, self._mesh_surfaces, self.samples, self._device)
+            seen, count = (self._mesh_image, self._mesh_surfaces), len(self.samples)
+            launch_shade_mesh(count, self._views, self._traced.surface, self._catches, light, *seen, self._device)
+            launch_blend_mesh(count, images.depth, *seen, self.samples, self._device)
         if self.pixels is not self.samples:
-            launch_average_samples(self._size[0], self._options.samples, self.samples, self.pixels, self._device)
+            side, count = self._options.samples, len(self.pixels)
+            launch_average_samples(count, self._size[0], side, self.samples, self.pixels, self._device)
 
     def image(self) -> RenderedImage:
         """Return what was drawn last; waits for the device."""

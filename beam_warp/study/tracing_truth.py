@@ -156,7 +156,7 @@ def _trace_block(
     """Trace the references of some points; blocks differ in the frame, so that their samples differ."""
     surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
     at, up = upload(points, wp.vec3, scene.device), upload(normals, wp.vec3, scene.device)
-    launch_local_surface(scene.occluders, at, up, surface, scene.device)
+    launch_local_surface(len(at), scene.occluders, at, up, surface, scene.device)
     nothing = np.zeros((0, len(points)), np.float32)
     bare = References(points, normals, surface.numpy(), nothing, nothing, points, points)
     common: dict[str, Any] = {"sample_count": plan.reference_rays, "seed": SEED, "frame": number}

@@ -131,7 +131,7 @@ def denoise(images: Sequence[NoisyImage], guides: SurfaceGuides, *, denoiser: De
         colors = _as_colors(image.values)
         if image.hdr:
             cut = wp.empty_like(colors)
-            launch_clamp_fireflies(kernel_guides, colors, cut, device)
+            launch_clamp_fireflies(len(colors), kernel_guides, colors, cut, device)
             colors = cut
         if kind == "oidn":
             result = _filter_by_oidn(colors, guides, image.hdr)
@@ -168,12 +168,12 @@ def _filter_by_rounds(colors: wp.array, error: wp.array, guides: Any) -> wp.arra
     """Run all rounds of the bilateral filter."""
     device = colors.device
     variances = wp.empty(len(colors), dtype=float, device=device)
-    launch_square_errors(error, variances, device)
+    launch_square_errors(len(error), error, variances, device)
     current, spread = colors, wp.empty_like(variances)
     for round in range(ROUNDS):
-        launch_smooth_variances(guides, variances, spread, device)
+        launch_smooth_variances(len(variances), guides, variances, spread, device)
         following = wp.empty_like(colors)
-        launch_filter_round(guides, 1 << round, current, spread, following, variances, device)
+        launch_filter_round(len(current), guides, 1 << round, current, spread, following, variances, device)
         current = following
     return current
 

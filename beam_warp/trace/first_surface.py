@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from beam_warp.checks import require_array, require_finite, require_number, require_same_length
-from beam_warp.device.arrays import download_like, upload, upload_vectors
+from beam_warp.device.arrays import download_like, upload, upload_vectors, zero_struct
 from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.trace.closest_surface import SurfaceRecords, launch_trace_surface
 from beam_warp.trace.scene import Scene
@@ -99,20 +99,10 @@ def closest_surface(
         require_same_length("attributes", values, "the scene", len(scene))
         require_finite("attributes", values)
     count = len(starts)
-    records = SurfaceRecords()
-    for name, dtype in (
-        ("threshold_depth", float),
-        ("expected_depth", float),
-        ("normals", wp.vec3),
-        ("transmittance", float),
-        ("gaussians", int),
-        ("hit_counts", int),
-        ("mesh_depth", float),
-        ("mesh_faces", int),
-    ):
-        setattr(records, name, wp.empty(count, dtype=dtype, device=device))
+    records = zero_struct(SurfaceRecords, count, device)
     records.attributes = wp.empty((count, values.shape[1]), dtype=float, device=device)
     launch_trace_surface(
+        len(starts),
         scene.occluders,
         options.settings(scene),
         starts,
@@ -124,17 +114,5 @@ def closest_surface(
         device,
     )
 
-    def out(result: wp.array) -> Any:
-        return download_like(result, origins, directions)
-
-    return SurfaceHits(
-        depth=out(records.threshold_depth),
-        expected_depth=out(records.expected_depth),
-        normals=out(records.normals),
-        attributes=out(records.attributes),
-        transmittance=out(records.transmittance),
-        gaussians=out(records.gaussians),
-        hit_counts=out(records.hit_counts),
-        mesh_depth=out(records.mesh_depth),
-        mesh_faces=out(records.mesh_faces),
-    )
+    seen = {field.name: getattr(records, field.name) for field in fields(SurfaceHits)}
+    return SurfaceHits(**{name: download_like(rows, origins, directions) for name, rows in seen.items()})

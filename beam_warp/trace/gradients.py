@@ -12,8 +12,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_array, require_finite, require_same_length
-from beam_warp.device.arrays import download_like, upload, upload_vectors
-from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.device.arrays import download_like, members, require_rows, upload, upload_vectors, zero_struct
+from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.trace.hit_gradients import HitGradients, HitMoments, HitRecords
 from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.visibility_adjoint import (
@@ -102,16 +102,9 @@ def visibility_gradients(
             "is 0 or 1 and has no derivative; the product is what its mean estimates."
         )
     moments, to_rays = _summed_hits(scene, options.settings(scene), rays)
-    gradients = _resolved(scene, moments)
-    results = (
-        gradients.positions,
-        gradients.orientations,
-        gradients.scales,
-        gradients.opacities,
-        to_rays.origins,
-        to_rays.directions,
-    )
-    return VisibilityGradients(*(download_like(result, origins, directions, adjoints) for result in results))
+    gradients = members(_resolved(scene, moments)) | members(to_rays)
+    inputs = origins, directions, adjoints
+    return VisibilityGradients(**{name: download_like(rows, *inputs) for name, rows in gradients.items()})
 
 
 def _summed_hits(scene: Scene, settings: TraceSettings, rays: WeightedRays) -> tuple[wp.array, RayGradients]:
@@ -119,12 +112,8 @@ def _summed_hits(scene: Scene, settings: TraceSettings, rays: WeightedRays) -> t
     device, gaussian_count, ray_count = scene.device, len(scene), len(rays.origins)
     degree = scene.occluders.gaussians.degree
     moments = wp.zeros(gaussian_count, dtype=HitMoments, device=device)
-    to_rays, tallies = RayGradients(), HitTallies()
-    to_rays.origins = wp.zeros(ray_count, dtype=wp.vec3, device=device)
-    to_rays.directions = wp.zeros(ray_count, dtype=wp.vec3, device=device)
-    tallies.transmittance = wp.empty(ray_count, dtype=float, device=device)
-    tallies.count = wp.empty(ray_count, dtype=int, device=device)
-    launch_count_hits(scene.occluders, settings, rays, tallies, device)
+    to_rays, tallies = (zero_struct(structure, ray_count, device) for structure in (RayGradients, HitTallies))
+    launch_count_hits(len(rays.origins), scene.occluders, settings, rays, tallies, device)
     for part, hit_count in _parts(tallies.count.numpy()):
         ends = wp.empty(part.stop - part.start, dtype=int, device=device)
         wp.utils.array_scan(tallies.count[part], ends, inclusive=True)
@@ -133,29 +122,29 @@ def _summed_hits(scene: Scene, settings: TraceSettings, rays: WeightedRays) -> t
         hits.record = wp.empty(hit_count, dtype=wp.vec4, device=device)
         order = wp.empty(2 * hit_count, dtype=int, device=device)
         some, their_tallies, to_some = (_rows_of(arrays, part) for arrays in (rays, tallies, to_rays))
-        launch_store_hits(scene.occluders, settings, some, their_tallies, ends, hits, order, to_some, device)
+        launch_store_hits(
+            len(some.origins), scene.occluders, settings, some, their_tallies, ends, hits, order, to_some, device
+        )
         wp.utils.radix_sort_pairs(hits.gaussian, order, hit_count, end_bit=gaussian_count.bit_length())
         sums = wp.empty(hit_count // SUM_BLOCK, dtype=HitMoments, device=device)
-        launch_sum_blocks(degree, hits, order, sums, device)
-        launch_add_moments(degree, hits, order, hit_count, sums, moments, device)
+        launch_sum_blocks(len(sums), degree, hits, order, sums, device)
+        launch_add_moments(len(moments), degree, hits, order, hit_count, sums, moments, device)
     return moments, to_rays
 
 
 def _rows_of(arrays: Any, part: slice) -> Any:
     """Return a structure of arrays with some of its rows; an array of one number for all rows stays whole."""
     some = arrays._cls()
-    for name in arrays._cls.vars:
-        array = getattr(arrays, name)
+    for name, array in members(arrays).items():
         setattr(some, name, array if name == "reaches" and len(array) == 1 else array[part])
     return some
 
 
 def _resolved(scene: Scene, moments: wp.array) -> HitGradients:
     """Return the gradients with respect to the cloud's arrays."""
-    gradients = HitGradients()
-    for name, dtype in (("positions", wp.vec3), ("orientations", wp.vec4), ("scales", wp.vec3), ("opacities", float)):
-        setattr(gradients, name, wp.empty(len(scene), dtype=dtype, device=scene.device))
+    gradients = zero_struct(HitGradients, len(scene), scene.device)
     launch_resolve_moments(
+        len(moments),
         scene.occluders.gaussians,
         scene.packed.orientations,
         scene.packed.scales,
@@ -171,13 +160,7 @@ def _resolved(scene: Scene, moments: wp.array) -> HitGradients:
 def _upload_adjoints(adjoints: Any, count: int, device: Any) -> wp.array:
     """Return ``adjoints`` on the device; a warp array that is there already passes through unread."""
     if isinstance(adjoints, wp.array):
-        if adjoints.dtype is not wp.float32 or adjoints.ndim != 1 or adjoints.device != device:
-            raise InvalidArrayError(
-                f"adjoints must be a one-dimensional warp array of float32 on {device}, got dtype "
-                f"{adjoints.dtype.__name__}, {adjoints.ndim} dimensions, on {adjoints.device}. Convert it or pass a "
-                "NumPy array."
-            )
-        require_same_length("adjoints", adjoints, "origins", count)
+        require_same_length("adjoints", require_rows("adjoints", adjoints, wp.float32, device), "origins", count)
         return adjoints
     array = require_array("adjoints", adjoints, (None,))
     require_finite("adjoints", array)

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import warp as wp
 
-from beam_warp.checks import require_choice, require_count, require_same_length
-from beam_warp.device.arrays import download_like, upload_vectors
+from beam_warp.checks import require_choice, require_count
+from beam_warp.device.arrays import download_like
 from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.light.product_sampling import launch_accumulate_block_weights
 from beam_warp.kernels.trace.incident_light import (
@@ -21,7 +21,7 @@ from beam_warp.kernels.trace.incident_light import (
     launch_sum_unshadowed,
 )
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
+from beam_warp.trace.rays import checked_points, points_for_weights, ray_batches, room_for_rays
 from beam_warp.trace.sampling import Sampler, sample_set
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT, TraceOptions, trace_rays
@@ -129,13 +129,7 @@ def irradiance(
     require_choice("density", density, DENSITIES)
     require_count("sample_count", sample_count, 4 if density == "mis" else 2, 1 << 20)
     parts = techniques(density, sampler, sample_count)
-    require_count("seed", seed, 0, 2**32 - 1)
-    require_count("frame", frame, 0, 2**32 - 1)
-    if isinstance(offset, str) and offset != "auto":
-        raise InvalidOptionError(f'offset must be a number or "auto", got {offset!r}. Give metres or "auto".')
-    at = upload_vectors("points", points, scene.device)
-    up = upload_vectors("normals", normals, scene.device, unit_length=True)
-    require_same_length("normals", up, "points", len(at))
+    at, up = checked_points(scene, points, normals, offset, seed, frame)
     if isinstance(environment, EnvironmentMap):
         environment = PreparedEnvironment(environment, scene.device)
     elif environment.device != scene.device:
@@ -144,67 +138,28 @@ def irradiance(
         )
     value = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
     error = wp.zeros(len(at), dtype=wp.vec3, device=scene.device)
-    _gather(
-        scene,
-        at,
-        up,
-        environment,
-        parts,
-        ratio=ratio,
-        offset=offset,
-        options=options,
-        stream=(seed, frame),
-        out_value=value,
-        out_error=error,
-    )
-    return Irradiance(download_like(value, points, normals), download_like(error, points, normals))
-
-
-def _gather(
-    scene: Scene,
-    points: wp.array,
-    normals: wp.array,
-    environment: PreparedEnvironment,
-    parts: list[Technique],
-    *,
-    ratio: bool,
-    offset: float | Literal["auto"],
-    options: TraceOptions,
-    stream: tuple[int, int],
-    out_value: wp.array,
-    out_error: wp.array,
-) -> None:
-    """Draw, trace and add up, batch by batch."""
-    device = scene.device
     count = parts[0].sample_count
-    is_product = parts[0].density == int(PRODUCT)
+    is_product = density == "product"
     is_bernoulli = options.acceptance == "bernoulli"
-    unshadowed = wp.empty(len(points) if ratio else 0, dtype=wp.vec3, device=device)
+    unshadowed = wp.empty(len(at) if ratio else 0, dtype=wp.vec3, device=scene.device)
     if ratio:
-        launch_sum_unshadowed(environment.moments, normals, unshadowed, device)
+        launch_sum_unshadowed(len(up), environment.moments, up, unshadowed, scene.device)
     counts = wp.vec2i(parts[0].samples.count, count - parts[0].samples.count)
     paired = wp.vec2i(int(parts[0].samples.columns > 0), int(parts[-1].samples.columns > 0))
-    for batch in ray_batches(
-        scene, points, normals, offset, count, points_at_once=points_for_weights(device) if is_product else None
-    ):
-        cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=device)
+    at_once = points_for_weights(scene.device) if is_product else None
+    for batch in ray_batches(scene, at, up, offset, count, stream=(seed, frame), points_at_once=at_once):
+        cumulative = wp.empty((len(batch.rows), 512) if is_product else (0, 0), dtype=float, device=scene.device)
         if is_product:
-            launch_accumulate_block_weights(environment.blocks, batch.normals, cumulative, device)
-        rays = room_for_rays(batch, device, bernoulli=is_bernoulli, reaches=True)
-        weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
-        for technique in parts:
-            launch_draw_light(technique, environment, cumulative, batch, stream, rays, weights, device)
-        visibility = wp.empty(len(rays.origins), dtype=float, device=device)
-        trace_rays(scene, options, rays, visibility)
+            launch_accumulate_block_weights(
+                len(batch.normals), environment.blocks, batch.normals, cumulative, scene.device
+            )
+        rays = room_for_rays(batch, scene.device, bernoulli=is_bernoulli, reaches=True)
+        weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=scene.device)
+        for part in parts:
+            launch_draw_light(part, environment, cumulative, batch, rays, weights, scene.device)
+        visible = wp.empty(len(rays.origins), dtype=float, device=scene.device)
+        trace_rays(scene, options, rays, visible)
         launch_reduce_light(
-            batch,
-            weights,
-            visibility,
-            counts=counts,
-            paired=paired,
-            ratio=ratio,
-            unshadowed=unshadowed,
-            out_value=out_value,
-            out_error=out_error,
-            device=device,
+            len(batch.rows), batch, weights, visible, counts, paired, unshadowed, value, error, scene.device
         )
+    return Irradiance(download_like(value, points, normals), download_like(error, points, normals))

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_count, require_finite, require_range, require_same_length
-from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.arrays import resolve_device, upload, zero_struct
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.mesh.channels import MeshChannels, launch_trace_channels
 from beam_warp.kernels.mesh.paths import LitMesh, launch_trace_outgoing, launch_trace_pixels, lit_mesh
@@ -49,15 +49,22 @@ class TracedMesh:
             DeviceError: There is no such device.
         """
         target = resolve_device(device)
-        surface = MeshSurface()
-        surface.points = upload(mesh.vertices, wp.vec3, target)
-        surface.faces = upload(mesh.faces, wp.vec3i, target)
-        surface.normals = upload(mesh.normals, wp.vec3, target)
-        surface.base_color = upload(mesh.base_color, wp.vec3, target)
-        surface.roughness = upload(mesh.roughness, float, target)
+        surface = mesh_surface(mesh, target)
         tree = wp.Mesh(surface.points, upload(mesh.faces.reshape(-1), int, target))
         surface.mesh = tree.id
         return cls(surface, target, len(mesh.faces), tree)
+
+
+def mesh_surface(mesh: MaterialMesh, device: Any, origin: ArrayLike = (0.0, 0.0, 0.0)) -> MeshSurface:
+    """Upload a mesh for kernels, its vertices relative to ``origin`` [m], without a hierarchy."""
+    surface = MeshSurface()
+    vertices = mesh.vertices.astype(np.float64) - np.asarray(origin, np.float64)
+    surface.points = upload(vertices.astype(np.float32), wp.vec3, device)
+    surface.faces = upload(mesh.faces, wp.vec3i, device)
+    surface.normals = upload(mesh.normals, wp.vec3, device)
+    surface.base_color = upload(mesh.base_color, wp.vec3, device)
+    surface.roughness = upload(mesh.roughness, float, device)
+    return surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +125,7 @@ def trace_radiance(
     Raises:
         InvalidOptionError: A count or the seed is out of range.
     """
-    require_count("sample_count", sample_count, 1, MOST_SAMPLES)
-    require_count("bounce_count", bounce_count, 0, MOST_BOUNCES)
-    require_count("seed", seed, 0, 2**32 - 1)
+    _require_counts(sample_count, bounce_count, seed)
     pixels = camera.width * camera.height
     rgb = wp.zeros(pixels, dtype=wp.vec3, device=mesh.device)
     alpha = wp.zeros(pixels, dtype=float, device=mesh.device)
@@ -151,10 +156,7 @@ def trace_channels(
     require_count("visibility_count", visibility_count, 1, MOST_SAMPLES // sample_count)
     require_count("seed", seed, 0, 2**32 - 1)
     pixels = camera.width * camera.height
-    channels = MeshChannels()
-    for name, dtype in (("base_color", wp.vec3), ("roughness", float), ("normal", wp.vec3), ("depth", float)):
-        setattr(channels, name, wp.zeros(pixels, dtype=dtype, device=mesh.device))
-    channels.ambient_occlusion = wp.zeros(pixels, dtype=float, device=mesh.device)
+    channels = zero_struct(MeshChannels, pixels, mesh.device)
     launch_trace_channels(mesh.surface, pixel_rays(camera), seed, sample_count, visibility_count, channels)
     shape = (camera.height, camera.width)
     return TracedChannels(
@@ -197,9 +199,7 @@ def outgoing_radiance(
         InvalidArrayError: An array breaks its contract.
         InvalidOptionError: A count or the seed is out of range.
     """
-    require_count("sample_count", sample_count, 1, MOST_SAMPLES)
-    require_count("bounce_count", bounce_count, 0, MOST_BOUNCES)
-    require_count("seed", seed, 0, 2**32 - 1)
+    _require_counts(sample_count, bounce_count, seed)
     where = require_array("faces", faces, (None,), np.int32)
     require_range("faces", where, 0, mesh.face_count - 1, "Index existing triangles.")
     corner_weights = require_array("weights", weights, (None, 3))
@@ -222,6 +222,13 @@ def outgoing_radiance(
         out,
     )
     return out.numpy()
+
+
+def _require_counts(sample_count: int, bounce_count: int, seed: int) -> None:
+    """Check what every tracing of paths takes."""
+    require_count("sample_count", sample_count, 1, MOST_SAMPLES)
+    require_count("bounce_count", bounce_count, 0, MOST_BOUNCES)
+    require_count("seed", seed, 0, 2**32 - 1)
 
 
 def _lit(mesh: TracedMesh, environment: EnvironmentMap) -> LitMesh:

@@ -8,11 +8,9 @@ from typing import Any, Literal
 
 import warp as wp
 
-from beam_warp.checks import require_count, require_same_length
-from beam_warp.device.arrays import download_like, upload_vectors
-from beam_warp.errors import InvalidOptionError
+from beam_warp.device.arrays import download_like
 from beam_warp.kernels.trace.ambient_occlusion import launch_draw_occlusion, launch_reduce_visibility
-from beam_warp.trace.rays import ray_batches, room_for_rays
+from beam_warp.trace.rays import checked_points, ray_batches, room_for_rays
 from beam_warp.trace.sampling import Sampler, sample_set
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT, TraceOptions, trace_rays
@@ -77,23 +75,17 @@ def ambient_occlusion(
     Source: BEAM Eq. 6; Owen's sets by hashing, Burley 2020; jittered grids, Cook 1986.
     """
     samples = sample_set(sampler, sample_count)
-    require_count("seed", seed, 0, 2**32 - 1)
-    require_count("frame", frame, 0, 2**32 - 1)
-    if isinstance(offset, str) and offset != "auto":
-        raise InvalidOptionError(f'offset must be a number or "auto", got {offset!r}. Give metres or "auto".')
-    at = upload_vectors("points", points, scene.device)
-    up = upload_vectors("normals", normals, scene.device, unit_length=True)
-    require_same_length("normals", up, "points", len(at))
+    at, up = checked_points(scene, points, normals, offset, seed, frame)
     mean = wp.ones(len(at), dtype=float, device=scene.device)
     error = wp.zeros(len(at), dtype=float, device=scene.device)
     is_bernoulli = options.acceptance == "bernoulli"
     done = 0
-    for batch in ray_batches(scene, at, up, offset, samples.count):
+    for batch in ray_batches(scene, at, up, offset, samples.count, stream=(seed, frame)):
         rays = room_for_rays(batch, scene.device, bernoulli=is_bernoulli, reaches=False)
-        launch_draw_occlusion(batch, samples, (seed, frame), rays, scene.device)
+        launch_draw_occlusion(len(batch.rows) * samples.count, batch, samples, rays, scene.device)
         traced = wp.empty(len(rays.origins), dtype=float, device=scene.device)
         trace_rays(scene, options, rays, traced)
-        launch_reduce_visibility(batch, samples, traced, mean, error, scene.device)
+        launch_reduce_visibility(len(batch.rows), batch, samples, traced, mean, error, scene.device)
         done += len(batch.rows)
         if progress is not None:
             progress(done, len(at))

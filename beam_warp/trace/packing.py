@@ -103,6 +103,7 @@ class PackedGaussians:
         bounds.lower, bounds.upper = self.lowers, self.uppers
         bounds.fate, bounds.takes_part = self.fates, self.takes_part
         launch_pack_gaussians(
+            len(cloud.positions),
             cloud,
             wp.vec3(*self.origin.tolist()),
             self.smallest_scale,

@@ -6,8 +6,10 @@ from typing import Any, Literal
 
 import warp as wp
 
-from beam_warp.checks import require_number
+from beam_warp.checks import require_count, require_number, require_same_length
+from beam_warp.device.arrays import upload_vectors
 from beam_warp.device.morton import morton_order
+from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.trace.surface_rays import RayBatch, launch_lift_off_surface, launch_local_surface
 from beam_warp.kernels.trace.visibility import Rays
@@ -33,6 +35,25 @@ WEIGHTED_POINTS_AT_ONCE_ON_CUDA = 1 << 17
 """The same on a GPU: 256 MiB."""
 
 
+def checked_points(
+    scene: Scene, points: Any, normals: Any, offset: Any, seed: int, frame: int
+) -> tuple[wp.array, wp.array]:
+    """Check what every estimate at surface points takes, and bring points and normals to the scene's device.
+
+    Raises:
+        InvalidArrayError: A shape, type, non-finite or non-unit value breaks the contract of points.
+        InvalidOptionError: The offset, the seed or the frame is out of range.
+    """
+    require_count("seed", seed, 0, 2**32 - 1)
+    require_count("frame", frame, 0, 2**32 - 1)
+    if isinstance(offset, str) and offset != "auto":
+        raise InvalidOptionError(f'offset must be a number or "auto", got {offset!r}. Give metres or "auto".')
+    at = upload_vectors("points", points, scene.device)
+    up = upload_vectors("normals", normals, scene.device, unit_length=True)
+    require_same_length("normals", up, "points", len(at))
+    return at, up
+
+
 def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float | Literal["auto"]) -> wp.array:
     """Return how far along its normal each ray origin is moved [m], ``(N,)`` float32 on the scene's device.
 
@@ -43,9 +64,9 @@ def ray_offsets(scene: Scene, points: wp.array, normals: wp.array, offset: float
         value = require_number("offset", offset)
         return wp.full(len(points), value, dtype=float, device=scene.device)
     surface = wp.empty(len(points), dtype=wp.vec2, device=scene.device)
-    launch_local_surface(scene.occluders, points, normals, surface, scene.device)
+    launch_local_surface(len(points), scene.occluders, points, normals, surface, scene.device)
     offsets = wp.empty(len(points), dtype=float, device=scene.device)
-    launch_lift_off_surface(surface, LIFT_IN_THICKNESSES, offsets, scene.device)
+    launch_lift_off_surface(len(surface), surface, LIFT_IN_THICKNESSES, offsets, scene.device)
     return offsets
 
 
@@ -56,6 +77,7 @@ def ray_batches(
     offset: float | Literal["auto"] | Any,
     sample_count: int,
     *,
+    stream: tuple[int, int] = (0, 0),
     points_at_once: int | None = None,
 ) -> list[RayBatch]:
     """Return points in Morton order, so many at a time that their rays are at most `RAYS_AT_ONCE`.
@@ -69,6 +91,7 @@ def ray_batches(
         normals: Unit normals, like ``points``.
         offset: As for `ray_offsets`, or an offset for each point.
         sample_count: Rays a point.
+        stream: Seed and number of the frame.
         points_at_once: At most so many points a batch.
     """
     count, device = len(points), scene.device
@@ -91,6 +114,7 @@ def ray_batches(
         batch.offsets, batch.rows = offsets[part], rows[part]
         batch.base = scene.occluders.origin
         batch.sample_count = sample_count
+        batch.seed, batch.frame = stream
         batches.append(batch)
     return batches
 

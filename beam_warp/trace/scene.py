@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_array, require_choice, require_finite, require_range, require_same_length
-from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.arrays import require_rows, resolve_device, upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
 from beam_warp.kernels.trace.occluders import GaussianAndMeshOccluders, GaussianOccluders
@@ -59,11 +59,12 @@ class Scene:
     Attributes:
         occluders: What kernels trace, relative to ``origin``.
         mesh: Triangles among the Gaussians; None for none.
+        packed: The Gaussians on the device.
     """
 
     occluders: Any
     mesh: wp.Mesh | None
-    _packed: PackedGaussians = field(repr=False)
+    packed: PackedGaussians = field(repr=False)
     _count: int = field(repr=False)
     _tree: BuiltTree = field(repr=False, init=False)
     _report: SceneReport = field(repr=False, default=SceneReport(0, 0, 0))
@@ -113,7 +114,7 @@ class Scene:
     def report(self) -> SceneReport:
         """What was left out or changed; after a refit it is counted when asked for, as a refit reads nothing back."""
         if self._refitted:
-            fates = self._packed.fates.numpy().copy()
+            fates = self.packed.fates.numpy().copy()
             absent = np.ones(len(fates), np.bool_)  # what was left out when the tree was built stays out
             absent[self._tree.layout.items.numpy()[: self._tree.count]] = False
             fates[absent & ((fates == TRACED) | (fates == RAISED))] = NOT_FINITE
@@ -128,14 +129,9 @@ class Scene:
         return self._report
 
     @property
-    def packed(self) -> PackedGaussians:
-        """The Gaussians on the device."""
-        return self._packed
-
-    @property
     def device(self) -> Any:
         """Warp device that holds the scene."""
-        return self._packed.device
+        return self.packed.device
 
     @property
     def origin(self) -> NDArray[np.float32]:
@@ -143,12 +139,12 @@ class Scene:
 
         The middle of the cloud, so that precision does not suffer far from the world's origin.
         """
-        return self._packed.origin
+        return self.packed.origin
 
     @property
     def extent(self) -> float:
         """Largest side of the centres' bounding box when the scene was made [m]."""
-        return self._packed.extent
+        return self.packed.extent
 
     @property
     def response_degree(self) -> int:
@@ -194,16 +190,16 @@ class Scene:
         ]
         if not len(self):
             return
-        self._packed.place(*arrays)
+        self.packed.place(*arrays)
         self._refitted = tree == "refit"
         if tree != "refit":
             self._build(tree)
         else:
-            refit(self._tree, self._packed)
+            refit(self._tree, self.packed)
 
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
-        packed = self._packed
+        packed = self.packed
         number = packed.fate_counts()
         traced = number[TRACED] + number[RAISED]
         self._tree = build_wide_tree(packed, traced, build)
@@ -218,12 +214,7 @@ class Scene:
 def _device_rows(name: str, value: Any, size: int, dtype: Any, count: int, device: Any) -> wp.array:
     """Return rows on the device; arrays that are there already pass through unread."""
     if isinstance(value, wp.array):
-        if value.dtype is not dtype or value.ndim != 1 or value.device != device:
-            raise InvalidArrayError(
-                f"{name} must be a one-dimensional warp array of {dtype.__name__} on {device}, got dtype "
-                f"{value.dtype.__name__}, {value.ndim} dimensions, on {value.device}. Convert it or pass NumPy."
-            )
-        rows = value
+        rows = require_rows(name, value, dtype, device)
     else:
         rows = upload(require_array(name, value, (None, size)), dtype, device)
     require_same_length(name, rows, "the scene", count)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from beam_warp.checks import require_array, require_choice, require_count, require_number, require_same_length
-from beam_warp.device.arrays import download_like, upload, upload_vectors
+from beam_warp.device.arrays import download_like, require_rows, upload, upload_vectors
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common.constants import LARGEST_FLOAT, TRANSMITTANCE_STOP
 from beam_warp.kernels.trace.settings import TraceSettings
@@ -115,11 +115,11 @@ def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: 
     """
     settings = options.settings(scene)
     if options.front != "peak" or options.cull or scene.response_degree != 2:
-        launch_trace_rays(scene.occluders, settings, rays, out_visibility, scene.device)
+        launch_trace_rays(len(rays.origins), scene.occluders, settings, rays, out_visibility, scene.device)
         return
     if scene.mesh is not None:
         reaches = wp.empty(len(rays.origins), dtype=float, device=scene.device)
-        launch_block_rays(scene.occluders.mesh, rays, reaches, scene.device)
+        launch_block_rays(len(rays.origins), scene.occluders.mesh, rays, reaches, scene.device)
         rays.reaches = reaches
     launch_trace_rays_wide(scene.occluders.tree, settings, rays, out_visibility, scene.device)
 
@@ -127,12 +127,7 @@ def trace_rays(scene: Scene, options: TraceOptions, rays: Rays, out_visibility: 
 def ray_reaches(t_max: Any, count: int, device: Any) -> wp.array:
     """Return ``t_max`` on the device, one number or one a ray; infinity becomes the largest float."""
     if isinstance(t_max, wp.array):
-        if t_max.dtype is not wp.float32 or t_max.ndim != 1 or t_max.device != device:
-            raise InvalidArrayError(
-                f"t_max must be a one-dimensional warp array of float32 on {device}, got dtype "
-                f"{t_max.dtype.__name__}, {t_max.ndim} dimensions, on {t_max.device}. Convert it or pass NumPy."
-            )
-        require_same_length("t_max", t_max, "origins", count)
+        require_same_length("t_max", require_rows("t_max", t_max, wp.float32, device), "origins", count)
         return t_max
     if np.ndim(t_max) == 0:
         return wp.full(1, min(require_number("t_max", t_max, low=0.0), LARGEST_FLOAT), dtype=float, device=device)

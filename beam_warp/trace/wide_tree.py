@@ -87,9 +87,9 @@ def build_wide_tree(packed: PackedGaussians, count: int, method: Method) -> Buil
 
 def refit(built: BuiltTree, packed: PackedGaussians) -> None:
     """Give a tree the boxes and leaves of Gaussians that moved: same tree, exact bounds."""
-    launch_fill_leaves(packed.gaussians, built.layout, built.count, built.tree, packed.device)
+    launch_fill_leaves(built.count, packed.gaussians, built.layout, built.tree, packed.device)
     for begin, count in reversed(built.levels):
-        launch_bound_nodes(begin, count, packed.lowers, packed.uppers, built.layout, built.tree, packed.device)
+        launch_bound_nodes(count, begin, packed.lowers, packed.uppers, built.layout, built.tree, packed.device)
 
 
 def _split(keys: wp.array, count: int, device: Any) -> tuple[BinaryTree, int]:
@@ -97,7 +97,7 @@ def _split(keys: wp.array, count: int, device: Any) -> tuple[BinaryTree, int]:
     binary = BinaryTree()
     for name in ("left", "right", "size"):
         setattr(binary, name, wp.empty(max(2 * count - 1, 1), dtype=int, device=device))
-    launch_split_runs(keys, count, binary, device)
+    launch_split_runs(count - 1, keys, count, binary, device)
     return binary, count if count > 1 else 0
 
 
@@ -109,12 +109,12 @@ def _merge(packed: PackedGaussians, items: wp.array, count: int, reach: int) -> 
         setattr(binary, name, wp.empty(2 * count - 1, dtype=dtype, device=device))
     clusters, merged, chosen = (wp.empty(count, dtype=int, device=device) for _ in range(3))
     marks, sums = (wp.empty(count, dtype=wp.vec2i, device=device) for _ in range(2))
-    launch_start_clusters(items, count, packed.lowers, packed.uppers, binary, clusters, device)
+    launch_start_clusters(count, items, packed.lowers, packed.uppers, binary, clusters, device)
     left, nodes, rounds = count, count, 0
     while left > 1:
         launch_choose_neighbors(clusters, left, reach if rounds < ROUNDS_BY_AREA else 0, binary, chosen, marks, device)
         wp.utils.array_scan(marks[:left], sums[:left], inclusive=True)
-        launch_merge_clusters(clusters, left, chosen, marks, sums, nodes, binary, merged, device)
+        launch_merge_clusters(left, clusters, chosen, marks, sums, nodes, binary, merged, device)
         stay, made = sums[left - 1 : left].numpy()[0]
         clusters, merged = merged, clusters
         left, nodes, rounds = int(stay), nodes + int(made), rounds + 1
@@ -124,6 +124,7 @@ def _merge(packed: PackedGaussians, items: wp.array, count: int, reach: int) -> 
 def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method: Method, device: Any) -> BuiltTree:
     """Open binary nodes to four children, level by level; boxes come with `refit`."""
     layout, tree = WideLayout(), WideTree()
+    binary.items, binary.leaf_count = items, count
     room = max(count, 1)  # a tree has fewer nodes than leaves, and at least its root
     layout.items = wp.empty(room, dtype=int, device=device)
     layout.children = wp.zeros(room, dtype=wp.vec4i, device=device)
@@ -144,17 +145,7 @@ def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method
                 if bound == 0:
                     break
             launch_open_level(
-                binary,
-                items,
-                count,
-                by_area=method != "fast",
-                level=level,
-                queue=queue,
-                bound=bound,
-                level_sizes=level_sizes,
-                out_queue=following,
-                out_layout=layout,
-                device=device,
+                bound, binary, int(method != "fast"), level, queue, level_sizes, following, layout, device
             )
             queue, following = following, queue
         sizes = level_sizes.numpy()

@@ -1,6 +1,8 @@
-"""Cut-offs that tracer and rasteriser share, each with its derivation or source."""
+"""Pi, and the cut-offs that tracer and rasteriser share, each with its derivation or source."""
 
 import warp as wp
+
+PI = wp.constant(3.14159265358979323846)
 
 ALPHA_MAX = wp.constant(0.99)
 """Cap of one Gaussian's alpha (Kerbl et al. 2023): 1 - alpha stays >= 0.01, so dividing it out stays stable."""

@@ -82,6 +82,32 @@ def launch(
     _run_in_chunks(run, range(count), target, 1 if in_order else thread_count(), min_chunk or MIN_CHUNK)
 
 
+def launcher(
+    kernel: Any, *, block_dim: int = 256, in_order: bool = False, min_chunk: int | None = None
+) -> Callable[..., None]:
+    """Return the function that launches a kernel: ``(item count, *arguments, device)``; options as for `launch`.
+
+    Arguments are those of the kernel after ``first``, in its order; names that begin with ``out_`` are outputs.
+    """
+    names = list(kernel.adj.arg_types)[1:]
+    input_count = sum(not name.startswith("out_") for name in names)
+
+    def launch_kernel(count: int, *arguments_and_device: Any) -> None:
+        *arguments, device = arguments_and_device
+        launch(
+            kernel,
+            count,
+            inputs=arguments[:input_count],
+            outputs=arguments[input_count:],
+            device=device,
+            block_dim=block_dim,
+            in_order=in_order,
+            min_chunk=min_chunk,
+        )
+
+    return launch_kernel
+
+
 @cache
 def kernel_for(kernel: Any, structures: tuple[Any, ...]) -> Any:
     """Return the form of a generic kernel that takes these structures, in a module of its own.

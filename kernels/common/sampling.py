@@ -6,7 +6,7 @@ not depend on launch order, chunking or device.
 
 import warp as wp
 
-PI = wp.constant(3.14159265358979323846)
+from beam_warp.kernels.common.constants import PI
 
 # Literals above 2^31 - 1 would be signed in generated code; as constants they keep their type.
 U_85EBCA6B = wp.constant(wp.uint32(0x85EBCA6B))
@@ -209,26 +209,3 @@ def square_to_cosine_hemisphere(u: float, v: float) -> wp.vec3:
 @wp.func
 def square_to_cosine_hemisphere_pdf(direction: wp.vec3) -> float:
     return wp.max(direction[2], 0.0) / PI
-
-
-@wp.func
-def cosine_hemisphere_to_square(direction: wp.vec3) -> wp.vec2:
-    radius = wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1])
-    phi = wp.atan2(direction[1], direction[0])
-    if phi < -PI / 4.0:
-        phi += 2.0 * PI
-    a = float(0.0)
-    b = float(0.0)
-    if phi < PI / 4.0:
-        a = radius
-        b = phi * a * 4.0 / PI
-    elif phi < 3.0 * PI / 4.0:
-        b = radius
-        a = -(phi - PI / 2.0) * b * 4.0 / PI
-    elif phi < 5.0 * PI / 4.0:
-        a = -radius
-        b = (phi - PI) * a * 4.0 / PI
-    else:
-        b = -radius
-        a = -(phi - 3.0 * PI / 2.0) * b * 4.0 / PI
-    return wp.vec2((a + 1.0) * 0.5, (b + 1.0) * 0.5)

@@ -6,7 +6,7 @@ alpha = roughness^2, F0 = 0.04. The specular lobe is D Vis F with the height-cor
 
 import warp as wp
 
-PI = wp.constant(3.14159265358979323846)
+from beam_warp.kernels.common.constants import PI
 
 DIELECTRIC_F0 = wp.constant(0.04)
 """Reflectance at normal incidence of a dielectric of index 1.5."""

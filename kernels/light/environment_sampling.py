@@ -6,9 +6,8 @@ samples. Radiance is constant inside a texel, and so is the density: inside, cos
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.light.latlong import direction_to_latlong, latlong_nearest
-
-PI = wp.constant(3.14159265358979323846)
 
 
 @wp.struct

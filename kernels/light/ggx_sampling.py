@@ -5,9 +5,8 @@ Source: Dupuy and Benyoub 2023: seen from a stretched view direction, visible no
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.light.brdf import ggx_distribution
-
-PI = wp.constant(3.14159265358979323846)
 
 
 @wp.func

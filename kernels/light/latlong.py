@@ -8,7 +8,7 @@ image is +x, its left quarter +y.
 
 import warp as wp
 
-PI = wp.constant(3.14159265358979323846)
+from beam_warp.kernels.common.constants import PI
 
 
 @wp.func

@@ -6,10 +6,8 @@ is a point or a direction, which no ray finds by chance.
 
 import warp as wp
 
-from beam_warp.kernels.common.constants import LARGEST_FLOAT
+from beam_warp.kernels.common.constants import LARGEST_FLOAT, PI
 from beam_warp.kernels.common.sampling import tangent_frame
-
-PI = wp.constant(3.14159265358979323846)
 
 DIRECTIONAL = wp.constant(0)
 POINT = wp.constant(1)

@@ -8,13 +8,13 @@ Product of environment and cosine: Clarberg et al. 2005; hierarchy of cumulative
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.constants import PI
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.light.environment_sampling import EnvironmentSample
 from beam_warp.kernels.light.latlong import direction_to_latlong
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 BLOCK_ROWS = wp.constant(16)
 BLOCK_COLUMNS = wp.constant(32)
 BLOCK_COUNT = wp.constant(512)
@@ -167,13 +167,5 @@ def block_of(blocks: EnvironmentBlocks, texel: wp.vec2i) -> int:
     return (texel[0] / rows) * BLOCK_COLUMNS + texel[1] / columns
 
 
-def launch_accumulate_block_weights(blocks, normals, out_cumulative, device):
-    """Prepare product sampling at each point."""
-    launch(
-        accumulate_block_weights_kernel,
-        len(normals),
-        inputs=[blocks, normals],
-        outputs=[out_cumulative],
-        device=device,
-        block_dim=128,
-    )
+launch_accumulate_block_weights = launcher(accumulate_block_weights_kernel, block_dim=128)
+"""Prepare product sampling at each point."""

@@ -7,11 +7,10 @@ specular one by visible normals.
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.common.sampling import square_to_cosine_hemisphere
 from beam_warp.kernels.light.brdf import ALPHA_FLOOR, specular_albedo, specular_brdf
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
-
-PI = wp.constant(3.14159265358979323846)
 
 GRAZING_COSINE = wp.constant(1.0e-3)
 """A shading normal that leans away from the viewer is turned back until it faces him by this cosine."""

@@ -5,12 +5,12 @@ Formulas and sources stand in `beam_warp.light.prefiltered`.
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.light.latlong import direction_to_latlong, latlong_bilinear, latlong_wrap
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 MIN_N_DOT_V = wp.constant(1.0e-4)
 """Smallest cosine with the view direction: shading of a normal that faces away is that of the grazing one."""
 

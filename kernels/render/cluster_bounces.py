@@ -13,7 +13,8 @@ Source: disc to point form factor as in Bunnell 2005; the ratio is ours.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.constants import PI
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.render.gaussian_light import (
     ARRIVING,
@@ -27,7 +28,6 @@ from beam_warp.kernels.render.gaussian_light import (
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 
 MEAN_COSINE = wp.constant(0.6666667)
 """Mean cosine of cosine-weighted directions: the specular lobe's albedo there stands for that of diffuse light."""
@@ -162,17 +162,8 @@ def launch_sum_clusters(gaussians, lit, albedo_table, out_clusters, device):
     )
 
 
-def launch_bounce_clusters(clusters, radiosity, out_radiosity, device):
-    """Let light bounce once between clusters."""
-    launch(
-        bounce_clusters_kernel,
-        len(out_radiosity),
-        inputs=[clusters, radiosity],
-        outputs=[out_radiosity],
-        device=device,
-        block_dim=32,
-        min_chunk=16,
-    )
+launch_bounce_clusters = launcher(bounce_clusters_kernel, block_dim=32, min_chunk=16)
+"""Let light bounce once between clusters."""
 
 
 def launch_gather_bounces(positions, arriving, clusters, radiosity, out_values, device):

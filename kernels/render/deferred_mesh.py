@@ -3,7 +3,7 @@
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.light.latlong import latlong_bilinear
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.mesh.surface import MeshSurface, closest_hit, surface_point
@@ -97,21 +97,9 @@ def blend_mesh_kernel(
         out_image[i] = mesh + (1.0 - mesh[3]) * gaussians
 
 
-def launch_shade_mesh(views, surface, catches_shadows, light, out_image, out_surfaces, device):
-    """Shade what of the triangles every pixel of one camera sees."""
-    launch(
-        shade_mesh_kernel,
-        len(out_image),
-        inputs=[views, surface, catches_shadows, light],
-        outputs=[out_image, out_surfaces],
-        device=device,
-        block_dim=128,
-        min_chunk=SHADE_CHUNK,
-    )
+launch_shade_mesh = launcher(shade_mesh_kernel, block_dim=128, min_chunk=SHADE_CHUNK)
+"""Shade what of the triangles every pixel of one camera sees."""
 
 
-def launch_blend_mesh(depth, mesh_image, mesh_surfaces, out_image, device):
-    """Blend triangles into the image of Gaussians."""
-    launch(
-        blend_mesh_kernel, len(out_image), inputs=[depth, mesh_image, mesh_surfaces], outputs=[out_image], device=device
-    )
+launch_blend_mesh = launcher(blend_mesh_kernel)
+"""Blend triangles into the image of Gaussians."""

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.constants import PI
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.light.shading import (
     MIN_N_DOT_V,
@@ -27,7 +28,6 @@ from beam_warp.kernels.render.surface_lighting import DistantLight, lit_radiance
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 
 SHADE_CHUNK = 256
 """Fewest pixels of one launch on the CPU."""
@@ -145,6 +145,5 @@ def launch_shade_gaussians(views, images, has_arriving, light, out_image, device
     )
 
 
-def launch_average_samples(width, side, samples, out_image, device):
-    """Reduce an image of ``side`` x ``side`` samples a pixel."""
-    launch(average_samples_kernel, len(out_image), inputs=[width, side, samples], outputs=[out_image], device=device)
+launch_average_samples = launcher(average_samples_kernel)
+"""Reduce an image of ``side`` x ``side`` samples a pixel."""

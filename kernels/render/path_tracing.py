@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.common.pixel_sampling import PIXEL_CHUNK, PixelRays, pixel_direction, sample_pair
 from beam_warp.kernels.common.sampling import hash_combine, stream_of, tangent_frame
 from beam_warp.kernels.light.latlong import latlong_nearest
@@ -323,14 +323,5 @@ def trace_paths_kernel(
     out_images.caught[pixel] = out_images.caught[pixel] + caught
 
 
-def launch_trace_paths(occluders, materials, settings, light, rays, pixels, tracing, out_images, device):
-    """Add a pass of samples to each of ``pixels``, numbers that must differ from each other."""
-    launch(
-        trace_paths_kernel,
-        len(pixels),
-        inputs=[occluders, materials, settings, light, rays, pixels, tracing],
-        outputs=[out_images],
-        device=device,
-        block_dim=64,
-        min_chunk=PIXEL_CHUNK,
-    )
+launch_trace_paths = launcher(trace_paths_kernel, block_dim=64, min_chunk=PIXEL_CHUNK)
+"""Add a pass of samples to each of ``pixels``, numbers that must differ from each other."""

@@ -2,17 +2,16 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.common.sampling import (
     SampleSet,
     draw_square,
     hash_combine,
     square_to_cosine_hemisphere,
-    stream_of,
     tangent_frame,
 )
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
+from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin, stream_of_place
 from beam_warp.kernels.trace.visibility import Rays
 
 wp.set_module_options({"enable_backward": False})
@@ -22,14 +21,12 @@ LARGEST_DEVIATION = wp.constant(0.5)
 
 
 @wp.kernel
-def draw_occlusion_kernel(
-    first: int, batch: RayBatch, samples: SampleSet, seed: wp.uint32, frame: wp.uint32, out_rays: Rays
-):
+def draw_occlusion_kernel(first: int, batch: RayBatch, samples: SampleSet, out_rays: Rays):
     """One cosine-distributed ray a thread."""
     item = first + wp.tid()
     place = item / samples.count
     index = item % samples.count
-    stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
+    stream = stream_of_place(batch, place)
     drawn = draw_square(samples, index, stream)
     begin = place * batch.sample_count
     ray = begin + drawn.slot
@@ -65,24 +62,9 @@ def reduce_visibility_kernel(
     out_error[batch.rows[place]] = error
 
 
-def launch_draw_occlusion(batch, samples, stream, out_rays, device):
-    """Draw the rays of a batch; ``stream`` is (seed, frame)."""
-    launch(
-        draw_occlusion_kernel,
-        len(batch.rows) * samples.count,
-        inputs=[batch, samples, wp.uint32(stream[0]), wp.uint32(stream[1])],
-        outputs=[out_rays],
-        device=device,
-    )
+launch_draw_occlusion = launcher(draw_occlusion_kernel)
+"""Draw the rays of a batch."""
 
 
-def launch_reduce_visibility(batch, samples, visibility, out_mean, out_error, device):
-    """Reduce each point's samples to mean and error, in its own row."""
-    launch(
-        reduce_visibility_kernel,
-        len(batch.rows),
-        inputs=[batch, samples, visibility],
-        outputs=[out_mean, out_error],
-        device=device,
-        block_dim=64,
-    )
+launch_reduce_visibility = launcher(reduce_visibility_kernel, block_dim=64)
+"""Reduce each point's samples to mean and error, in its own row."""

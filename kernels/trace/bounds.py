@@ -1,9 +1,9 @@
-"""From a cloud's arrays to what tracing reads: packed rows and exact, opacity-adaptive ellipsoid bounds."""
+"""A cloud's arrays made into what tracing reads: packed rows and exact, opacity-adaptive ellipsoid bounds."""
 
 import warp as wp
 
 from beam_warp.kernels.common.constants import ALPHA_MIN
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.trace.gaussian import QUARTIC_FALLOFF, Gaussians
 
 wp.set_module_options({"enable_backward": False})
@@ -123,12 +123,5 @@ def launch_count_fates(fates, out_counts, device):
     launch(count_fates_kernel, groups, inputs=[fates], outputs=[out_counts], device=device, in_order=True)
 
 
-def launch_pack_gaussians(cloud, origin, smallest_scale, largest_ratio, out_gaussians, out_bounds, device):
-    """Pack every Gaussian and its bounds; ``cloud`` is in world space, the outputs relative to ``origin``."""
-    launch(
-        pack_gaussians_kernel,
-        len(cloud.positions),
-        inputs=[cloud, origin, smallest_scale, largest_ratio],
-        outputs=[out_gaussians, out_bounds],
-        device=device,
-    )
+launch_pack_gaussians = launcher(pack_gaussians_kernel)
+"""Pack every Gaussian and its bounds; ``cloud`` is in world space, the outputs relative to ``origin``."""

@@ -10,12 +10,12 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
 from beam_warp.kernels.trace.gaussian import Gaussians, ray_peak, whitening_times
 from beam_warp.kernels.trace.settings import TraceSettings
-from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
+from beam_warp.kernels.trace.wide_traversal import TracedRay, traced_ray, traversal
 from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
@@ -99,12 +99,9 @@ def nearest_hits(
     t_max: float,
 ) -> HitBuffer:
     """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``."""
-    ray = TracedRay()
-    ray.origin = origin
-    ray.direction = direction
+    ray = traced_ray(origin, direction, t_max)
     ray.t_min = t_last
     ray.index_min = index_last
-    ray.t_max = t_max
     return insert_all(tree, gaussians, settings, ray, empty_buffer())
 
 
@@ -134,7 +131,7 @@ def entry_normal(gaussians: Gaussians, index: int, origin: wp.vec3, direction: w
 class SurfaceRecords:
     """What rays see, one row each."""
 
-    threshold_depth: wp.array[float]
+    depth: wp.array[float]
     expected_depth: wp.array[float]
     normals: wp.array[wp.vec3]
     attributes: wp.array2d[float]
@@ -211,7 +208,7 @@ def trace_surface_kernel(
         depth = wp.inf
     if threshold_gaussian < 0 and mesh.face >= 0:
         threshold_depth = mesh.t
-    out_records.threshold_depth[i] = threshold_depth
+    out_records.depth[i] = threshold_depth
     out_records.expected_depth[i] = depth
     out_records.normals[i] = normal
     out_records.transmittance[i] = transmittance
@@ -221,13 +218,5 @@ def trace_surface_kernel(
     out_records.mesh_faces[i] = mesh.face
 
 
-def launch_trace_surface(occluders, settings, origins, directions, reaches, threshold, attributes, out_records, device):
-    """Trace one ray a thread, front to back."""
-    launch(
-        trace_surface_kernel,
-        len(origins),
-        inputs=[occluders, settings, origins, directions, reaches, threshold, attributes],
-        outputs=[out_records],
-        device=device,
-        block_dim=64,
-    )
+launch_trace_surface = launcher(trace_surface_kernel, block_dim=64)
+"""Trace one ray a thread, front to back."""

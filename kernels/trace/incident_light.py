@@ -2,15 +2,14 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.constants import LARGEST_FLOAT, PI
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.sampling import (
     SampleSet,
     draw_square,
     hash_combine,
     square_to_cosine_hemisphere,
     square_to_cosine_hemisphere_pdf,
-    stream_of,
     tangent_frame,
 )
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
@@ -23,12 +22,11 @@ from beam_warp.kernels.light.environment_sampling import (
     square_to_environment_pdf,
 )
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks, square_to_product
-from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
+from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin, stream_of_place
 from beam_warp.kernels.trace.visibility import Rays
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 LIGHT_STREAM = wp.constant(wp.uint32(0x49525241))
 
 COSINE = wp.constant(0)
@@ -131,8 +129,6 @@ def draw_light_kernel(
     blocks: EnvironmentBlocks,
     cumulative: wp.array2d[float],
     batch: RayBatch,
-    seed: wp.uint32,
-    frame: wp.uint32,
     out_rays: Rays,
     out_weights: wp.array[wp.vec3],
 ):
@@ -140,7 +136,7 @@ def draw_light_kernel(
     item = first + wp.tid()
     place = item / technique.samples.count
     normal = batch.normals[place]
-    point_stream = stream_of(seed, frame, wp.uint32(batch.rows[place]))
+    point_stream = stream_of_place(batch, place)
     stream = hash_combine(point_stream, LIGHT_STREAM + wp.uint32(technique.density))
     square = draw_square(technique.samples, item % technique.samples.count, stream)
     drawn = draw_light(technique, distribution, blocks, cumulative, place, normal, square.u, square.v)
@@ -164,18 +160,18 @@ def reduce_light_kernel(
     visibility: wp.array[float],
     counts: wp.vec2i,
     paired: wp.vec2i,
-    ratio: int,
     unshadowed: wp.array[wp.vec3],
     out_value: wp.array[wp.vec3],
     out_error: wp.array[wp.vec3],
 ):
     """Irradiance over pi and its standard error, by channel, from the samples of up to two techniques.
 
-    Plain: the mean of V f. Ratio: unshadowed * sum V f / sum f (Heitz et al. 2018), whose error is that of the
-    linearised terms (V - ratio) f. Where no sample found light, the ratio is anything in [0, 1].
+    Plain, without ``unshadowed``: the mean of V f. Ratio: unshadowed * sum V f / sum f (Heitz et al. 2018), whose error
+    is that of the linearised terms (V - ratio) f. Where no sample found light, the ratio is anything in [0, 1].
     """
     place = first + wp.tid()
     row = batch.rows[place]
+    ratio = unshadowed.shape[0] > 0
     count = counts[0] + counts[1]
     begin = place * batch.sample_count
     free = wp.vec3()
@@ -189,7 +185,7 @@ def reduce_light_kernel(
     for c in range(3):
         scale = 1.0 / float(count)
         center = float(0.0)
-        if ratio == 1:
+        if ratio:
             scale = 0.0
             if free[c] > 0.0:
                 scale = unshadowed[row][c] / free[c]
@@ -206,45 +202,28 @@ def reduce_light_kernel(
             there = add_term(there, weights[ray][c] * (visibility[ray] - center))
         value[c] = scale * seen[c]
         error[c] = scale * wp.sqrt(variance_of_sum(here) + variance_of_sum(there))
-        if ratio == 1 and not (free[c] > 0.0):
+        if ratio and not (free[c] > 0.0):
             value[c] = 0.5 * unshadowed[row][c]
             error[c] = 0.5 * unshadowed[row][c]
     out_value[row] = value
     out_error[row] = error
 
 
-def launch_sum_unshadowed(moments, normals, out_irradiance, device):
-    """Sum the irradiance over pi of every normal, with nothing in the way."""
-    launch(sum_unshadowed_kernel, len(normals), inputs=[moments, normals], outputs=[out_irradiance], device=device)
+launch_sum_unshadowed = launcher(sum_unshadowed_kernel)
+"""Sum the irradiance over pi of every normal, with nothing in the way."""
 
 
-def launch_draw_light(technique, environment, cumulative, batch, stream, out_rays, out_weights, device):
-    """Draw one technique's rays; ``stream`` is (seed, frame)."""
+def launch_draw_light(technique, environment, cumulative, batch, out_rays, out_weights, device):
+    """Draw one technique's rays."""
     launch(
         draw_light_kernel,
         len(batch.rows) * technique.samples.count,
-        inputs=[
-            technique,
-            environment.distribution,
-            environment.blocks,
-            cumulative,
-            batch,
-            wp.uint32(stream[0]),
-            wp.uint32(stream[1]),
-        ],
+        inputs=[technique, environment.distribution, environment.blocks, cumulative, batch],
         outputs=[out_rays, out_weights],
         device=device,
         block_dim=128,
     )
 
 
-def launch_reduce_light(batch, weights, visibility, *, counts, paired, ratio, unshadowed, out_value, out_error, device):
-    """Add up each point's samples, in its own row; ``unshadowed`` is by row too."""
-    launch(
-        reduce_light_kernel,
-        len(batch.rows),
-        inputs=[batch, weights, visibility, counts, paired, int(ratio), unshadowed],
-        outputs=[out_value, out_error],
-        device=device,
-        block_dim=64,
-    )
+launch_reduce_light = launcher(reduce_light_kernel, block_dim=64)
+"""Add up each point's samples, in its own row; ``unshadowed`` is by row too, or empty."""

@@ -5,18 +5,16 @@ how well its normal agrees, by how near it is to the pixel's tangent plane, and 
 value is off, which are filtered along (Schied et al. 2017). Pixels that show no surface neither give nor take.
 """
 
-from typing import Any
-
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
 ROUNDS = 5
 
 NORMAL_POWER = wp.constant(64.0)
-"""Of the cosine between normals: half at 8 degrees."""
+"""Power of the cosine between normals: a tap counts half at 8 degrees."""
 
 PLANE_PIXELS = wp.constant(1.0)
 """Distance from the tangent plane at which a tap counts exp(-1), in pixels of its distance."""
@@ -25,7 +23,7 @@ VALUE_ERRORS = wp.constant(3.0)
 """Standard errors of a difference at which a tap counts exp(-1)."""
 
 FIREFLY = wp.constant(5.0)
-"""Times the mean of its 24 neighbours on the surface is what a pixel may be at most before filtering, by the largest
+"""A pixel is cut, before filtering, to this many times the mean of its 24 neighbours on the surface, by the largest
 channel."""
 
 TINY = wp.constant(1.0e-12)
@@ -61,7 +59,7 @@ def is_surface(guides: Guides, x: int, y: int) -> bool:
 
 @wp.func
 def surface_point(guides: Guides, x: int, y: int) -> wp.vec3:
-    """In camera axes."""
+    """The surface's point at a pixel, in camera axes."""
     ray = wp.vec3(
         (float(x) + 0.5 - guides.center[0]) / guides.focal[0],
         (float(y) + 0.5 - guides.center[1]) / guides.focal[1],
@@ -157,29 +155,17 @@ def filter_round_kernel(
     out_variances[pixel] = spread / (weight_sum * weight_sum)
 
 
-def launch_clamp_fireflies(guides: Any, values: Any, out_values: Any, device: Any) -> None:
-    """Cut pixels that are far brighter than all around them."""
-    launch(clamp_fireflies_kernel, len(values), inputs=[guides, values], outputs=[out_values], device=device)
+launch_clamp_fireflies = launcher(clamp_fireflies_kernel)
+"""Cut pixels that are far brighter than all around them."""
 
 
-def launch_square_errors(errors: Any, out_variances: Any, device: Any) -> None:
-    """Turn standard errors into variances."""
-    launch(square_errors_kernel, len(errors), inputs=[errors], outputs=[out_variances], device=device)
+launch_square_errors = launcher(square_errors_kernel)
+"""Turn standard errors into variances."""
 
 
-def launch_smooth_variances(guides: Any, variances: Any, out_variances: Any, device: Any) -> None:
-    """Average variances over 3 x 3 pixels of the surface."""
-    launch(smooth_variances_kernel, len(variances), inputs=[guides, variances], outputs=[out_variances], device=device)
+launch_smooth_variances = launcher(smooth_variances_kernel)
+"""Average variances over 3 x 3 pixels of the surface."""
 
 
-def launch_filter_round(
-    guides: Any, step: int, values: Any, variances: Any, out_values: Any, out_variances: Any, device: Any
-) -> None:
-    """One round, with taps ``step`` pixels apart."""
-    launch(
-        filter_round_kernel,
-        len(values),
-        inputs=[guides, step, values, variances],
-        outputs=[out_values, out_variances],
-        device=device,
-    )
+launch_filter_round = launcher(filter_round_kernel)
+"""One round, with taps ``step`` pixels apart."""

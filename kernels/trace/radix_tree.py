@@ -7,7 +7,7 @@ Equal codes are told apart by their places.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.trace.tree_build import BinaryTree
 
 wp.set_module_options({"enable_backward": False})
@@ -76,6 +76,5 @@ def split_runs_kernel(first: int, keys: wp.array[wp.int64], count: int, out_tree
     out_tree.size[count + i] = high - low + 1
 
 
-def launch_split_runs(keys, count, out_tree, device):
-    """Make the ``count - 1`` inner nodes."""
-    launch(split_runs_kernel, count - 1, inputs=[keys, count], outputs=[out_tree], device=device)
+launch_split_runs = launcher(split_runs_kernel)
+"""Make the ``count - 1`` inner nodes."""

@@ -4,7 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
+from beam_warp.kernels.common.sampling import stream_of
 from beam_warp.kernels.trace.occluders import surface_layer
 
 wp.set_module_options({"enable_backward": False})
@@ -21,15 +22,22 @@ class RayBatch:
     positions: wp.array[wp.vec3]
     normals: wp.array[wp.vec3]
     offsets: wp.array[float]
-    rows: wp.array[int]  # of the caller's arrays: where results go, and what random streams belong to
+    rows: wp.array[int]  # of the caller's arrays: where results go
     base: wp.vec3  # subtracted from the positions
     sample_count: int
+    seed: wp.uint32  # random streams belong to (seed, frame, row)
+    frame: wp.uint32
 
 
 @wp.func
 def ray_origin(batch: RayBatch, place: int) -> wp.vec3:
     """Relative to ``batch.base``, subtracted first: far from the world's origin the offset would be rounded away."""
     return batch.positions[place] - batch.base + batch.normals[place] * batch.offsets[place]
+
+
+@wp.func
+def stream_of_place(batch: RayBatch, place: int) -> wp.uint32:
+    return stream_of(batch.seed, batch.frame, wp.uint32(batch.rows[place]))
 
 
 @wp.kernel
@@ -48,18 +56,9 @@ def lift_off_surface_kernel(first: int, surface: wp.array[wp.vec2], thicknesses:
     out_offsets[i] = surface[i][0] + thicknesses * surface[i][1]
 
 
-def launch_local_surface(occluders, points, normals, out_surface, device):
-    """Measure the layer of Gaussians around each point."""
-    launch(
-        local_surface_kernel,
-        len(points),
-        inputs=[occluders, points, normals],
-        outputs=[out_surface],
-        device=device,
-        block_dim=64,
-    )
+launch_local_surface = launcher(local_surface_kernel, block_dim=64)
+"""Measure the layer of Gaussians around each point."""
 
 
-def launch_lift_off_surface(surface, thicknesses, out_offsets, device):
-    """Find how far ray origins are moved along the normals."""
-    launch(lift_off_surface_kernel, len(surface), inputs=[surface, thicknesses], outputs=[out_offsets], device=device)
+launch_lift_off_surface = launcher(lift_off_surface_kernel)
+"""Find how far ray origins are moved along the normals."""

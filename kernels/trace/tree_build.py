@@ -11,7 +11,7 @@ atomic counters: the tree is the same on every run.
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,6 +87,8 @@ def order_boxes_kernel(
 class BinaryTree:
     """Nodes of a binary hierarchy; the first ``leaf_count`` are leaves in Morton order."""
 
+    items: wp.array[int]  # Gaussian of each leaf
+    leaf_count: int
     lower: wp.array[wp.vec3]
     upper: wp.array[wp.vec3]
     left: wp.array[int]
@@ -200,11 +202,8 @@ def launch_order_boxes(lowers, uppers, takes_part, bounds, out_keys, out_items, 
     )
 
 
-def launch_start_clusters(items, count, lowers, uppers, out_tree, out_clusters, device):
-    """Make every box, in Morton order, a cluster of its own."""
-    launch(
-        start_clusters_kernel, count, inputs=[items, lowers, uppers], outputs=[out_tree, out_clusters], device=device
-    )
+launch_start_clusters = launcher(start_clusters_kernel)
+"""Make every box, in Morton order, a cluster of its own."""
 
 
 def launch_choose_neighbors(clusters, count, reach, tree, out_chosen, out_marks, device):
@@ -213,12 +212,5 @@ def launch_choose_neighbors(clusters, count, reach, tree, out_chosen, out_marks,
     launch(mark_merges_kernel, count, inputs=[out_chosen, count], outputs=[out_marks], device=device)
 
 
-def launch_merge_clusters(clusters, count, chosen, marks, sums, next_node, out_tree, out_clusters, device):
-    """Merge the pairs and close the gaps."""
-    launch(
-        merge_clusters_kernel,
-        count,
-        inputs=[clusters, chosen, marks, sums, next_node],
-        outputs=[out_tree, out_clusters],
-        device=device,
-    )
+launch_merge_clusters = launcher(merge_clusters_kernel)
+"""Merge the pairs and close the gaps."""

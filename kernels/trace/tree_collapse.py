@@ -1,4 +1,4 @@
-"""From a binary hierarchy to the wide tree, and new boxes for an old tree (refit).
+"""The wide tree made of a binary hierarchy, and new boxes for an old tree (refit).
 
 A wide node opens its largest child until it has four. Nodes are made level by level, so that levels are contiguous and
 a refit runs from the last to the first.
@@ -7,7 +7,7 @@ a refit runs from the last to the first.
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.tree_build import BinaryTree, half_area
 from beam_warp.kernels.trace.wide_tree import LEAF_ROWS, NODE_ROWS, WideTree
@@ -40,8 +40,6 @@ def widest_axis(lower: wp.vec3, upper: wp.vec3) -> int:
 def open_level_kernel(
     first: int,
     tree: BinaryTree,
-    items: wp.array[int],
-    leaf_count: int,
     by_area: int,
     level: int,
     queue: wp.array[int],
@@ -51,9 +49,9 @@ def open_level_kernel(
 ):
     """Open each queued binary node to up to four children, and queue the inner ones for the next level.
 
-    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet. ``items`` holds the
-    Gaussian of each binary leaf, ``level_sizes`` the nodes of each level, and the leaves so far behind them. Numbers
-    come from counters and so from the order of threads; what a ray meets, and in which order, does not.
+    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet. ``level_sizes``
+    holds the nodes of each level, and the leaves so far behind them. Numbers come from counters and so from the order
+    of threads; what a ray meets, and in which order, does not.
     """
     i = first + wp.tid()
     if i < level_sizes[level]:
@@ -64,7 +62,7 @@ def open_level_kernel(
             which = int(-1)
             for k in range(count):
                 node = found[k]
-                if node >= leaf_count:
+                if node >= tree.leaf_count:
                     size = float(tree.size[node])
                     if by_area == 1:
                         size = half_area(tree.lower[node], tree.upper[node])
@@ -87,7 +85,7 @@ def open_level_kernel(
                         found[k + 1] = a
         inner = int(0)
         for k in range(count):
-            if found[k] >= leaf_count:
+            if found[k] >= tree.leaf_count:
                 inner += 1
         begin = int(0)
         for above in range(level):
@@ -97,11 +95,11 @@ def open_level_kernel(
         first_leaf = wp.atomic_add(level_sizes, level_sizes.shape[0] - 1, count - inner)
         out_layout.children[begin + i] = wp.vec4i(next_begin + first_inner, first_leaf, inner, count)
         for k in range(count):
-            if found[k] >= leaf_count:
+            if found[k] >= tree.leaf_count:
                 out_queue[first_inner] = found[k]
                 first_inner += 1
             else:
-                out_layout.items[first_leaf] = items[found[k]]
+                out_layout.items[first_leaf] = tree.items[found[k]]
                 first_leaf += 1
 
 
@@ -211,27 +209,13 @@ def bound_nodes_kernel(
     out_tree.nodes[row + 2] = wp.vec4i(low_words[2], high_words[0], high_words[1], high_words[2])
 
 
-def launch_open_level(
-    tree, items, leaf_count, *, by_area, level, queue, bound, level_sizes, out_queue, out_layout, device
-):
-    """Open a level of at most ``bound`` nodes."""
-    launch(
-        open_level_kernel,
-        bound,
-        inputs=[tree, items, leaf_count, int(by_area), level, queue, level_sizes],
-        outputs=[out_queue, out_layout],
-        device=device,
-        in_order=True,
-    )
+launch_open_level = launcher(open_level_kernel, in_order=True)
+"""Open a level of at most ``bound`` nodes."""
 
 
-def launch_fill_leaves(gaussians, layout, count, out_tree, device):
-    """Copy the Gaussians into their leaves."""
-    launch(fill_leaves_kernel, count, inputs=[gaussians, layout], outputs=[out_tree], device=device)
+launch_fill_leaves = launcher(fill_leaves_kernel)
+"""Copy the Gaussians into their leaves."""
 
 
-def launch_bound_nodes(level_begin, count, lowers, uppers, out_layout, out_tree, device):
-    """Write a level's nodes; the level below must be done."""
-    launch(
-        bound_nodes_kernel, count, inputs=[level_begin, lowers, uppers], outputs=[out_layout, out_tree], device=device
-    )
+launch_bound_nodes = launcher(bound_nodes_kernel)
+"""Write a level's nodes; the level below must be done."""

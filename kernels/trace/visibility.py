@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.sampling import hash_combine, unit_float
 from beam_warp.kernels.mesh.occluder import MeshOccluder, mesh_blocks
 from beam_warp.kernels.trace.occluders import transmittance
@@ -22,11 +22,11 @@ from beam_warp.kernels.trace.wide_tree import Stack, WideTree, lowest_bit, meet_
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 RAYS_A_LANE = 8
-"""Measured on an H200 among 4, 8, 16, 32 and 64 (1,018, 1,113, 1,075, 905, 726 Mray/s); large pools leave the last
-warps alone on the device."""
+"""Rays in a pool for each lane. Measured on an H200 among 4, 8, 16, 32 and 64 (1,018, 1,113, 1,075, 905, 726 Mray/s);
+large pools leave the last warps alone on the device."""
 
 REGISTERS = 80
-"""Of the 96 that the compiler would take: a fifth more warps at once, 3 to 5 % more rays a second on an H200."""
+"""Registers a thread; the compiler would take 96. A fifth more warps at once, 3 to 5 % more rays a second (H200)."""
 
 THREADS_TO_FILL = 1 << 17
 """Fewer threads than this do not fill a large GPU; small batches get fewer rays a lane."""
@@ -113,7 +113,7 @@ def trace_rays_wide_kernel(
     share: int,
     out_visibility: wp.array[float],
 ):
-    """By the default rules, in pools of ``lanes`` times ``share`` neighbouring rays."""
+    """Trace rays by the default rules, in pools of ``lanes`` times ``share`` neighbouring rays."""
     thread = first + wp.tid()
     count = rays.origins.shape[0]
     begin = (thread / lanes) * lanes * share
@@ -177,23 +177,12 @@ def trace_rays_wide_kernel(
                 out_visibility[ray] = v
 
 
-def launch_block_rays(mesh, rays, out_reaches, device):
-    """Find which rays triangles block."""
-    launch(
-        block_rays_kernel, len(rays.origins), inputs=[mesh, rays], outputs=[out_reaches], device=device, block_dim=64
-    )
+launch_block_rays = launcher(block_rays_kernel, block_dim=64)
+"""Find which rays triangles block."""
 
 
-def launch_trace_rays(occluders, settings, rays, out_visibility, device):
-    """Trace a batch of rays through any occluders, one a thread."""
-    launch(
-        trace_rays_kernel,
-        len(rays.origins),
-        inputs=[occluders, settings, rays],
-        outputs=[out_visibility],
-        device=device,
-        block_dim=64,  # divergent rays: small blocks
-    )
+launch_trace_rays = launcher(trace_rays_kernel, block_dim=64)
+"""Trace a batch of rays through any occluders, one a thread."""
 
 
 def launch_trace_rays_wide(tree, settings, rays, out_visibility, device):

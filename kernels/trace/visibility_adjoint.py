@@ -5,7 +5,7 @@ traversal's loop is silently wrong; here the first traversal counts hits and fin
 that belong to the ray alone, and after a stable sort by Gaussian each Gaussian's hits are added in the order of rays.
 No float atomics: the same bits in every run, for any number of threads.
 
-`tally_hits` and `store_hits` are the two traversals; they meet hits in the same order.
+`tally_all` and `store_all` are the two traversals; they meet hits in the same order.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.common.constants import ALPHA_MAX
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.mesh.occluder import mesh_blocks
 from beam_warp.kernels.trace.gaussian import Gaussians
 from beam_warp.kernels.trace.hit_gradients import (
@@ -30,7 +30,7 @@ from beam_warp.kernels.trace.hit_gradients import (
     whitened_closest_point,
 )
 from beam_warp.kernels.trace.settings import TraceSettings
-from beam_warp.kernels.trace.wide_traversal import TracedRay, traversal
+from beam_warp.kernels.trace.wide_traversal import TracedRay, traced_ray, traversal
 from beam_warp.kernels.trace.wide_tree import LeafPeak, WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
@@ -61,15 +61,6 @@ class RayReturn:
 
 
 @wp.func
-def tally_hit(tally: HitTally, alpha: float) -> HitTally:
-    result = tally
-    result.transmittance *= 1.0 - alpha
-    if alpha < ALPHA_MAX:
-        result.count += 1
-    return result
-
-
-@wp.func
 def store_hit(start: RayReturn, gaussians: Gaussians, peak: LeafPeak, ray: TracedRay) -> RayReturn:
     """Store a hit, unless it has no gradient, and add that gradient to the ray's."""
     result = start
@@ -93,7 +84,9 @@ def tally_leaf(
     peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
     tally = found
     if peak.alpha > 0.0:
-        tally = tally_hit(found, peak.alpha)
+        tally.transmittance *= 1.0 - peak.alpha
+        if peak.alpha < ALPHA_MAX:
+            tally.count += 1
     return tally
 
 
@@ -103,20 +96,7 @@ def is_tally_dark(settings: TraceSettings, found: HitTally) -> bool:
 
 
 tally_all = traversal("tally_all", tally_leaf, is_done=is_tally_dark)
-
-
-@wp.func
-def tally_hits(
-    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, origin: wp.vec3, direction: wp.vec3, t_max: float
-) -> HitTally:
-    """V and the number of hits with gradients, over what `tree_transmittance` visits."""
-    ray = TracedRay()
-    ray.origin = origin
-    ray.direction = direction
-    ray.t_max = t_max
-    tally = HitTally()
-    tally.transmittance = 1.0
-    return tally_all(tree, gaussians, settings, ray, tally)
+"""V and the number of hits with gradients, over what `tree_transmittance` visits."""
 
 
 @wp.func
@@ -136,24 +116,7 @@ def is_full(settings: TraceSettings, found: RayReturn) -> bool:
 
 
 store_all = traversal("store_all", store_leaf, is_done=is_full)
-
-
-@wp.func
-def store_hits(
-    tree: WideTree,
-    gaussians: Gaussians,
-    settings: TraceSettings,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    t_max: float,
-    start: RayReturn,
-) -> RayReturn:
-    """Store the hits that `tally_hits` counted: it ends after as many, which is where that one stopped."""
-    ray = TracedRay()
-    ray.origin = origin
-    ray.direction = direction
-    ray.t_max = t_max
-    return store_all(tree, gaussians, settings, ray, start)
+"""Store the hits that `tally_all` counted: it ends after as many, which is where that one stopped."""
 
 
 @wp.struct
@@ -191,21 +154,15 @@ def count_hits_kernel(first: int, occluders: Any, settings: TraceSettings, rays:
         t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
         origin = rays.origins[i] - occluders.origin
         if not mesh_blocks(occluders.mesh, origin, rays.directions[i], t_max):
-            tally = tally_hits(occluders.tree, occluders.gaussians, settings, origin, rays.directions[i], t_max)
+            tally.transmittance = 1.0
+            ray = traced_ray(origin, rays.directions[i], t_max)
+            tally = tally_all(occluders.tree, occluders.gaussians, settings, ray, tally)
     out_tallies.transmittance[i] = tally.transmittance
     out_tallies.count[i] = tally.count
 
 
-def launch_count_hits(occluders, settings, rays, out_tallies, device):
-    """Trace one ray a thread and count the hits that have gradients."""
-    launch(
-        count_hits_kernel,
-        len(rays.origins),
-        inputs=[occluders, settings, rays],
-        outputs=[out_tallies],
-        device=device,
-        block_dim=64,  # as `launch_trace_rays`
-    )
+launch_count_hits = launcher(count_hits_kernel, block_dim=64)
+"""Trace one ray a thread and count the hits that have gradients."""
 
 
 @wp.kernel
@@ -231,7 +188,8 @@ def store_hits_kernel(
     if begin < ray.end:
         t_max = rays.reaches[wp.min(i, rays.reaches.shape[0] - 1)]
         origin = rays.origins[i] - occluders.origin
-        ray = store_hits(occluders.tree, occluders.gaussians, settings, origin, rays.directions[i], t_max, ray)
+        traced = traced_ray(origin, rays.directions[i], t_max)
+        ray = store_all(occluders.tree, occluders.gaussians, settings, traced, ray)
     # The compiler may round a tie differently in the two traversals; then a slot stays free, and none overflows.
     for slot in range(ray.slot, ray.end):
         out_hits.gaussian[slot] = occluders.gaussians.center_opacity.shape[0]
@@ -241,16 +199,8 @@ def store_hits_kernel(
     out_rays.directions[i] = ray.direction
 
 
-def launch_store_hits(occluders, settings, rays, tallies, slot_ends, out_hits, out_order, out_rays, device):
-    """Trace one ray a thread and store its hits."""
-    launch(
-        store_hits_kernel,
-        len(rays.origins),
-        inputs=[occluders, settings, rays, tallies, slot_ends],
-        outputs=[out_hits, out_order, out_rays],
-        device=device,
-        block_dim=64,  # as `launch_trace_rays`
-    )
+launch_store_hits = launcher(store_hits_kernel, block_dim=64)
+"""Trace one ray a thread and store its hits."""
 
 
 @wp.func
@@ -280,9 +230,8 @@ def sum_blocks_kernel(first: int, degree: int, hits: HitRecords, order: wp.array
         out_sums[i] = add_hits(HitMoments(), degree, hits.record, order, begin, end)
 
 
-def launch_sum_blocks(degree, hits, order, out_sums, device):
-    """Sum whole blocks of sorted hits, one a thread, so that a Gaussian that all rays hit is not one thread's work."""
-    launch(sum_blocks_kernel, len(out_sums), inputs=[degree, hits, order], outputs=[out_sums], device=device)
+launch_sum_blocks = launcher(sum_blocks_kernel)
+"""Sum whole blocks of sorted hits, one a thread, so that a Gaussian that all rays hit is not one thread's work."""
 
 
 @wp.kernel
@@ -310,15 +259,8 @@ def add_moments_kernel(
         out_moments[i] = add_hits(total, degree, hits.record, order, begin, end)
 
 
-def launch_add_moments(degree, hits, order, hit_count, sums, moments, device):
-    """Add sorted hits to the moments of their Gaussians, one Gaussian a thread; ``sums`` from `launch_sum_blocks`."""
-    launch(
-        add_moments_kernel,
-        len(moments),
-        inputs=[degree, hits, order, hit_count, sums],
-        outputs=[moments],
-        device=device,
-    )
+launch_add_moments = launcher(add_moments_kernel)
+"""Add sorted hits to the moments of their Gaussians, one Gaussian a thread; ``sums`` from `launch_sum_blocks`."""
 
 
 @wp.kernel
@@ -332,7 +274,7 @@ def resolve_moments_kernel(
     moments: wp.array[HitMoments],
     out_gradients: HitGradients,
 ):
-    """From moments to gradients of the cloud's arrays; 0 for Gaussians that take no part."""
+    """Gradients of the cloud's arrays by a Gaussian's moments; 0 for Gaussians that take no part."""
     i = first + wp.tid()
     position = wp.vec3()
     orientation = wp.vec4()
@@ -353,14 +295,5 @@ def resolve_moments_kernel(
     out_gradients.opacities[i] = opacity
 
 
-def launch_resolve_moments(
-    gaussians, orientations, scales, smallest_scale, largest_ratio, moments, out_gradients, device
-):
-    """Resolve every Gaussian's moments to its gradients."""
-    launch(
-        resolve_moments_kernel,
-        len(moments),
-        inputs=[gaussians, orientations, scales, smallest_scale, largest_ratio, moments],
-        outputs=[out_gradients],
-        device=device,
-    )
+launch_resolve_moments = launcher(resolve_moments_kernel)
+"""Resolve every Gaussian's moments to its gradients."""

@@ -40,6 +40,16 @@ class TracedRay:
 
 
 @wp.func
+def traced_ray(origin: wp.vec3, direction: wp.vec3, t_max: float) -> TracedRay:
+    """A ray from its origin on, without a random stream."""
+    ray = TracedRay()
+    ray.origin = origin
+    ray.direction = direction
+    ray.t_max = t_max
+    return ray
+
+
+@wp.func
 def whole_reach(ray: TracedRay, found: Any) -> float:
     """The ray's own reach, whatever was found."""
     return ray.t_max
@@ -153,10 +163,7 @@ def tree_transmittance(
     stream: wp.uint32,
 ) -> float:
     """Product of (1 - alpha) in any order, or one Bernoulli sample of it."""
-    ray = TracedRay()
-    ray.origin = origin
-    ray.direction = direction
-    ray.t_max = t_max
+    ray = traced_ray(origin, direction, t_max)
     ray.stream = stream
     return pass_all(tree, gaussians, settings, ray, 1.0)
 
@@ -201,9 +208,7 @@ def tree_sampled_hit(
     stream: wp.uint32,
 ) -> int:
     """The nearest of the Gaussians that each stop the ray with probability alpha, or -1."""
-    ray = TracedRay()
-    ray.origin = origin
-    ray.direction = direction
+    ray = traced_ray(origin, direction, t_max)
     ray.stream = stream
     nearest = NearestHit()
     nearest.index = -1
@@ -224,7 +229,4 @@ join_all = traversal("join_all", join_layer)
 @wp.func
 def tree_layer(tree: WideTree, gaussians: Gaussians, p: wp.vec3, n: wp.vec3) -> SurfaceLayer:
     """The layer of Gaussians that contain a point; a ray of no reach meets just the boxes around its origin."""
-    ray = TracedRay()
-    ray.origin = p
-    ray.direction = n
-    return join_all(tree, gaussians, TraceSettings(), ray, SurfaceLayer())
+    return join_all(tree, gaussians, TraceSettings(), traced_ray(p, n, 0.0), SurfaceLayer())

@@ -51,7 +51,7 @@ def test_a_sun_is_a_small_region():
 
 
 def test_turning_is_turning_the_map(rng):
-    """By whole columns a turned map has the same texels; cuts at other columns than 0 do not matter for one region."""
+    """A map turned by whole columns has the same texels; cuts at other columns than 0 do not matter for one region."""
     light = cloudy(rng)
     turned = EnvironmentRegions.of(light, 1).turned(90.0)
     expected = EnvironmentRegions.of(light.rotated(90.0), 1)

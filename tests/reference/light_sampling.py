@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.ggx_sampling import stretched
 from beam_warp.kernels.light.latlong import direction_to_latlong
@@ -15,7 +16,29 @@ from beam_warp.kernels.light.product_sampling import (
     texel_of,
 )
 
-PI = wp.constant(3.14159265358979323846)
+
+@wp.func
+def cosine_hemisphere_to_square(direction: wp.vec3) -> wp.vec2:
+    """The point of the unit square that `square_to_cosine_hemisphere` takes to ``direction``."""
+    radius = wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1])
+    phi = wp.atan2(direction[1], direction[0])
+    if phi < -PI / 4.0:
+        phi += 2.0 * PI
+    a = 0.0
+    b = 0.0
+    if phi < PI / 4.0:
+        a = radius
+        b = phi * a * 4.0 / PI
+    elif phi < 3.0 * PI / 4.0:
+        b = radius
+        a = -(phi - PI / 2.0) * b * 4.0 / PI
+    elif phi < 5.0 * PI / 4.0:
+        a = -radius
+        b = (phi - PI) * a * 4.0 / PI
+    else:
+        b = -radius
+        a = -(phi - 3.0 * PI / 2.0) * b * 4.0 / PI
+    return wp.vec2((a + 1.0) * 0.5, (b + 1.0) * 0.5)
 
 
 @wp.func

@@ -249,7 +249,7 @@ def test_the_same_seed_gives_the_same_bits(corner, monkeypatch):
 
 
 def test_turning_the_sky_is_a_turned_sky(corner):
-    """By a quarter: a whole number of columns, so that nothing is resampled."""
+    """A quarter is a whole number of columns, so that nothing is resampled."""
     turned = Shot(**{**vars(corner), "environment_rotation": 90.0})
     rotated = Shot(**{**vars(corner), "environment": corner.environment.rotated(90.0)})
     options = PathOptions(samples=256, bounces=1)
@@ -263,9 +263,6 @@ def test_an_interrupted_render_ends_with_the_same_bits(corner, tmp_path):
     options = PathOptions(samples=4 * PASS_SAMPLES, target_error=1e-6)
     whole = PathRenderer(options, device="cpu").draw(corner)
     path = tmp_path / "frame.checkpoint"
-
-    class Stop(Exception):
-        pass
 
     def stop(done, most):
         if done >= PASS_SAMPLES:
@@ -326,7 +323,7 @@ def test_the_inside_of_a_surface_is_not_seen_through_its_leaks(device):
 
 
 def test_layers_do_not_mix_what_is_apart(device):
-    """At an outline the foreground and what is behind it are shaded apart, never at a place in between."""
+    """The foreground of an outline and what is behind it are shaded apart, never at a place in between."""
     front = disc(height=1.0, opacity=0.5, base_color=0.9, size=0.2)
     back = disc(height=0.0, base_color=0.1, size=2.0)
     camera = Camera.look_at((0.01, 0.0, 2.0), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)

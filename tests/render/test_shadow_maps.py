@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from support.flat_scenes import UP, discs, nothing, plate
+from support.kernel_runs import run_kernel
 from support.shapes import sphere_points
 
 from beam_warp.device.arrays import resolve_device
@@ -40,18 +41,10 @@ def visible(drawer, points, normals, light=None, turned=True):
     angles = np.random.default_rng(1).random(len(points)) * 2 * np.pi * turned
     device = drawer.maps.texels.device
     turns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
-    out = wp.zeros(len(points), dtype=float, device=device)
-    arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=device) for a in (points, normals)]
     around = len(drawer.cameras) == 6
     middle = wp.vec3(*light.position) if around else wp.vec3()
-    wp.launch(
-        share_kernel,
-        len(points),
-        inputs=[drawer.maps, int(around), middle, *arrays, wp.array(turns, dtype=wp.vec2, device=device)],
-        outputs=[out],
-        device=device,
-    )
-    return out.numpy()
+    inputs = [drawer.maps, int(around), middle, (points, wp.vec3), (normals, wp.vec3), (turns, wp.vec2)]
+    return run_kernel(share_kernel, len(points), inputs, [float], device)[0]
 
 
 def drawn(light, cloud, subject, device, size=128, mesh=None):
@@ -139,7 +132,7 @@ def test_taps_are_spread_over_the_disc():
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (0.4, 0.2, -1.0)])
 def test_the_shadow_of_a_square(device, direction):
-    """Of triangles, under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
+    """Triangles under a light without size: lit turns dark within the filter of a texel and a half, and a bias."""
     light = DirectionalLight(direction=direction, irradiance=(1, 1, 1), angular_diameter=0.0)
     drawer = drawn(light, nothing(), SUBJECT, device, mesh=plate(0.5, 0.25))
     x = np.linspace(-0.6, 0.6, 121)

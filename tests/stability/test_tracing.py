@@ -340,7 +340,9 @@ class TestOnTheDevice:
         gaussians.degree = 2
         for name, dtype in (("lower", wp.vec3), ("upper", wp.vec3), ("fate", int), ("takes_part", int)):
             setattr(bounds, name, wp.zeros(1, dtype=dtype, device=device))
-        launch_pack_gaussians(cloud, wp.vec3(), 1e-7, 1e-4, gaussians, bounds, wp.get_device(device))
+        launch_pack_gaussians(
+            len(cloud.positions), cloud, wp.vec3(), 1e-7, 1e-4, gaussians, bounds, wp.get_device(device)
+        )
         packed = [getattr(gaussians, f"whitening_{k}").numpy() for k in range(3)]
         values = [gaussians.center_opacity.numpy()[:, :3], bounds.lower.numpy(), bounds.upper.numpy(), *packed]
         return int(bounds.fate.numpy()[0]), float(packed[0][0, 3]), all(np.isfinite(value).all() for value in values)

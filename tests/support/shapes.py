@@ -56,8 +56,27 @@ def random_cloud(rng, count, *, scale=(-3.5, 0.8), opacity=(0.0, 1.0)):
     )
 
 
+def aligned(positions, opacities=0.5, scales=0.1, **fields):
+    """Gaussians whose axes are the world's."""
+    count = len(positions)
+    return GaussianCloud(
+        positions=positions,
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        scales=np.broadcast_to(scales, (count, 3)),
+        opacities=np.broadcast_to(opacities, count),
+        **fields,
+    )
+
+
+def along_x(y=0.0, z=0.0, x=-2.0, count=1):
+    """Origins and directions of equal rays along +x."""
+    return np.tile([[x, y, z]], (count, 1)), np.tile([[1.0, 0.0, 0.0]], (count, 1))
+
+
+def unit(vectors):
+    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
 def random_rays(rng, count):
     d = rng.normal(size=(count, 3))
-    return rng.uniform(-1.0, 1.0, (count, 3)).astype(np.float32), (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(
-        np.float32
-    )
+    return rng.uniform(-1.0, 1.0, (count, 3)).astype(np.float32), unit(d)

@@ -51,6 +51,21 @@ def smooth_environment(height=64):
     return EnvironmentMap(radiance[..., None] * np.array([1.0, 0.5, 2.0]))
 
 
+def sunny_sky(height=64):
+    """A dim sky, a hot sun of one texel, and a black ground."""
+    radiance = np.full((height, 2 * height, 3), 0.5, np.float32)
+    radiance[height // 2 :] = 0.0
+    radiance[height // 6, height // 3] = (4000.0, 3000.0, 2000.0)
+    return EnvironmentMap(radiance)
+
+
+def texels_of(directions, height):
+    """Rows and columns of the texels that hold directions, in a map of ``height`` rows."""
+    u = (0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2.0 * np.pi)) % 1.0
+    v = np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi
+    return np.minimum((v * height).astype(int), height - 1), np.minimum((u * 2 * height).astype(int), 2 * height - 1)
+
+
 def sunny_environment(rng, height=64):
     radiance = rng.random((height, 2 * height, 3)).astype(np.float32)
     radiance[height // 4, height // 3] = 5e4

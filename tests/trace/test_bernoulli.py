@@ -8,9 +8,10 @@ import pytest
 import warp as wp
 from scipy import stats
 from support.estimates import LARGEST_Z, SIGNIFICANCE, require_zero_mean
-from support.shapes import random_cloud, random_rays
+from support.kernel_runs import run_kernel
+from support.shapes import aligned, along_x, random_cloud, random_rays
 
-from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp import Scene, visibility
 from beam_warp.kernels.common.sampling import hash_combine
 from beam_warp.kernels.trace.occluders import sampled_hit
 from beam_warp.kernels.trace.settings import TraceSettings
@@ -33,17 +34,7 @@ def options(request):
 
 
 def on_x(opacities):
-    count = len(opacities)
-    return GaussianCloud(
-        positions=np.arange(count)[:, None] * [1.0, 0.0, 0.0],
-        orientations=np.tile([0, 0, 0, 1.0], (count, 1)),
-        scales=np.full((count, 3), 0.1),
-        opacities=opacities,
-    )
-
-
-def along_x(count):
-    return np.tile([[-2.0, 0.0, 0.0]], (count, 1)), np.tile([[1.0, 0.0, 0.0]], (count, 1))
+    return aligned(np.arange(len(opacities))[:, None] * [1.0, 0.0, 0.0], opacities)
 
 
 def require_chi_square(squares, degrees):
@@ -76,7 +67,7 @@ def test_equal_rays_draw_independently(device, options, opacities):
     scene = Scene.from_gaussians(on_x(opacities), device)
     truth = np.prod(1.0 - np.asarray(opacities))
     sigma = np.sqrt(truth * (1.0 - truth) / count)
-    drawn = np.array([visibility(scene, *along_x(count), options=options, seed=seed) for seed in range(20)])
+    drawn = np.array([visibility(scene, *along_x(count=count), options=options, seed=seed) for seed in range(20)])
     z = (drawn.mean(1) - truth) / sigma
     assert np.abs(z).max() < stats.norm.isf(SIGNIFICANCE / 2.0 / 20)  # the largest of 20
     require_chi_square(np.sum(z**2), 20)
@@ -93,12 +84,7 @@ def test_each_pair_of_gaussians_draws_independently(device, options):
         [np.column_stack([np.full(count, x), np.arange(count), np.zeros(count)]) for x in (0, 1)]
     )
     order = rng.permutation(2 * count)
-    cloud = GaussianCloud(
-        positions=positions[order],
-        orientations=np.tile([0, 0, 0, 1.0], (2 * count, 1)),
-        scales=np.full((2 * count, 3), 0.1),
-        opacities=np.full(2 * count, 0.5),
-    )
+    cloud = aligned(positions[order], 0.5)
     origins = np.column_stack([np.full(count, -1.0), np.arange(count), np.zeros(count)])
     directions = np.tile([1.0, 0.0, 0.0], (count, 1))
     scene = Scene.from_gaussians(cloud, device)
@@ -121,7 +107,7 @@ def test_seeds_decide_the_bits(device, options, rng):
 @pytest.mark.parametrize("seed", [0, 2**31, 2**32 - 1])
 def test_every_seed_is_taken(device, options, seed):
     scene = Scene.from_gaussians(on_x([0.5]), device)
-    drawn = visibility(scene, *along_x(10_000), options=options, seed=seed)
+    drawn = visibility(scene, *along_x(count=10_000), options=options, seed=seed)
     assert abs(drawn.mean() - 0.5) < LARGEST_Z * 0.5 / np.sqrt(10_000)
 
 
@@ -153,17 +139,16 @@ def test_sampled_hits_follow_alpha_times_the_transmittance_before(device, front,
         vertices = [[6.5, -9.0, -9.0], [6.5, 9.0, -9.0], [6.5, 0.0, 9.0]]
         plate, reach = SimpleNamespace(vertices=vertices, faces=[[0, 1, 2]]), 3e38
     scene = Scene.from_gaussians(cloud, device, mesh=plate)
-    drawn = wp.empty(count, dtype=int, device=device)
     settings = TraceOptions(front=front).settings(scene)
     inputs = [scene.occluders, settings, wp.vec3(-2.0, 0.0, 0.0), wp.vec3(1.0, 0.0, 0.0), reach, wp.uint32(5)]
-    wp.launch(sample_hits_kernel, dim=count, inputs=inputs, outputs=[drawn], device=device)
+    (drawn,) = run_kernel(sample_hits_kernel, count, inputs, [int], device)
     order = [k for k in np.argsort(places) if limit == "none" or places[k] <= 6]
     weights = np.zeros(11)  # the last for none
     passed = 1.0
     for k in order:
         weights[k], passed = passed * opacities[k], passed * (1.0 - opacities[k])
     weights[-1] = passed
-    found = np.bincount(np.where(drawn.numpy() < 0, 10, drawn.numpy()), minlength=11)
+    found = np.bincount(np.where(drawn < 0, 10, drawn), minlength=11)
     assert not found[weights == 0.0].any()
     expected = count * weights[weights > 0.0]
     assert expected.min() > 100.0

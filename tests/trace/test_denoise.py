@@ -156,7 +156,7 @@ class TestBilateral:
         assert found.numpy().std() <= values.std()
 
     def test_a_mean_of_what_agrees_fully(self, device, rng):
-        """On a plane, with errors so large that all values agree, the first round is the B-spline itself."""
+        """The first round on a plane, with errors so large that all values agree, is the B-spline itself."""
         from beam_warp.kernels.trace.joint_bilateral import launch_filter_round
 
         wall = Wall(device)
@@ -165,6 +165,7 @@ class TestBilateral:
         variances = rng.uniform(1e7, 2e7, HEIGHT * WIDTH).astype(np.float32)
         out, spread = (wp.zeros(HEIGHT * WIDTH, dtype=t, device=wall.device) for t in (wp.vec3, float))
         launch_filter_round(
+            len(colors),
             denoising._kernel_guides(wall.guides),
             2,
             upload(colors, wp.vec3, wall.device),

@@ -1,10 +1,10 @@
-"""Gradients of visibility: closed forms, float64 differences with frozen decisions, identities, refusals, a fit."""
+"""Gradients of visibility: closed forms, float64 differences with frozen decisions, identities, refusals."""
 
 import numpy as np
 import pytest
 import warp as wp
 from reference.visibility import FrozenVisibility
-from support.shapes import random_cloud, random_rays
+from support.shapes import aligned, along_x, random_cloud, random_rays, unit
 
 from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -46,10 +46,6 @@ def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), orientation=(0.0, 0.0, 0.0
     )
 
 
-def along_x(y=0.0, z=0.0, x=-2.0):
-    return np.array([[x, y, z]]), np.array([[1.0, 0.0, 0.0]])
-
-
 class TestClosedForm:
     @pytest.mark.parametrize("degree", [2, 4])
     def test_axis_parallel_ray(self, device, degree):
@@ -70,38 +66,22 @@ class TestClosedForm:
         assert result.orientations[0] == pytest.approx([2 * turn, 0, 0, 0], **tolerance)
 
     def test_three_on_a_ray(self, device):
-        cloud = GaussianCloud(
-            positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]],
-            orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
-            scales=np.full((3, 3), 0.1),
-            opacities=[0.1, 0.2, 0.3],
-        )
+        cloud = aligned([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [0.1, 0.2, 0.3])
         result = visibility_gradients(Scene.from_gaussians(cloud, device), *along_x(), [1.0])
         # Autodiff through the loop returns (0, -0.90, -0.648) here.
         assert result.opacities == pytest.approx([-0.8 * 0.7, -0.9 * 0.7, -0.9 * 0.8], rel=1e-6)
         assert np.abs(result.positions).max() == 0.0
 
-    @pytest.mark.parametrize("opacity", [0.99, 1.0])
-    def test_capped_alpha_has_no_gradient(self, device, opacity):
+    @pytest.mark.parametrize("opacity", [0.0, 1.0 / 255.0, 0.99, 1.0])
+    def test_neither_dropped_nor_capped_gaussians_have_a_gradient(self, device, opacity):
         scene = Scene.from_gaussians(one_gaussian(opacity), device)
         result = visibility_gradients(scene, *along_x(), [1.0])
         assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
     def test_behind_a_capped_gaussian_the_others_keep_theirs(self, device):
-        cloud = GaussianCloud(
-            positions=[[0, 0, 0], [1, 0, 0]],
-            orientations=np.tile([0, 0, 0, 1.0], (2, 1)),
-            scales=np.full((2, 3), 0.1),
-            opacities=[1.0, 0.25],
-        )
+        cloud = aligned([[0, 0, 0], [1, 0, 0]], [1.0, 0.25])
         result = visibility_gradients(Scene.from_gaussians(cloud, device), *along_x(), [1.0])
         assert result.opacities == pytest.approx([0.0, -0.01], abs=1e-7)
-
-    @pytest.mark.parametrize("opacity", [0.0, 1.0 / 255.0])
-    def test_dropped_gaussians_have_no_gradient(self, device, opacity):
-        scene = Scene.from_gaussians(one_gaussian(opacity), device)
-        result = visibility_gradients(scene, *along_x(), [1.0])
-        assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
     def test_only_what_counts_has_a_gradient(self, device):
         scene = Scene.from_gaussians(one_gaussian(0.5), device)
@@ -140,8 +120,7 @@ class TestClosedForm:
 def case(rng, *, scale=(-2.0, 0.4), rays=300, **rules):
     """A cloud, rays away from ties, their adjoints, and the float64 twin."""
     cloud = random_cloud(rng, 200, scale=scale)
-    normals = rng.normal(size=(200, 3))
-    cloud = cloud.with_arrays(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    cloud = cloud.with_arrays(normals=unit(rng.normal(size=(200, 3))))
     origins, directions = random_rays(rng, 2 * rays)
     t_max = rules.pop("t_max", np.full(2 * rays, np.inf, np.float32))
     clear = ~FrozenVisibility(cloud, origins, directions, t_max=t_max, **rules).near_tie
@@ -256,8 +235,8 @@ class TestIdentities:
 
     def test_quaternions_and_directions_keep_their_length(self, solved):
         cloud, _, directions, g = solved
-        for name, unit in (("orientations", cloud.orientations), ("directions", directions)):
-            along = (g[name] * unit).sum(1)
+        for name, vectors in (("orientations", cloud.orientations), ("directions", directions)):
+            along = (g[name] * vectors).sum(1)
             assert np.abs(along).max() <= 8 * 2.0**-23 * np.abs(g[name]).max() * 3.0  # four products and a few sums
 
     def test_quaternions_that_are_not_quite_unit(self, device, rng):
@@ -279,29 +258,6 @@ class TestIdentities:
         )
         assert np.array_equal(one.orientations, -other.orientations)
 
-    def test_gradients_turn_with_the_scene(self, device, rng):
-        cloud, (origins, directions), _, adjoints, _ = case(rng)
-        half = np.float32(np.sqrt(0.5))
-        turn = rotation_matrices([[0.0, 0.0, half, half]])[0]  # a quarter about z: exact on coordinates
-        x, y, z, w = cloud.orientations.T
-        turned = cloud.with_arrays(
-            positions=cloud.positions @ turn.T.round(),
-            orientations=np.stack([half * (x - y), half * (x + y), half * (z + w), half * (w - z)], axis=1),
-        )
-        one = visibility_gradients(Scene.from_gaussians(cloud, device), origins, directions, adjoints, options=WHOLE)
-        other = visibility_gradients(
-            Scene.from_gaussians(turned, device),
-            origins @ turn.T.round(),
-            directions @ turn.T.round(),
-            adjoints,
-            options=WHOLE,
-        )
-        for name in ("positions", "origins", "directions"):
-            expected = getattr(one, name) @ turn.T
-            assert relative_error(getattr(other, name), expected) <= rounding(cloud, expected)
-        for name in ("scales", "opacities"):
-            assert relative_error(getattr(other, name), getattr(one, name)) <= rounding(cloud, getattr(one, name))
-
     def test_adjoints_enter_linearly(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         scene = Scene.from_gaussians(cloud, device)
@@ -314,12 +270,7 @@ class TestIdentities:
 class TestStop:
     def test_gradient_is_that_of_the_product_so_far(self, device):
         opacities = np.array([0.3, 0.4, 0.5, 0.6, 0.7])
-        cloud = GaussianCloud(
-            positions=[[k, 0, 0] for k in range(5)],
-            orientations=np.tile([0, 0, 0, 1.0], (5, 1)),
-            scales=np.full((5, 3), 0.1),
-            opacities=opacities,
-        )
+        cloud = aligned([[k, 0, 0] for k in range(5)], opacities)
         scene = Scene.from_gaussians(cloud, device)
         options = TraceOptions(stop=0.5)
         v = visibility(scene, *along_x(), options=options)[0]
@@ -367,12 +318,7 @@ class TestBits:
     @pytest.mark.parametrize("first", [0, 1, 255, 256, 257, 700])
     @pytest.mark.parametrize("second", [1, 255, 256, 257, 512, 2000])
     def test_sums_over_blocks_of_hits_add_each_hit_once(self, device, first, second):
-        cloud = GaussianCloud(
-            positions=[[0, 0, 0], [0, 5, 0], [0, 9, 0]],
-            orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
-            scales=np.full((3, 3), 0.1),
-            opacities=[0.5, 0.5, 0.5],
-        )
+        cloud = aligned([[0, 0, 0], [0, 5, 0], [0, 9, 0]], [0.5, 0.5, 0.5])
         scene = Scene.from_gaussians(cloud, device)
         origins = np.tile([-2.0, 0.0, 0.0], (first + second, 1))
         origins[first:, 1] = 5.0
@@ -490,12 +436,7 @@ class TestSizes:
         assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
 
     def test_ten_thousand_coincident_gaussians(self, device):
-        cloud = GaussianCloud(
-            positions=np.zeros((10_000, 3)),
-            orientations=np.tile([0, 0, 0, 1.0], (10_000, 1)),
-            scales=np.full((10_000, 3), 0.1),
-            opacities=np.full(10_000, 1.0 / 250.0),
-        )
+        cloud = aligned(np.zeros((10_000, 3)), 1.0 / 250.0)
         scene = Scene.from_gaussians(cloud, device)
         result = visibility_gradients(scene, *along_x(), [1e10], options=WHOLE)
         # 1 - alpha is rounded by up to 2^-25, the same way in all 1e4 factors
@@ -507,17 +448,18 @@ class TestRefusals:
     def scene(self, rng):
         return Scene.from_gaussians(random_cloud(rng, 5), "cpu")
 
-    def test_bernoulli(self, scene):
-        with pytest.raises(InvalidOptionError, match=r"options.acceptance must be 'product' for gradients, got 'bern"):
-            visibility_gradients(scene, *along_x(), [1.0], options=TraceOptions(acceptance="bernoulli"))
-
-    def test_number_of_adjoints(self, scene):
-        with pytest.raises(InvalidArrayError, match=r"adjoints must have as many rows as origins \(1\), got 2"):
-            visibility_gradients(scene, *along_x(), [1.0, 1.0])
-
-    def test_adjoints_not_finite(self, scene):
-        with pytest.raises(InvalidArrayError, match="adjoints must be finite, got NaN or infinity at row 0"):
-            visibility_gradients(scene, *along_x(), [np.nan])
+    @pytest.mark.parametrize(
+        ("adjoints", "options", "error", "match"),
+        [
+            ([1.0], {"acceptance": "bernoulli"}, InvalidOptionError, r"options.acceptance must be 'product' for grad"),
+            ([1.0], {"cull": True}, InvalidOptionError, "cull must be False for a scene without normals"),
+            ([1.0, 1.0], {}, InvalidArrayError, r"adjoints must have as many rows as origins \(1\), got 2"),
+            ([np.nan], {}, InvalidArrayError, "adjoints must be finite, got NaN or infinity at row 0"),
+        ],
+    )
+    def test_adjoints_and_options(self, scene, adjoints, options, error, match):
+        with pytest.raises(error, match=match):
+            visibility_gradients(scene, *along_x(), adjoints, options=TraceOptions(**options))
 
     def test_type_of_warp_adjoints(self, scene):
         with pytest.raises(InvalidArrayError, match="adjoints must be a one-dimensional warp array of float32 on cpu"):
@@ -528,42 +470,3 @@ class TestRefusals:
             visibility_gradients(scene, np.zeros((1, 3)), [[2.0, 0, 0]], [1.0])
         with pytest.raises(InvalidOptionError, match="t_max must be a number in"):
             visibility_gradients(scene, *along_x(), [1.0], t_max=-1.0)
-
-    def test_culling_without_normals(self, scene):
-        with pytest.raises(InvalidOptionError, match="cull must be False for a scene without normals"):
-            visibility_gradients(scene, *along_x(), [1.0], options=TraceOptions(cull=True))
-
-
-class TestFit:
-    def test_descent_recovers_positions_and_opacities_from_two_shadows(self, device, rng):
-        """Two orthographic images of V determine centres in space; the descent starts a deviation away."""
-        count, side = 6, 20
-        # on a ring: no two overlap much in either view, so that neither hides or trades opacity with another
-        angles = 2.0 * np.pi * (np.arange(count) + 0.3) / count
-        cloud = GaussianCloud(
-            positions=np.stack([np.cos(angles), np.sin(angles), np.linspace(-0.8, 0.8, count)], axis=1) * 0.7,
-            orientations=np.tile([0, 0, 0, 1.0], (count, 1)),
-            scales=np.full((count, 3), 0.15),
-            opacities=rng.uniform(0.4, 0.8, count),
-        )
-        a, b = (m.ravel() for m in np.meshgrid(*[np.linspace(-1.2, 1.2, side)] * 2))
-        far = np.full(a.shape, 3.0)
-        origins = np.concatenate([np.stack([a, b, -far], 1), np.stack([-far, a, b], 1)]).astype(np.float32)
-        directions = np.repeat([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], side * side, axis=0)
-        target = visibility(Scene.from_gaussians(cloud, device), origins, directions, options=WHOLE)
-
-        positions = cloud.positions + rng.uniform(-0.1, 0.1, (count, 3)).astype(np.float32)
-        opacities = np.full(count, 0.6, np.float32)
-        losses = []
-        for _ in range(200):
-            now = cloud.with_arrays(positions=positions, opacities=opacities)
-            scene = Scene.from_gaussians(now, device)
-            difference = visibility(scene, origins, directions, options=WHOLE) - target
-            losses.append(float(difference @ difference))
-            slope = visibility_gradients(scene, origins, directions, 2.0 * difference, options=WHOLE)
-            # steps of about the inverse curvature: rays per Gaussian times the squared slope of V
-            positions = positions - 0.003 * slope.positions
-            opacities = np.clip(opacities - 0.02 * slope.opacities, 0.0, 0.99)
-        assert losses[-1] < 1e-6 * losses[0]
-        assert np.abs(positions - cloud.positions).max() < 1e-3
-        assert np.abs(opacities - cloud.opacities).max() < 1e-3

@@ -7,7 +7,9 @@ import pytest
 import warp as wp
 from scipy import stats
 from support.estimates import LARGEST_Z, SIGNIFICANCE, require_honest, require_zero_mean, rms
-from support.shapes import cloud_of, disc_points, random_cloud, tiles
+from support.kernel_runs import run_kernel
+from support.shapes import cloud_of, disc_points, random_cloud, tiles, unit
+from support.split_sum import texels_of
 
 from beam_warp import Scene, ambient_occlusion
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -22,10 +24,6 @@ from beam_warp.trace.transmittance import TraceOptions
 from beam_warp.world.environment import EnvironmentMap
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def unit(vectors):
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
 def sky(peak=60.0, height=32, ground=0.05):
@@ -208,15 +206,8 @@ class TestMultipleImportance:
         assert cosine.samples.count + environment.samples.count == 50
         assert environment.begin == cosine.samples.count
         cosines, pdfs = rng.uniform(0.0, 1.0, 500), np.exp(rng.normal(0.0, 6.0, 500))
-        mixed = wp.empty(500, dtype=float, device=device)
-        wp.launch(
-            mixture_kernel,
-            500,
-            inputs=[cosine, wp.array(cosines, dtype=float, device=device), wp.array(pdfs, dtype=float, device=device)],
-            outputs=[mixed],
-            device=device,
-        )
-        weights = (25 / 50 * cosines / np.pi + 25 / 50 * pdfs) / mixed.numpy()
+        (mixed,) = run_kernel(mixture_kernel, 500, [cosine, (cosines, float), (pdfs, float)], [float], device)
+        weights = (25 / 50 * cosines / np.pi + 25 / 50 * pdfs) / mixed
         np.testing.assert_allclose(weights, 1.0, rtol=1e-6)
         assert (cosine.cosine_share, cosine.environment_share) == (0.5, 0.5)
         odd = techniques("mis", "owen", 7)[0]
@@ -231,28 +222,14 @@ class TestMultipleImportance:
         squares = rng.random((40_000, 2)).astype(np.float32)
         directions, pdfs = [], []
         for technique in techniques("mis", "iid", 64):
-            direction = wp.empty(len(squares), dtype=wp.vec3, device=device)
-            pdf = wp.empty(len(squares), dtype=float, device=device)
-            wp.launch(
-                draw_light_kernel,
-                len(squares),
-                inputs=[
-                    technique,
-                    light.distribution,
-                    light.blocks,
-                    wp.empty((0, 0), dtype=float, device=device),
-                    wp.vec3(*normal),
-                    wp.array(squares, dtype=wp.vec2, device=device),
-                ],
-                outputs=[direction, pdf],
-                device=device,
-            )
-            directions.append(direction.numpy())
-            pdfs.append(pdf.numpy())
+            nothing = wp.empty((0, 0), dtype=float, device=device)
+            inputs = [technique, light.distribution, light.blocks, nothing, wp.vec3(*normal), (squares, wp.vec2)]
+            direction, pdf = run_kernel(draw_light_kernel, len(squares), inputs, (wp.vec3, float), device)
+            directions.append(direction)
+            pdfs.append(pdf)
         directions = np.concatenate(directions)
         height, width = environment.height, environment.width
-        row = np.minimum((np.arccos(np.clip(directions[:, 2], -1, 1)) / np.pi * height).astype(int), height - 1)
-        column = ((0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi)) * width).astype(int) % width
+        row, column = texels_of(directions, height)
         counts = np.bincount(row * width + column, minlength=height * width).astype(float)
         # expected: environment's part exact, the cosine's by 16 x 16 midpoints a texel
         fine = EnvironmentMap.constant((1.0, 1.0, 1.0), height=16 * height)
@@ -301,7 +278,7 @@ class TestUnshadowed:
         environment, normals = sky(peak, height), unit(rng.normal(size=(500, 3)))
         out = wp.empty(500, dtype=wp.vec3, device=device)
         at = wp.array(normals, dtype=wp.vec3, device=device)
-        launch_sum_unshadowed(light_moments(environment, wp.get_device(device)), at, out, device)
+        launch_sum_unshadowed(len(at), light_moments(environment, wp.get_device(device)), at, out, device)
         truth = exact_unshadowed(environment, normals)
         # the oracle takes fine texels for points: (pi / 256)^2 / 12 of the sun
         assert (np.abs(out.numpy() - truth) <= horizon_error(environment, normals) + 1.3e-5 * truth.max()).all()
@@ -312,7 +289,7 @@ class TestUnshadowed:
         out = wp.empty(500, dtype=wp.vec3, device=device)
         at = wp.array(normals, dtype=wp.vec3, device=device)
         moments = light_moments(EnvironmentMap.constant((1.0, 2.0, 0.5)), wp.get_device(device))
-        launch_sum_unshadowed(moments, at, out, device)
+        launch_sum_unshadowed(len(at), moments, at, out, device)
         relative = out.numpy() / [1.0, 2.0, 0.5] - 1.0
         assert np.abs(relative).max() < 8e-4 / 3.0
         assert abs(relative.mean()) < 8e-4 / 30.0

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from support.estimates import require_honest, require_zero_mean
-from support.shapes import random_cloud, random_rays
+from support.shapes import aligned, random_cloud, random_rays, unit
+from support.shapes import along_x as rays_along_x
 
-from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
+from beam_warp import Scene, ambient_occlusion, visibility
 from beam_warp.errors import InvalidArrayError
 from beam_warp.trace.first_surface import closest_surface
 from beam_warp.trace.gradients import visibility_gradients
@@ -33,26 +34,19 @@ def quad(half, *, x=0.0, center=(0.0, 0.0)):
 
 
 def on_x(positions, opacities, scale=0.05):
-    count = len(positions)
-    return GaussianCloud(
-        positions=np.outer(positions, [1.0, 0.0, 0.0]).reshape(-1, 3),
-        orientations=np.tile([0, 0, 0, 1.0], (count, 1)),
-        scales=np.full((count, 3), scale),
-        opacities=opacities,
-        normals=np.tile([-1.0, 0.0, 0.0], (count, 1)),
-    )
+    places = np.outer(positions, [1.0, 0.0, 0.0]).reshape(-1, 3)
+    return aligned(places, opacities, scale, normals=np.tile([-1.0, 0.0, 0.0], (len(places), 1)))
 
 
-def along_x(x=-2.0, count=1):
-    return np.tile([[x, 0.1, 0.0]], (count, 1)), np.tile([[1.0, 0.0, 0.0]], (count, 1))
+def along_x(count=1):
+    return rays_along_x(0.1, count=count)
 
 
 class TestVisibility:
     @pytest.mark.parametrize("options", RULES, ids=str)
     def test_a_quad_blocks_what_passes_through_it(self, device, rng, options):
         cloud = random_cloud(rng, 100, scale=(-3.0, 0.5), opacity=(0.1, 0.9))
-        normals = rng.normal(size=(100, 3))
-        cloud = cloud.with_arrays(normals=normals / np.linalg.norm(normals, axis=1, keepdims=True))
+        cloud = cloud.with_arrays(normals=unit(rng.normal(size=(100, 3))))
         origins, directions = random_rays(rng, 500)
         t = (0.25 - origins[:, 0]) / directions[:, 0]
         at = origins + t[:, None] * directions
@@ -206,37 +200,24 @@ def test_far_from_the_origin(device):
     assert visibility(scene, origins, directions, t_max=1.9) == pytest.approx(hit.transmittance, abs=1e-6)
 
 
-class TestRefusals:
-    def refuse(self, match, **changes):
-        mesh = quad(1.0)
-        for name, value in changes.items():
-            setattr(mesh, name, value)
-        with pytest.raises(InvalidArrayError, match=match):
-            Scene.from_gaussians(on_x([0.0], [0.5]), "cpu", mesh=mesh)
-
-    def test_no_faces(self):
-        self.refuse("mesh.faces must hold at least one triangle, got none", faces=np.zeros((0, 3), int))
-
-    @pytest.mark.parametrize("bad", [-1, 4, 2**32])
-    def test_indices_out_of_range(self, bad):
-        self.refuse(r"mesh.faces must lie in \[0, 3\]", faces=[[0, 1, 2], [0, 2, bad]])
-
-    @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    def test_vertices_that_are_not_finite(self, bad):
-        vertices = quad(1.0).vertices
-        vertices[2, 1] = bad
-        self.refuse("mesh.vertices must be finite, got NaN or infinity at row 2", vertices=vertices)
-
-    def test_quads(self):
-        self.refuse(r"mesh.faces must have shape \(N, 3\), got \(1, 4\)", faces=[[0, 1, 2, 3]])
-
-    def test_no_vertices(self):
-        self.refuse(r"mesh\.faces must lie in", vertices=np.zeros((0, 3)))
-
-    def test_something_else(self):
-        with pytest.raises(InvalidArrayError, match="mesh must have vertices and faces, got object without vertices"):
-            Scene.from_gaussians(on_x([0.0], [0.5]), "cpu", mesh=object())
-        with pytest.raises(
-            InvalidArrayError, match="mesh must have vertices and faces, got SimpleNamespace without faces"
-        ):
-            Scene.from_gaussians(on_x([0.0], [0.5]), "cpu", mesh=SimpleNamespace(vertices=np.zeros((3, 3))))
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"faces": np.zeros((0, 3), int)}, "mesh.faces must hold at least one triangle, got none"),
+        *(({"faces": [[0, 1, 2], [0, 2, bad]]}, r"mesh.faces must lie in \[0, 3\]") for bad in (-1, 4, 2**32)),
+        *(
+            (
+                {"vertices": [[0, 0, 0], [0, 1, 0], [0, bad, 1]]},
+                "mesh.vertices must be finite, got NaN or infinity at row 2",
+            )
+            for bad in (np.nan, np.inf)
+        ),
+        ({"faces": [[0, 1, 2, 3]]}, r"mesh.faces must have shape \(N, 3\), got \(1, 4\)"),
+        ({"vertices": np.zeros((0, 3))}, r"mesh\.faces must lie in"),
+        ({"faces": None}, "mesh must have vertices and faces, got SimpleNamespace without faces"),
+        ({"vertices": None}, "mesh must have vertices and faces, got SimpleNamespace without vertices"),
+    ],
+)
+def test_bad_meshes_are_refused(changes, match):
+    with pytest.raises(InvalidArrayError, match=match):
+        Scene.from_gaussians(on_x([0.0], [0.5]), "cpu", mesh=SimpleNamespace(**vars(quad(1.0)) | changes))

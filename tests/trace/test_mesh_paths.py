@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from support.shapes import unit
 
 from beam_warp.trace.mesh_paths import TracedMesh, outgoing_radiance, trace_channels, trace_radiance
 from beam_warp.world.camera import Camera
@@ -122,8 +123,7 @@ def test_outgoing_radiance_is_what_a_camera_sees(device):
     traced = TracedMesh.from_mesh(mesh, device=device)
     faces = np.arange(0, len(mesh.faces), 40)
     weights = np.full((len(faces), 3), 1.0 / 3.0)
-    normals = mesh.interpolate(mesh.normals, faces, weights)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(mesh.interpolate(mesh.normals, faces, weights))
     light = EnvironmentMap.constant((1.0, 2.0, 0.5))
     out = outgoing_radiance(traced, faces, weights, normals[:, None], light, sample_count=256)
     # open diffuse surface: (1 - E) rho + E with E near 0.04, in proportion to the light

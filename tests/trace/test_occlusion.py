@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from support.estimates import require_honest, require_zero_mean, rms
-from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles
+from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles, unit
 
 from beam_warp import Scene, ambient_occlusion
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -84,8 +84,7 @@ def cluttered(device):
     rng = np.random.default_rng(20260)
     cloud = random_cloud(rng, 800, scale=(-2.5, 0.4), opacity=(0.3, 1.0))
     scene = Scene.from_gaussians(cloud, device)
-    n = rng.normal(size=(300, 3))
-    n = (n / np.linalg.norm(n, axis=1, keepdims=True)).astype(np.float32)
+    n = unit(rng.normal(size=(300, 3)))
     points = cloud.positions[:300]
     truth = ambient_occlusion(scene, points, n, sample_count=4096, offset=0.1, seed=9).visibility
     return scene, points, n, truth

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import random_cloud
+from support.kernel_runs import run_kernel
+from support.shapes import random_cloud, unit
 
 from beam_warp import Scene, ambient_occlusion, irradiance
 from beam_warp.device.arrays import upload
@@ -34,9 +35,8 @@ def surroundings():
     """Soft Gaussians, points in their midst in no order, and unit normals."""
     rng = np.random.default_rng(8)
     cloud = random_cloud(rng, 500, scale=(-2.5, 0.4), opacity=(0.3, 1.0))
-    normals = rng.normal(size=(POINTS, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return cloud, rng.uniform(-1, 1, (POINTS, 3)).astype(np.float32), normals.astype(np.float32)
+    normals = unit(rng.normal(size=(POINTS, 3)))
+    return cloud, rng.uniform(-1, 1, (POINTS, 3)).astype(np.float32), normals
 
 
 def set_rays_at_once(monkeypatch, count):
@@ -119,24 +119,10 @@ class TestOrderDoesNotMatter:
             scene, points, normals, sample_count=sample_count, sampler=sampler, options=options, seed=3, frame=2
         )
         at, up = (upload(array, wp.vec3, scene.device) for array in (points, normals))
-        traced = wp.empty((POINTS, sample_count), dtype=float, device=scene.device)
-        wp.launch(
-            trace_one_by_one_kernel,
-            (POINTS, sample_count),
-            inputs=[
-                scene.occluders,
-                options.settings(scene),
-                at,
-                up,
-                ray_offsets(scene, at, up, "auto"),
-                sample_set(sampler, sample_count),
-                wp.uint32(3),
-                wp.uint32(2),
-            ],
-            outputs=[traced],
-            device=scene.device,
-        )
-        mean = traced.numpy().astype(np.float64).mean(axis=1)
+        offsets, samples = ray_offsets(scene, at, up, "auto"), sample_set(sampler, sample_count)
+        inputs = [scene.occluders, options.settings(scene), at, up, offsets, samples, wp.uint32(3), wp.uint32(2)]
+        (traced,) = run_kernel(trace_one_by_one_kernel, (POINTS, sample_count), inputs, [float], scene.device)
+        mean = traced.astype(np.float64).mean(axis=1)
         # Transmittances of both forms lie within 2e-4 of the exact product (early stop and rounding). A Bernoulli
         # sample flips where a probability rounds across the random number: about one hit in 1e6.
         allowed = 2e-4 if acceptance == "product" else 1.01 / sample_count

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import random_cloud, random_rays
+from support.shapes import aligned, along_x, random_cloud, random_rays
 
 from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
@@ -18,10 +18,6 @@ VISIBILITY_TOLERANCE = 2e-4
 
 def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), position=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0)):
     return GaussianCloud(positions=[position], orientations=[orientation], scales=[scales], opacities=[opacity])
-
-
-def along_x(y=0.0, z=0.0, x=-2.0):
-    return np.array([[x, y, z]]), np.array([[1.0, 0.0, 0.0]])
 
 
 class TestClosedForm:
@@ -55,12 +51,7 @@ class TestClosedForm:
         assert visibility(scene, *along_x(), t_max=2.001) == pytest.approx(0.5, abs=1e-6)
 
     def test_product_over_gaussians(self, device):
-        cloud = GaussianCloud(
-            positions=[[0, 0, 0], [1, 0, 0], [2, 0, 0]],
-            orientations=np.tile([0, 0, 0, 1.0], (3, 1)),
-            scales=np.full((3, 3), 0.1),
-            opacities=[0.1, 0.2, 0.3],
-        )
+        cloud = aligned([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [0.1, 0.2, 0.3])
         assert visibility(Scene.from_gaussians(cloud, device), *along_x()) == pytest.approx(0.9 * 0.8 * 0.7, abs=1e-6)
 
     def test_rotated_needle_is_hit_across_and_missed_beside(self, device):
@@ -84,12 +75,7 @@ class TestAgainstBruteForce:
 
     def test_axis_parallel_rays_on_box_planes_are_not_lost(self, device):
         """Warp's slab test computes 0 * inf there; without the direction floor 32 of 36 such rays are lost."""
-        cloud = GaussianCloud(
-            positions=[[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]],
-            orientations=np.tile([0, 0, 0, 1.0], (2, 1)),
-            scales=np.full((2, 3), 0.5),
-            opacities=[0.9, 0.9],
-        )
+        cloud = aligned([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [0.9, 0.9], 0.5)
         scene = Scene.from_gaussians(cloud, device)
         edge = 0.5 * np.sqrt(2.0 * np.log(255.0 * 0.9)) * 0.999
         for y in (-edge, 0.0, edge):
@@ -109,12 +95,7 @@ class TestAgainstBruteForce:
         assert np.abs(result - expected).max() <= VISIBILITY_TOLERANCE
 
     def test_coincident_gaussians(self, device):
-        cloud = GaussianCloud(
-            positions=np.zeros((10_000, 3)),
-            orientations=np.tile([0, 0, 0, 1.0], (10_000, 1)),
-            scales=np.full((10_000, 3), 0.1),
-            opacities=np.full(10_000, 1.0 / 250.0),
-        )
+        cloud = aligned(np.zeros((10_000, 3)), 1.0 / 250.0)
         scene = Scene.from_gaussians(cloud, device)
         assert visibility(scene, *along_x())[0] < 1e-4  # 0.996^10000 = 4e-18
         assert visibility(scene, *along_x(z=1.0))[0] == 1.0
@@ -165,12 +146,7 @@ class TestProperties:
 
 class TestScene:
     def test_invisible_gaussians_are_dropped_and_reported(self, device):
-        cloud = GaussianCloud(
-            positions=np.zeros((4, 3)),
-            orientations=np.tile([0, 0, 0, 1.0], (4, 1)),
-            scales=np.full((4, 3), 0.1),
-            opacities=[0.0, 1.0 / 255.0, 0.5, 1.0],
-        )
+        cloud = aligned(np.zeros((4, 3)), [0.0, 1.0 / 255.0, 0.5, 1.0])
         scene = Scene.from_gaussians(cloud, device)
         assert (scene.report.traced, scene.report.dropped) == (2, 2)
 
@@ -212,23 +188,18 @@ class TestRefusals:
     def scene(self, rng):
         return Scene.from_gaussians(random_cloud(rng, 5), "cpu")
 
-    def test_shape(self, scene):
-        with pytest.raises(InvalidArrayError, match=r"origins must have shape \(N, 3\), got \(3, 4\)"):
-            visibility(scene, np.zeros((3, 4)), np.zeros((3, 4)))
-
-    def test_not_finite(self, scene):
-        origins, directions = np.zeros((3, 3)), np.tile([1.0, 0, 0], (3, 1))
-        origins[1, 2] = np.nan
-        with pytest.raises(InvalidArrayError, match="origins must be finite, got NaN or infinity at row 1"):
+    @pytest.mark.parametrize(
+        ("origins", "directions", "match"),
+        [
+            (np.zeros((3, 4)), np.zeros((3, 4)), r"origins must have shape \(N, 3\), got \(3, 4\)"),
+            ([[0, 0, 0], [0, 0, np.nan]], [[1.0, 0, 0]] * 2, "origins must be finite, got NaN or infinity at row 1"),
+            ([[0, 0, 0]], [[2.0, 0, 0]], r"directions must have unit length, got \|v\| = 2 at row 0"),
+            ([[0, 0, 0]] * 2, [[1.0, 0, 0]], r"directions must have as many rows as origins \(2\), got 1"),
+        ],
+    )
+    def test_rays(self, scene, origins, directions, match):
+        with pytest.raises(InvalidArrayError, match=match):
             visibility(scene, origins, directions)
-
-    def test_not_unit(self, scene):
-        with pytest.raises(InvalidArrayError, match=r"directions must have unit length, got \|v\| = 2 at row 0"):
-            visibility(scene, np.zeros((1, 3)), [[2.0, 0, 0]])
-
-    def test_lengths_differ(self, scene):
-        with pytest.raises(InvalidArrayError, match=r"directions must have as many rows as origins \(2\), got 1"):
-            visibility(scene, np.zeros((2, 3)), [[1.0, 0, 0]])
 
     @pytest.mark.parametrize("t_max", [-1.0, np.nan])
     def test_reach(self, scene, t_max):
@@ -254,12 +225,7 @@ class TestReach:
 def test_a_stop_returns_the_product_so_far(device):
     """Two hundred Gaussians of opacity 0.8 in a row: 0.2^6 is the first product below 1e-4."""
     count = 200
-    cloud = GaussianCloud(
-        positions=np.stack([np.arange(count) * 0.1, np.zeros(count), np.zeros(count)], axis=1),
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-        scales=np.full((count, 3), 0.02),
-        opacities=np.full(count, 0.8),
-    )
+    cloud = aligned(np.stack([np.arange(count) * 0.1, np.zeros(count), np.zeros(count)], axis=1), 0.8, 0.02)
     scene = Scene.from_gaussians(cloud, device)
     assert visibility(scene, *along_x()) == pytest.approx(0.2**6, rel=1e-5)
     assert visibility(scene, *along_x(), options=TraceOptions(stop=0.0)) == pytest.approx(0.0, abs=1e-38)

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.latlong import lookup
-from reference.light_sampling import product_to_square, square_to_product_pdf
+from reference.light_sampling import cosine_hemisphere_to_square, product_to_square, square_to_product_pdf
 from scipy import stats
 from scipy.stats import qmc
+from support.estimates import SIGNIFICANCE
+from support.kernel_runs import run_kernel
+from support.split_sum import sunny_sky, texels_of
 
 from beam_warp.kernels.common.sampling import (
     SampleSet,
-    cosine_hemisphere_to_square,
     draw_square,
     owen_sobol_x,
     owen_sobol_y,
@@ -34,9 +36,6 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.light.sampled import suited_height
 from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
 from beam_warp.world.environment import EnvironmentMap
-
-SIGNIFICANCE = 1e-4
-"""Of each statistical test here; seeds are fixed, so a failure is a change of code, not bad luck."""
 
 
 @wp.kernel
@@ -113,45 +112,25 @@ def product_pdf_kernel(
 
 def owen_points(device, points, count, seed=7):
     bits = count.bit_length() - 1
-    out = wp.empty((points, count), dtype=wp.vec2, device=device)
-    cells = wp.empty((points, count), dtype=int, device=device)
-    wp.launch(
-        owen_kernel,
-        (points, count),
-        inputs=[wp.uint32(seed), count, wp.vec2i(bits // 2, bits - bits // 2)],
-        outputs=[out, cells],
-        device=device,
-    )
-    return out.numpy(), cells.numpy()
+    inputs = [wp.uint32(seed), count, wp.vec2i(bits // 2, bits - bits // 2)]
+    return run_kernel(owen_kernel, (points, count), inputs, (wp.vec2, int), device)
 
 
 def draw_sets(device, sampler, points, count):
-    out = wp.empty((points, count), dtype=wp.vec2, device=device)
-    slots = wp.empty((points, count), dtype=int, device=device)
-    wp.launch(
-        draw_square_kernel, (points, count), inputs=[sample_set(sampler, count)], outputs=[out, slots], device=device
-    )
-    return out.numpy().astype(np.float64), slots.numpy()
+    inputs = [sample_set(sampler, count)]
+    squares, slots = run_kernel(draw_square_kernel, (points, count), inputs, (wp.vec2, int), device)
+    return squares.astype(np.float64), slots
 
 
 def variance_of_sums(device, terms, paired):
-    out = wp.empty(len(terms), dtype=float, device=device)
-    wp.launch(
-        spread_kernel,
-        len(terms),
-        inputs=[wp.array(terms, dtype=float, device=device), int(paired)],
-        outputs=[out],
-        device=device,
-    )
-    return out.numpy()
+    return run_kernel(spread_kernel, len(terms), [(terms, float), int(paired)], [float], device)[0]
 
 
 def test_second_dimension_is_sobols(device):
-    out = wp.empty(256, dtype=wp.uint32, device=device)
-    wp.launch(plain_sobol_kernel, 256, outputs=[out], device=device)
+    (found,) = run_kernel(plain_sobol_kernel, 256, [], [wp.uint32], device)
     expected = qmc.Sobol(2, scramble=False, bits=32).random(256)[:, 1] * 2.0**32
     index = np.arange(256)
-    assert np.array_equal(out.numpy()[index ^ (index >> 1)], expected.astype(np.uint32))  # scipy walks in Gray code
+    assert np.array_equal(found[index ^ (index >> 1)], expected.astype(np.uint32))  # scipy walks in Gray code
 
 
 @pytest.mark.parametrize("count", [2, 8, 64, 128])
@@ -254,18 +233,9 @@ def test_scrambled_estimates_are_unbiased_and_beat_independent_samples(device):
 
 def test_cosine_map_inverts_and_has_its_density(device, rng):
     squares = rng.random((20_000, 2)).astype(np.float32)
-    back = wp.empty(len(squares), dtype=wp.vec2, device=device)
-    directions = wp.empty(len(squares), dtype=wp.vec3, device=device)
-    wp.launch(
-        cosine_round_trip_kernel,
-        len(squares),
-        inputs=[wp.array(squares, dtype=wp.vec2, device=device)],
-        outputs=[back, directions],
-        device=device,
-    )
-    d = directions.numpy()
+    back, d = run_kernel(cosine_round_trip_kernel, len(squares), [(squares, wp.vec2)], (wp.vec2, wp.vec3), device)
     # the square's corners map to the rim, where the inverse divides float32 noise by the radius: 1e-5
-    assert np.abs(back.numpy() - squares).max() < 1e-5
+    assert np.abs(back - squares).max() < 1e-5
     assert np.abs(np.linalg.norm(d, axis=1) - 1.0).max() < 1e-6
     # cos^2 and azimuth are uniform and independent under the cosine density
     phi = np.arctan2(d[:, 1], d[:, 0]) / (2.0 * np.pi) + 0.5
@@ -274,28 +244,13 @@ def test_cosine_map_inverts_and_has_its_density(device, rng):
 
 
 def test_cosine_density_integrates_to_one(device):
-    """By midpoints of a fine lat-long grid, which the equator does not cut: exact to their second order."""
+    """A sum over midpoints of a fine lat-long grid, which the equator does not cut: exact to second order."""
     sphere = EnvironmentMap.constant((1.0, 1.0, 1.0), height=256)
     directions = sphere.directions().reshape(-1, 3).astype(np.float32)
-    out = wp.empty(len(directions), dtype=float, device=device)
-    wp.launch(
-        cosine_pdf_kernel,
-        len(directions),
-        inputs=[wp.array(directions, dtype=wp.vec3, device=device)],
-        outputs=[out],
-        device=device,
-    )
-    density = out.numpy().astype(np.float64)
+    (density,) = run_kernel(cosine_pdf_kernel, len(directions), [(directions, wp.vec3)], [float], device)
+    density = density.astype(np.float64)
     assert (density * sphere.solid_angles().ravel()).sum() == pytest.approx(1.0, abs=(np.pi / 256) ** 2)
     assert not density[directions[:, 2] < 0.0].any()
-
-
-def sunny_sky(height=64):
-    """A dim sky, a hot sun of one texel, and a black ground."""
-    radiance = np.full((height, 2 * height, 3), 0.5, np.float32)
-    radiance[height // 2 :] = 0.0
-    radiance[height // 6, height // 3] = (4000.0, 3000.0, 2000.0)
-    return EnvironmentMap(radiance)
 
 
 class TestProduct:
@@ -305,34 +260,18 @@ class TestProduct:
         blocks = PreparedEnvironment(environment, device).blocks
         normals = wp.array(self.normal[None], dtype=wp.vec3, device=device)
         cumulative = wp.empty((1, 512), dtype=float, device=device)
-        launch_accumulate_block_weights(blocks, normals, cumulative, device)
+        launch_accumulate_block_weights(len(normals), blocks, normals, cumulative, device)
         return blocks, cumulative
 
     def draw(self, device, environment, squares):
         blocks, cumulative = self.prepare(device, environment)
-        direction = wp.empty(len(squares), dtype=wp.vec3, device=device)
-        radiance = wp.empty(len(squares), dtype=wp.vec3, device=device)
-        back = wp.empty(len(squares), dtype=wp.vec2, device=device)
-        wp.launch(
-            product_kernel,
-            len(squares),
-            inputs=[blocks, cumulative, wp.array(squares, dtype=wp.vec2, device=device)],
-            outputs=[direction, radiance, back],
-            device=device,
-        )
-        return direction.numpy(), radiance.numpy(), back.numpy()
+        inputs = [blocks, cumulative, (squares, wp.vec2)]
+        return run_kernel(product_kernel, len(squares), inputs, (wp.vec3, wp.vec3, wp.vec2), device)
 
     def density(self, device, environment):
         blocks, cumulative = self.prepare(device, environment)
-        out = wp.empty((environment.height, environment.width), dtype=float, device=device)
-        wp.launch(
-            product_pdf_kernel,
-            out.shape,
-            inputs=[blocks, cumulative, wp.array(environment.directions(), dtype=wp.vec3, device=device)],
-            outputs=[out],
-            device=device,
-        )
-        return out.numpy()
+        inputs = [blocks, cumulative, (environment.directions(), wp.vec3)]
+        return run_kernel(product_pdf_kernel, (environment.height, environment.width), inputs, [float], device)[0]
 
     def test_density_integrates_to_one(self, device):
         environment = sunny_sky()
@@ -349,10 +288,7 @@ class TestProduct:
         squares = rng.random((40_000, 2)).astype(np.float32)
         directions, _, _ = self.draw(device, environment, squares)
         expected = (self.density(device, environment).astype(np.float64) * environment.solid_angles()).ravel()
-        u = 0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2.0 * np.pi)
-        v = np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi
-        row = np.minimum((v * 32).astype(int), 31)
-        column = np.minimum((u * 64).astype(int), 63)
+        row, column = texels_of(directions, 32)
         counts = np.bincount(row * 64 + column, minlength=32 * 64)
         # directions within float rounding of a texel's edge may land next door: texels that expect nothing stay out
         order = np.argsort(expected)[::-1]

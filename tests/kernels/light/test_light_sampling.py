@@ -5,8 +5,10 @@ import pytest
 import warp as wp
 from reference.light_sampling import environment_to_square, visible_reflection_to_square
 from scipy import stats
+from support.estimates import SIGNIFICANCE
+from support.kernel_runs import run_kernel
+from support.split_sum import texels_of
 
-from beam_warp.device.arrays import upload
 from beam_warp.kernels.light.environment_sampling import (
     EnvironmentDistribution,
     square_to_environment,
@@ -15,8 +17,6 @@ from beam_warp.kernels.light.environment_sampling import (
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.light.sampled import environment_distribution
 from beam_warp.world.environment import EnvironmentMap
-
-SIGNIFICANCE = 1e-4
 
 
 @wp.kernel
@@ -57,26 +57,17 @@ def sky(height=32):
     return EnvironmentMap(radiance.astype(np.float32))
 
 
-def cells(directions, height):
-    """Texel of each direction."""
-    u = 0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2.0 * np.pi)
-    v = np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi
-    return np.minimum((v * height).astype(int), height - 1), np.minimum((u * 2 * height).astype(int), 2 * height - 1)
+def reflect(device, view, alpha, squares):
+    """Directions drawn at points of the square, and the points that they go back to."""
+    inputs = [wp.vec3(*view), alpha, (squares, wp.vec2)]
+    return run_kernel(reflection_kernel, len(squares), inputs, (wp.vec3, wp.vec2), device)
 
 
 class TestEnvironment:
     def draw(self, device, environment, squares):
         distribution = environment_distribution(environment, wp.get_device(device))
-        direction = wp.empty(len(squares), dtype=wp.vec3, device=device)
-        back, pdf = (wp.empty(len(squares), dtype=wp.vec2, device=device) for _ in range(2))
-        wp.launch(
-            environment_kernel,
-            len(squares),
-            inputs=[distribution, upload(squares, wp.vec2, device)],
-            outputs=[direction, back, pdf],
-            device=device,
-        )
-        return direction.numpy(), back.numpy(), pdf.numpy()
+        inputs = [distribution, (squares, wp.vec2)]
+        return run_kernel(environment_kernel, len(squares), inputs, (wp.vec3, wp.vec2, wp.vec2), device)
 
     def test_samples_have_the_density_and_it_integrates_to_one(self, device, rng):
         environment = sky()
@@ -84,7 +75,7 @@ class TestEnvironment:
         expected = distribution.density.numpy().astype(np.float64) * environment.solid_angles()
         assert expected.sum() == pytest.approx(1.0, abs=1e-5)
         directions, _, _ = self.draw(device, environment, rng.random((40_000, 2)).astype(np.float32))
-        row, column = cells(directions, 32)
+        row, column = texels_of(directions, 32)
         observed = np.zeros((32, 64))
         np.add.at(observed, (row, column), 1)
         # rows of texels and the sun apart: texels alone expect too few each
@@ -121,17 +112,7 @@ class TestVisibleNormals:
     @pytest.mark.parametrize(("n_dot_v", "alpha"), [(1.0, 0.3), (0.5, 0.25), (0.2, 0.6), (0.7, 1.0)])
     def test_density_of_samples(self, device, rng, n_dot_v, alpha):
         view = np.array([np.sqrt(1.0 - n_dot_v**2), 0.0, n_dot_v])
-        squares = rng.random((40_000, 2)).astype(np.float32)
-        light = wp.empty(len(squares), dtype=wp.vec3, device=device)
-        back = wp.empty(len(squares), dtype=wp.vec2, device=device)
-        wp.launch(
-            reflection_kernel,
-            len(squares),
-            inputs=[wp.vec3(*view), alpha, upload(squares, wp.vec2, device)],
-            outputs=[light, back],
-            device=device,
-        )
-        drawn = light.numpy()
+        drawn, _ = reflect(device, view, alpha, rng.random((40_000, 2)).astype(np.float32))
         # expected mass of 24 x 24 cells in (z, azimuth), each by 12 x 12 midpoints
         fine = 24 * 12
         z = -1.0 + 2.0 * (np.arange(fine) + 0.5) / fine
@@ -139,15 +120,9 @@ class TestVisibleNormals:
         zz, pp = np.meshgrid(z, phi, indexing="ij")
         radius = np.sqrt(1.0 - zz**2)
         grid = np.stack([radius * np.cos(pp), radius * np.sin(pp), zz], axis=-1).reshape(-1, 3).astype(np.float32)
-        density = wp.empty(len(grid), dtype=float, device=device)
-        wp.launch(
-            reflection_pdf_kernel,
-            len(grid),
-            inputs=[wp.vec3(*view), alpha, upload(grid, wp.vec3, device)],
-            outputs=[density],
-            device=device,
-        )
-        mass = density.numpy().astype(np.float64).reshape(24, 12, 24, 12).sum((1, 3)) * 4.0 * np.pi / fine**2
+        inputs = [wp.vec3(*view), alpha, (grid, wp.vec3)]
+        (density,) = run_kernel(reflection_pdf_kernel, len(grid), inputs, [float], device)
+        mass = density.astype(np.float64).reshape(24, 12, 24, 12).sum((1, 3)) * 4.0 * np.pi / fine**2
         assert mass.sum() == pytest.approx(1.0, abs=5e-3)  # midpoints across the horizon's kink and narrow lobes
         counts = np.histogram2d(
             drawn[:, 2], np.arctan2(drawn[:, 1], drawn[:, 0]), bins=24, range=[[-1, 1], [-np.pi, np.pi]]
@@ -164,15 +139,7 @@ class TestVisibleNormals:
     )
     def test_inverse(self, device, rng, n_dot_v, alpha):
         squares = rng.uniform(0.02, 0.98, (4000, 2)).astype(np.float32)
-        light = wp.empty(len(squares), dtype=wp.vec3, device=device)
-        back = wp.empty(len(squares), dtype=wp.vec2, device=device)
-        wp.launch(
-            reflection_kernel,
-            len(squares),
-            inputs=[wp.vec3(np.sqrt(1.0 - n_dot_v**2), 0.0, n_dot_v), alpha, upload(squares, wp.vec2, device)],
-            outputs=[light, back],
-            device=device,
-        )
+        _, back = reflect(device, (np.sqrt(1.0 - n_dot_v**2), 0.0, n_dot_v), alpha, squares)
         # Half vectors come back from sums of unit vectors, with errors of 1e-7 that dividing by alpha stretches again;
         # azimuth divides by the cap's radius, 0.2 and more within these squares. A tenfold margin.
-        assert np.abs(back.numpy() - squares).max() < 10.0 * 1.2e-7 / (0.2 * min(alpha, n_dot_v)) + 1e-5
+        assert np.abs(back - squares).max() < 10.0 * 1.2e-7 / (0.2 * min(alpha, n_dot_v)) + 1e-5

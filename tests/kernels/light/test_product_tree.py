@@ -5,6 +5,8 @@ import pytest
 import warp as wp
 from scipy import stats
 from support.estimates import LARGEST_Z, SIGNIFICANCE
+from support.kernel_runs import run_kernel
+from support.split_sum import sunny_sky, texels_of
 
 from beam_warp.kernels.light.environment_sampling import radiance_over_pdf
 from beam_warp.kernels.light.product_tree import (
@@ -42,31 +44,17 @@ def density_kernel(tree: ProductTree, normal: wp.vec3, directions: wp.array[wp.v
     out[i] = square_to_product_tree_pdf(tree, normal, total_weight(tree, normal), directions[i])
 
 
-def sunny_sky(height=64):
-    """A dim sky, a hot sun of one texel, and a black ground."""
-    radiance = np.full((height, 2 * height, 3), 0.5, np.float32)
-    radiance[height // 2 :] = 0.0
-    radiance[height // 6, height // 3] = (4000.0, 3000.0, 2000.0)
-    return EnvironmentMap(radiance)
-
-
 def draw(device, sky, normal, count, seed=0):
     squares = np.random.default_rng(seed).uniform(size=(count, 2)).astype(np.float32)
-    outs = [wp.empty(count, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, wp.vec2)]
-    tree = PreparedEnvironment(sky, device).product_tree
-    squares_array = wp.array(squares, dtype=wp.vec2, device=device)
-    wp.launch(draw_kernel, count, inputs=[tree, wp.vec3(*normal.tolist()), squares_array], outputs=outs, device=device)
-    return tuple(out.numpy() for out in outs)
+    inputs = [PreparedEnvironment(sky, device).product_tree, wp.vec3(*normal.tolist()), (squares, wp.vec2)]
+    return run_kernel(draw_kernel, count, inputs, (wp.vec3, wp.vec3, wp.vec2), device)
 
 
 def density(device, sky, normal):
-    directions = wp.array(sky.directions().reshape(-1, 3), dtype=wp.vec3, device=device)
-    out = wp.empty(len(directions), dtype=float, device=device)
-    tree = PreparedEnvironment(sky, device).product_tree
-    wp.launch(
-        density_kernel, len(out), inputs=[tree, wp.vec3(*normal.tolist()), directions], outputs=[out], device=device
-    )
-    return out.numpy().reshape(sky.height, sky.width).astype(np.float64)
+    directions = sky.directions().reshape(-1, 3)
+    inputs = [PreparedEnvironment(sky, device).product_tree, wp.vec3(*normal.tolist()), (directions, wp.vec3)]
+    (found,) = run_kernel(density_kernel, len(directions), inputs, [float], device)
+    return found.reshape(sky.height, sky.width).astype(np.float64)
 
 
 @pytest.mark.parametrize("normal", NORMALS[:3])
@@ -92,9 +80,7 @@ def test_draws_follow_the_density(device):
     count = 20_000
     direction, _, pdfs = draw(device, sky, NORMALS[0], count)
     drawn = pdfs[:, 0] > 0.0
-    u = (0.5 - np.arctan2(direction[drawn, 1], direction[drawn, 0]) / (2.0 * np.pi)) % 1.0
-    v = np.arccos(np.clip(direction[drawn, 2], -1.0, 1.0)) / np.pi
-    rows, columns = np.minimum((v * 16).astype(int), 15), np.minimum((u * 32).astype(int), 31)
+    rows, columns = texels_of(direction[drawn], 16)
     counts = np.bincount(rows * 32 + columns, minlength=512)
     share = (density(device, sky, NORMALS[0]) * sky.solid_angles()).reshape(16, 2, 32, 2).sum(axis=(1, 3)).reshape(-1)
     expected = share * count

@@ -138,7 +138,7 @@ class TestShade:
         [(1.0, 0.2, 0.002), (1.0, 0.5, 0.01), (1.0, 1.0, 0.02), (0.5, 0.2, 0.005), (0.5, 0.5, 0.01), (0.2, 0.3, 0.03)],
     )
     def test_against_the_full_rendering_equation(self, device, n_dot_v, roughness, bound):
-        """On smooth light the split sum may differ by the shift of the lobe's mean direction, times the gradient."""
+        """The split sum may be off by the shift of the lobe's mean direction, times the gradient of smooth light."""
         lighting = PreparedEnvironment(smooth_environment(128), device=device)
         base_color = 0.5
         radiance = shade(lighting, **facing_surfaces(n_dot_v, roughness, base_color))[0, 0, 0]
