@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -80,33 +81,33 @@ def stability(args: Stability) -> int:
 
 def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Trace the scenes and the shapes."""
-    from beam_warp.stability.analytic_occlusion import SHAPES, measure_shapes
+    from beam_warp.stability.analytic_occlusion import SHAPES, measure_refinements
     from beam_warp.stability.page import StabilityResult
-    from beam_warp.stability.tracing import run_cases
+    from beam_warp.stability.suite import run_suite
+    from beam_warp.stability.tracing import run_case
     from beam_warp.stability.tracing_cases import CASES
 
     cases = [case for case in CASES if args.large or not case.large]
     return StabilityResult(
-        tuple(run_cases(cases, args.device, progress=lambda done, total: report("cases", done, total))),
-        tuple(measure_shapes(SHAPES, args.device, progress=lambda done, total: report("shapes", done, total))),
+        tuple(run_suite(cases, partial(run_case, device=args.device), partial(report, "cases"))),
+        tuple(run_suite(SHAPES, partial(measure_refinements, device=args.device), partial(report, "shapes"))),
     )
 
 
 def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Reconstruct the captures."""
     from beam_warp.stability.capture_cases import CAPTURE_CASES
-    from beam_warp.stability.captures import run_capture_cases
+    from beam_warp.stability.captures import run_capture_case
     from beam_warp.stability.page import StabilityResult
     from beam_warp.stability.reconstruct import LARGE, QUICK, reconstructing
+    from beam_warp.stability.suite import run_suite
 
     effort = LARGE if args.large else QUICK
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        outcomes = run_capture_cases(
-            reconstructing(effort.steps(args.device), place),
-            effort.studio(place, args.device),
-            CAPTURE_CASES,
-            progress=lambda done, total: report("captures", done, total),
+        reconstruct, studio = reconstructing(effort.steps(args.device), place), effort.studio(place, args.device)
+        outcomes = run_suite(
+            CAPTURE_CASES, lambda case: [run_capture_case(reconstruct, studio, case)], partial(report, "captures")
         )
         return StabilityResult(captures=tuple(outcomes))
 
@@ -114,33 +115,32 @@ def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
 def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Measure materials."""
     from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialStudio
-    from beam_warp.stability.materials import run_material_cases
+    from beam_warp.stability.materials import Bench, run_material_case
     from beam_warp.stability.page import StabilityResult
+    from beam_warp.stability.suite import run_suite
 
-    outcomes = run_material_cases(
-        MaterialStudio(args.device), MATERIAL_CASES, progress=lambda done, total: report("materials", done, total)
-    )
+    bench = Bench(MaterialStudio(args.device))
+    outcomes = run_suite(MATERIAL_CASES, lambda case: [run_material_case(bench, case)], partial(report, "materials"))
     return StabilityResult(materials=tuple(outcomes))
 
 
 def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
     """Render subjects and lights with both renderers."""
     from beam_warp.stability.page import StabilityResult
-    from beam_warp.stability.relighting import RelightingBench, run_relighting_cases
+    from beam_warp.stability.relighting import RelightingBench, run_both_renderers
     from beam_warp.stability.relighting_cases import RELIGHTING_CASES
+    from beam_warp.stability.suite import run_suite
 
-    outcomes = run_relighting_cases(
-        RelightingBench(device=args.device),
-        [case for case in RELIGHTING_CASES if args.large or not case.large],
-        progress=lambda done, total: report("relighting", done, total),
-    )
+    cases = [case for case in RELIGHTING_CASES if args.large or not case.large]
+    run = partial(run_both_renderers, RelightingBench(device=args.device))
+    outcomes = run_suite(cases, run, partial(report, "relighting"))
     return StabilityResult(relighting=tuple(outcomes))
 
 
 def _faults(result: StabilityResult) -> list[str]:
     """Return one line for each bad verdict."""
     named = [
-        *((outcome, f", {outcome.hierarchy}") for outcome in result.outcomes),
+        *((outcome, f", {outcome.hierarchy}") for outcome in result.cases),
         *((outcome, "") for outcome in (*result.captures, *result.materials)),
         *((outcome, f", {outcome.renderer}") for outcome in result.relighting),
     ]
@@ -160,7 +160,7 @@ def _print_tables(result: StabilityResult) -> None:
     """Print a table of every part that was run; how others fail is on the page."""
     from beam_warp.stability import captures, materials, relighting
 
-    if result.outcomes:
+    if result.cases:
         _print_tracing(result)
     if result.captures:
         rows = [(o, captures.cells(o, result.captures)) for o in result.captures]
@@ -196,11 +196,11 @@ def _print_tracing(result: StabilityResult) -> None:
     from beam_warp.stability.page import allowed_by, devices_of
 
     console = Console(width=None if sys.stdout.isatty() else 200)
-    device = ", ".join(devices_of(result.outcomes))
+    device = ", ".join(devices_of(result.cases))
     titles = ("case", "did", "detected", "done", "allowed", "error", "verdict")
     table = Table(*titles, title=f"stress cases on {device}")
-    for name in dict.fromkeys(outcome.case for outcome in result.outcomes):
-        rows = [outcome for outcome in result.outcomes if outcome.case == name]
+    for name in dict.fromkeys(outcome.case for outcome in result.cases):
+        rows = [outcome for outcome in result.cases if outcome.case == name]
         failed = ", ".join(outcome.hierarchy for outcome in rows if not outcome.passed)
         table.add_row(
             name,

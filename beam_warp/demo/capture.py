@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats.qmc import Halton
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
@@ -24,6 +25,7 @@ from beam_warp.demo.figure import Figure, build_figure
 from beam_warp.demo.lights import studio
 from beam_warp.errors import OutputError
 from beam_warp.image.files import write_exr
+from beam_warp.jobs.progress import Progress, no_progress
 from beam_warp.trace.mesh_paths import TracedMesh, trace_channels, trace_radiance
 from beam_warp.world.camera import MAX_SIDE, Camera
 from beam_warp.world.environment import EnvironmentMap
@@ -56,9 +58,6 @@ VISIBILITY_SAMPLES = 4
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
-WriteProgress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
-
 
 @dataclass(frozen=True)
 class DomeCamera:
@@ -86,7 +85,7 @@ def write_demo_capture(
     relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
-    progress: WriteProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Capture:
     """Path trace the demo figure's dance for a dome of cameras and write it as a capture.
 
@@ -123,15 +122,7 @@ def write_demo_capture(
     meshes = [figure.at(frame / period) for frame in range(frame_count)]
     dome = dome_cameras([mesh.vertices for mesh in meshes], camera_count, test_camera_count, size, size)
     return write_capture(
-        folder,
-        meshes,
-        dome,
-        studio(),
-        samples=samples,
-        relit=relit,
-        device=device,
-        seed=seed,
-        progress=progress or _quiet,
+        folder, meshes, dome, studio(), samples=samples, relit=relit, device=device, seed=seed, progress=progress
     )
 
 
@@ -151,14 +142,13 @@ def write_capture(
     relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
-    progress: WriteProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Capture:
     """Path trace meshes, one a frame, for some cameras and write them as a capture; see `write_demo_capture`.
 
     ``surfaces`` are vertices and faces to be written as truth, where they are less dense than the meshes. ``relit`` are
     lights by name, fit for a file name: ``truth/NAME.exr``; what test views show under them is in ``truth/relit_NAME``.
     """
-    report = progress or _quiet
     total = len(meshes) * len(cameras)
     with replacing_folder(folder) as root:
         write_exr(root / "environment.exr", _layers(light.radiance, "RGB"))
@@ -172,13 +162,14 @@ def write_capture(
         records = []
         for frame, mesh in enumerate(meshes):
             traced = TracedMesh.from_mesh(mesh, device=device)
-            surface = (mesh.vertices, mesh.faces) if surfaces is None else surfaces[frame]
-            write_truth_mesh(root / f"truth/mesh_{frame:04d}.npz", *surface)
+            vertices, faces = (mesh.vertices, mesh.faces) if surfaces is None else surfaces[frame]
+            exact = {"vertices": np.asarray(vertices, np.float32), "faces": np.asarray(faces, np.int32)}
+            np.savez_compressed(root / f"truth/mesh_{frame:04d}.npz", **exact)
             for entry in cameras:
                 # A seed of its own for every image: noise that frames share would look like texture.
                 stream = (seed * 1_000_003 + len(records)) % 2**32
                 records.append(_write_view(root, mesh, traced, entry, frame, light, others, samples, stream))
-                report("path trace capture", len(records), total)
+                progress("path trace capture", len(records), total)
         write_transforms(root / "transforms.json", records, FRAMES_PER_SECOND)
     return Capture.read(folder)
 
@@ -210,9 +201,9 @@ def dome_cameras(
         ("train", camera_count, ELEVATIONS, 0.0),
         ("test", test_camera_count, TEST_ELEVATIONS, 180.0 / camera_count),
     ):
-        for index in range(count):
-            elevation = low + (high - low) * _van_der_corput(index)
-            names.append((split, f"{split}_{index:02d}", 360.0 * index / count + shift, elevation))
+        for index, share in enumerate(Halton(1, scramble=False).random(count)[:, 0].tolist()):
+            azimuth = 360.0 * index / count + shift
+            names.append((split, f"{split}_{index:02d}", azimuth, low + (high - low) * share))
     sizes: dict[str, Any] = {"width": width, "height": height, "vertical_fov": VERTICAL_FOV}
     reach = max(
         float(
@@ -224,11 +215,6 @@ def dome_cameras(
         DomeCamera(name, split, Camera.orbit(center, reach, azimuth, elevation, **sizes))
         for split, name, azimuth, elevation in names
     ]
-
-
-def write_truth_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Write the exact surface of a frame as ``vertices`` float32 [m] and ``faces`` int32 of an npz file."""
-    np.savez_compressed(path, vertices=np.asarray(vertices, np.float32), faces=np.asarray(faces, np.int32))
 
 
 def write_transforms(path: Path, records: Sequence[Mapping[str, Any]], frames_per_second: float) -> None:
@@ -378,17 +364,3 @@ class _Window:
 
 def _layers(image: NDArray[np.floating[Any]], names: str, prefix: str = "") -> dict[str, NDArray[np.floating[Any]]]:
     return {prefix + name: image[..., index] for index, name in enumerate(names)}
-
-
-def _van_der_corput(index: int) -> float:
-    """Return the binary digits of a number mirrored at the point: 0, 1/2, 1/4, 3/4, …."""
-    value, weight = 0.0, 0.5
-    while index:
-        value += weight * (index & 1)
-        index >>= 1
-        weight *= 0.5
-    return value
-
-
-def _quiet(stage: str, done: int, total: int) -> None:
-    """Report to nobody."""

@@ -20,7 +20,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
-from beam_warp.jobs.progress import Progress
+from beam_warp.jobs.progress import Progress, StageTimer
 from beam_warp.jobs.report import write_json
 from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult, run
 from beam_warp.materials.options import ESTIMATE
@@ -126,38 +126,38 @@ def demo_from_images(
     Raises:
         OutputError: ``out/capture`` holds another capture than these options make, or a folder cannot be written.
     """
-    laps = _Laps()
-    capture = demo_capture(out, options, device, seed, progress)
-    laps.end("capture")
+    timer = StageTimer(resolve_device(device))
+    with timer("capture"):
+        capture = demo_capture(out, options, device, seed, progress)
     steps = demo_steps(options, device=device, seed=seed)
-    found = reconstruct(
-        capture,
-        out / "reconstruction",
-        steps,
-        progress=lambda stage, done, total, note="": progress(stage, done, total),
-    )
-    laps.end("reconstruct")
-    meshes = [
-        mesh_of_gaussians(cloud, _training_cameras(capture, frame), options=steps.raster, device=device)
-        for frame, cloud in enumerate(found.sequence)
-    ]
-    laps.end("mesh")
-    frames = _score_frames(capture, found, meshes, steps.raster, device)
-    drift = tracking_drift(
-        found.sequence,
-        [read_truth_mesh(capture, frame).vertices for frame in capture.frames],
-        read_truth_mesh(capture, 0).faces,
-        cameras=_training_cameras(capture, 0),
-        device=device,
-    )
-    laps.end("score")
-    result = _decompose(out / "from_images", capture, found.sequence, lights, device, progress)
-    laps.end("decompose")
+    with timer("reconstruct"):
+        found = reconstruct(
+            capture,
+            out / "reconstruction",
+            steps,
+            progress=lambda stage, done, total, note="": progress(stage, done, total),
+        )
+    with timer("mesh"):
+        meshes = [
+            mesh_of_gaussians(cloud, _training_cameras(capture, frame), options=steps.raster, device=device)
+            for frame, cloud in enumerate(found.sequence)
+        ]
+    with timer("score"):
+        frames = _score_frames(capture, found, meshes, steps.raster, device)
+        drift = tracking_drift(
+            found.sequence,
+            [read_truth_mesh(capture, frame).vertices for frame in capture.frames],
+            read_truth_mesh(capture, 0).faces,
+            cameras=_training_cameras(capture, 0),
+            device=device,
+        )
+    with timer("decompose"):
+        result = _decompose(out / "from_images", capture, found.sequence, lights, device, progress)
+    started = time.perf_counter()
     last = capture.frames[-1]
     cameras = [record.camera for record in capture.select(split="test", frames={last})]
-    traced = TracedMesh.from_mesh(
-        demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS)), device=device
-    )
+    figure = demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS))
+    traced = TracedMesh.from_mesh(figure, device=device)
     truths = [DemoTruth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
     renderer = DeferredRenderer(UNSHADOWED, raster=steps.raster, device=device)
     relit = relit_views(result.sequence[last], cameras, lights, renderer, raster=steps.raster, device=device)
@@ -171,8 +171,7 @@ def demo_from_images(
     }
     picture = out / "reconstruction.png"
     _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, renderer, steps.raster, device)
-    laps.end("score relightings")
-    report["seconds"] = laps.seconds
+    report["seconds"] = {**timer.seconds, "score relightings": time.perf_counter() - started}
     return FromImages(picture, result, report)
 
 
@@ -201,33 +200,14 @@ def demo_steps(options: FromImagesOptions, *, device: str | None, seed: int) -> 
     )
 
 
-class _Laps:
-    """Seconds of one stage after the other."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def end(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = now - self._last
-        self._last = now
-
-
 def demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
     """Write ``out/capture``, or read it if it was written with the same options.
 
     Raises:
         OutputError: ``out/capture`` holds another capture, or cannot be written.
     """
-    sizes: dict[str, Any] = {
-        "frame_count": options.frame_count,
-        "camera_count": options.camera_count,
-        "test_camera_count": options.test_camera_count,
-        "size": options.size,
-        "samples": options.samples,
-        "seed": seed,
-    }
+    names = ("frame_count", "camera_count", "test_camera_count", "size", "samples")
+    sizes: dict[str, Any] = {**{name: getattr(options, name) for name in names}, "seed": seed}
     asked = {"code": code_digest(), "device": "cuda" if resolve_device(device).is_cuda else "cpu", **sizes}
     note, folder = out / "capture.json", out / "capture"
     if folder.exists() and _read_json(note) == asked:

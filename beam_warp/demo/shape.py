@@ -177,55 +177,28 @@ def _body() -> list[BodyPart]:
     for name, side in SIDES.items():
         shoulder, elbow, wrist = (mirrored(p, side) for p in (SHOULDER, ELBOW, WRIST))
         hip, knee, ankle = (mirrored(p, side) for p in (HIP, KNEE, ANKLE))
+        forearm, hand, shin, foot = (f"{name} {bone}" for bone in ("forearm", "hand", "shin", "foot"))
         along = (wrist - elbow) / np.linalg.norm(wrist - elbow)
         reach = np.stack([elbow - 0.09, elbow + 0.09, wrist - 0.09, wrist + 0.09])
+        around = partial(sleeve, elbow=elbow, wrist=wrist)
         palm = wrist + 0.055 * along
         thumb = mirrored(np.array([-0.030, -0.050, -0.005]), side)
+        shaft = ankle + np.array((0, 0, -0.01)), ankle + np.array((-0.001 * side, -0.01, 0.185))
+        cuff = ankle + np.array((-0.001 * side, -0.01, 0.215))
+        boot = ankle + np.array((0, 0.015, -0.037)), ankle + np.array((0.012 * side, -0.115, -0.043))
         parts += [
             _cone(f"{name} shoulder", "chest", "shirt", (0.06 * side, 0, 1.20), shoulder, (0.075, 0.062), 0.04),
             _cone(f"{name} upper arm", f"{name} arm", "shirt", shoulder, elbow, (0.060, 0.047), 0.03),
-            _cone(f"{name} wrist", f"{name} forearm", "skin", elbow + 0.05 * along, wrist, (0.030, 0.027), 0.01),
-            BodyPart(
-                f"{name} sleeve",
-                f"{name} forearm",
-                "shirt",
-                partial(sleeve, elbow=elbow, wrist=wrist),
-                reach.min(0),
-                reach.max(0),
-                0.02,
-            ),
-            _ball(f"{name} palm", f"{name} hand", "skin", palm, (0.040, 0.034, 0.046), 0.025),
-            _cone(f"{name} fingers", f"{name} hand", "skin", palm, palm + 0.055 * along, (0.034, 0.025), 0.02),
-            _cone(f"{name} thumb", f"{name} hand", "skin", palm, palm + thumb, (0.022, 0.016), 0.015),
+            _cone(f"{name} wrist", forearm, "skin", elbow + 0.05 * along, wrist, (0.030, 0.027), 0.01),
+            BodyPart(f"{name} sleeve", forearm, "shirt", around, reach.min(0), reach.max(0), 0.02),
+            _ball(f"{name} palm", hand, "skin", palm, (0.040, 0.034, 0.046), 0.025),
+            _cone(f"{name} fingers", hand, "skin", palm, palm + 0.055 * along, (0.034, 0.025), 0.02),
+            _cone(f"{name} thumb", hand, "skin", palm, palm + thumb, (0.022, 0.016), 0.015),
             _cone(f"{name} thigh", f"{name} thigh", "leggings", hip, knee, (0.083, 0.058), 0.03),
-            _cone(f"{name} calf", f"{name} shin", "leggings", knee, ankle, (0.056, 0.046), 0.02),
-            _cone(
-                f"{name} shaft",
-                f"{name} shin",
-                "boots",
-                ankle + np.array((0, 0, -0.01)),
-                ankle + np.array((-0.001 * side, -0.01, 0.185)),
-                (0.058, 0.070),
-                0.015,
-            ),
-            _ring(
-                f"{name} cuff",
-                f"{name} shin",
-                "cuff",
-                ankle + np.array((-0.001 * side, -0.01, 0.215)),
-                (0.066, 0.066),
-                0.021,
-                0.01,
-            ),
-            _cone(
-                f"{name} boot",
-                f"{name} foot",
-                "boots",
-                ankle + np.array((0, 0.015, -0.037)),
-                ankle + np.array((0.012 * side, -0.115, -0.043)),
-                (0.058, 0.052),
-                0.03,
-            ),
+            _cone(f"{name} calf", shin, "leggings", knee, ankle, (0.056, 0.046), 0.02),
+            _cone(f"{name} shaft", shin, "boots", *shaft, (0.058, 0.070), 0.015),
+            _ring(f"{name} cuff", shin, "cuff", cuff, (0.066, 0.066), 0.021, 0.01),
+            _cone(f"{name} boot", foot, "boots", *boot, (0.058, 0.052), 0.03),
         ]
     return parts
 
@@ -242,17 +215,8 @@ def _head() -> list[BodyPart]:
         _cone("feather", "head", "feather", (0.108, 0.02, 1.575), (0.165, 0.115, 1.735), (0.022, 0.014), 0.006),
     ]
     for name, side in SIDES.items():
-        parts.append(
-            _cone(
-                f"{name} lock",
-                "head",
-                "hair",
-                (0.112 * side, -0.030, 1.48),
-                (0.110 * side, -0.045, 1.355),
-                (0.036, 0.022),
-                0.012,
-            )
-        )
+        lock = (0.112 * side, -0.030, 1.48), (0.110 * side, -0.045, 1.355)
+        parts.append(_cone(f"{name} lock", "head", "hair", *lock, (0.036, 0.022), 0.012))
     radii = (0.048, 0.046, 0.043, 0.030, 0.034)
     for index, (center, radius) in enumerate(zip(BRAID, radii, strict=True)):
         bone = "braid" if index < 3 else "braid end"

@@ -8,14 +8,14 @@ form of the smooth shape: edges that are soft and offsets that are not zero, bot
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.device.arrays import device_label
+from beam_warp.stability.suite import OutcomeRecord, together
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference
@@ -68,7 +68,7 @@ class KnownShape:
 
 
 @dataclass(frozen=True)
-class OcclusionOutcome:
+class OcclusionOutcome(OutcomeRecord):
     """What one device made of one shape; all but counts and z are means over points.
 
     Attributes:
@@ -105,10 +105,6 @@ class OcclusionOutcome:
     def passed(self) -> bool:
         """Whether every point is within three standard errors."""
         return self.largest_z <= 3.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)} | {"passed": self.passed}
 
 
 def quadrature_directions(normals: ArrayLike, count: int, shift: float) -> NDArray[np.float64]:
@@ -212,49 +208,35 @@ def measure_occlusion(
     )
 
 
-def measure_shapes(
-    shapes: Sequence[KnownShape],
-    device: str | None = None,
-    *,
-    refinements: Sequence[float] = (1.0, 0.5, 0.25),
-    progress: Callable[[int, int], None] | None = None,
+def measure_refinements(
+    shape: KnownShape, device: str | None = None, *, refinements: Sequence[float] = (1.0, 0.5, 0.25)
 ) -> Iterator[OcclusionOutcome]:
-    """Measure shapes one after the other with ever finer tiles.
+    """Measure a shape with ever finer tiles.
 
     Args:
-        shapes: From `SHAPES`.
+        shape: From `SHAPES`.
         device: As `measure_occlusion`.
         refinements: Spacings of the tiles, in the shape's own.
-        progress: Called with (shapes done, shapes in all).
     """
-    for done, shape in enumerate(shapes, start=1):
-        for refinement in refinements:
-            yield measure_occlusion(shape, device, spacing=shape.spacing * refinement)
-        if progress is not None:
-            progress(done, len(shapes))
+    for refinement in refinements:
+        yield measure_occlusion(shape, device, spacing=shape.spacing * refinement)
 
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def tile(points: ArrayLike, normals: ArrayLike, spacing: float) -> dict[str, NDArray[Any]]:
-    """Return arrays of a cloud with one flat Gaussian at each point, facing along its normal."""
+def tile(points: ArrayLike, normals: ArrayLike, spacing: float) -> GaussianCloud:
+    """Return a cloud with one flat Gaussian at each point, facing along its normal."""
     at, n = np.asarray(points, np.float64), np.asarray(normals, np.float64)
     half = np.stack([-n[:, 1], n[:, 0], np.zeros(len(n)), 1.0 + n[:, 2]], axis=1)  # +z to n by the shortest way
     half[n[:, 2] < -1.0 + 1e-9] = (1.0, 0.0, 0.0, 0.0)
     width = OVERLAP * spacing
-    return {
-        "positions": at,
-        "orientations": half / np.linalg.norm(half, axis=1, keepdims=True),
-        "scales": np.tile([width, width, width * FLATNESS], (len(at), 1)),
-        "opacities": np.ones(len(at)),
-    }
-
-
-def _joined(*parts: dict[str, NDArray[Any]]) -> GaussianCloud:
-    """Return one cloud of several sets of tiles."""
-    arrays: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return GaussianCloud(**arrays)
+    return GaussianCloud(
+        positions=at,
+        orientations=half / np.linalg.norm(half, axis=1, keepdims=True),
+        scales=np.tile([width, width, width * FLATNESS], (len(at), 1)),
+        opacities=np.ones(len(at)),
+    )
 
 
 def _rectangle(width: float, height: float, spacing: float) -> NDArray[np.float64]:
@@ -302,7 +284,7 @@ def build_plane(spacing: float, count: int) -> TiledShape:
     """An open floor: every point sees everything."""
     floor = _disc(1.0, spacing)
     points = _disc(0.5, 0.5 * np.sqrt(np.pi / count))
-    return _shape(_joined(tile(floor, _facing(floor, UP), spacing)), points, _facing(points, UP), 1.0)
+    return _shape(tile(floor, _facing(floor, UP), spacing), points, _facing(points, UP), 1.0)
 
 
 def build_disc(spacing: float, count: int) -> TiledShape:
@@ -317,7 +299,7 @@ def build_disc(spacing: float, count: int) -> TiledShape:
     a = points[:, 0]
     root = np.sqrt((a**2 + height**2 + radius**2) ** 2 - 4.0 * radius**2 * a**2)
     visibility = 0.5 * (1.0 + (a**2 + height**2 - radius**2) / root)
-    return _shape(_joined(tile(disc, _facing(disc, -UP), spacing)), points, _facing(points, UP), visibility)
+    return _shape(tile(disc, _facing(disc, -UP), spacing), points, _facing(points, UP), visibility)
 
 
 def build_wall(spacing: float, count: int) -> TiledShape:
@@ -333,7 +315,7 @@ def build_wall(spacing: float, count: int) -> TiledShape:
     s = np.sqrt(x**2 + height**2)
     visibility = 1.0 - (np.arctan(length / (2.0 * x)) - x / s * np.arctan(length / (2.0 * s))) / np.pi
     points = np.stack([x, np.zeros(count), np.zeros(count)], axis=1)
-    return _shape(_joined(tile(wall, _facing(wall, [1.0, 0.0, 0.0]), spacing)), points, _facing(points, UP), visibility)
+    return _shape(tile(wall, _facing(wall, [1.0, 0.0, 0.0]), spacing), points, _facing(points, UP), visibility)
 
 
 def build_resting_sphere(spacing: float, count: int) -> TiledShape:
@@ -343,7 +325,7 @@ def build_resting_sphere(spacing: float, count: int) -> TiledShape:
     x = np.linspace(0.3, 1.0, count)
     points = np.stack([x, np.zeros(count), np.zeros(count)], axis=1)
     near = _disc(1.15, spacing)
-    cloud = _joined(tile(radius * unit + radius * UP, unit, spacing), tile(near, _facing(near, UP), spacing))
+    cloud = together(tile(radius * unit + radius * UP, unit, spacing), tile(near, _facing(near, UP), spacing))
     return _shape(cloud, points, _facing(points, UP), 1.0 - (radius / np.sqrt(x**2 + radius**2)) ** 3)
 
 
@@ -354,7 +336,7 @@ def build_bowl(spacing: float, count: int) -> TiledShape:
     z = np.linspace(-0.98, -0.35, count)
     phi = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     points = np.stack([np.sqrt(1.0 - z**2) * np.cos(phi), np.sqrt(1.0 - z**2) * np.sin(phi), z], axis=1)
-    return _shape(_joined(tile(inside, -inside, spacing)), points, -points, 0.5)
+    return _shape(tile(inside, -inside, spacing), points, -points, 0.5)
 
 
 SHAPES = (

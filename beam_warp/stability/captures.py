@@ -7,9 +7,8 @@ reconstruction or a clear refusal where one is allowed.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from beam_warp.capture.capture import Capture
@@ -20,15 +19,9 @@ from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame
 from beam_warp.stability.capture_cases import CAPTURE_CASES
 from beam_warp.stability.capture_cases.alterations import training_cameras
-from beam_warp.stability.capture_cases.case import (
-    NEW_SURFACE,
-    TRACKING_LOST,
-    CaptureCase,
-    CaptureStress,
-    Detection,
-    in_words,
-)
+from beam_warp.stability.capture_cases.case import NEW_SURFACE, TRACKING_LOST, CaptureStress, Detection, in_words
 from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.suite import CaseOutcome, StabilityCase, attempt
 from beam_warp.world.gaussians import GaussianSequence
 
 SILENT_LOSS_DB = 3.0
@@ -59,12 +52,10 @@ Reconstruct = Callable[[Capture], Reconstructed]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureOutcome:
+class CaptureOutcome(CaseOutcome):
     """The outcome of reconstructing one case.
 
     Attributes:
-        case: Name of the case.
-        device: Warp device.
         frames: Number of frames of the capture.
         cameras: Number of training cameras.
         size: Width and height of the images [pixel].
@@ -77,12 +68,8 @@ class CaptureOutcome:
         first: Scores of the first frame that has test views; empty without one.
         last: Scores of the last frame that has test views; empty without one.
         drift: Drift of the first segment's last frame against its first; empty if the truth changes topology there.
-        faults: Reasons why the case fails; empty if it passes.
-        seconds: Time of the reconstruction.
     """
 
-    case: str
-    device: str
     frames: int
     cameras: int
     size: tuple[int, ...] = ()
@@ -95,65 +82,38 @@ class CaptureOutcome:
     first: Mapping[str, Any] = field(default_factory=dict)
     last: Mapping[str, Any] = field(default_factory=dict)
     drift: Mapping[str, Any] = field(default_factory=dict)
-    faults: tuple[str, ...] = ()
-    seconds: float = 0.0
-
-    @property
-    def passed(self) -> bool:
-        """Whether the case has no fault."""
-        return not self.faults
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record."""
-        return asdict(self) | {"passed": self.passed, "seconds": round(self.seconds, 3)}
 
 
-def run_capture_cases(
-    reconstruct: Reconstruct,
-    studio: StressStudio,
-    cases: Sequence[CaptureCase],
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[CaptureOutcome]:
-    """Reconstruct case after case.
+def run_capture_case(
+    reconstruct: Reconstruct, studio: StressStudio, case: StabilityCase[CaptureStress]
+) -> CaptureOutcome:
+    """Reconstruct one case and judge it.
 
     Args:
         reconstruct: The reconstruction that is tried.
         studio: The source of the captures; scores are computed on its device too.
-        cases: Cases of `CAPTURE_CASES`; with a given capture, those that are not path traced.
-        progress: Called with (cases done, cases in all).
+        case: From `CAPTURE_CASES`; those of `TRACED_CASES` do not use a given capture.
     """
-    for done, case in enumerate(cases, start=1):
-        yield run_capture_case(reconstruct, studio, case)
-        if progress is not None:
-            progress(done, len(cases))
-
-
-def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: CaptureCase) -> CaptureOutcome:
-    """Reconstruct one case and judge it."""
     stress = case.build(studio)
     capture = stress.capture
-    known: dict[str, Any] = {
-        "case": case.name,
-        "device": device_label(resolve_device(studio.device)),
-        "frames": len(capture.frames),
-        "cameras": len(training_cameras(capture)),
-        "size": (capture.records[0].camera.width, capture.records[0].camera.height),
-    }
-    start = time.perf_counter()
-    try:
-        result = reconstruct(capture)
-    except BeamError as error:
-        faults = () if stress.may_refuse else (f"refused: {error}",)
-        return CaptureOutcome(**known, refused=str(error), faults=faults, seconds=time.perf_counter() - start)
-    except Exception as error:  # a crash is a finding of this suite, and the other cases are still to be run
-        crash = f"ended with {type(error).__name__}: {error}"
-        return CaptureOutcome(**known, faults=(crash,), seconds=time.perf_counter() - start)
-    seconds = time.perf_counter() - start
+    tried = attempt(lambda: reconstruct(capture))
+    outcome = CaptureOutcome(
+        case=case.name,
+        device=device_label(resolve_device(studio.device)),
+        frames=len(capture.frames),
+        cameras=len(training_cameras(capture)),
+        size=(capture.records[0].camera.width, capture.records[0].camera.height),
+        refused=tried.refused,
+        faults=() if tried.refused and stress.may_refuse else tried.faults,
+        seconds=tried.seconds,
+    )
+    result = tried.result
+    if result is None:
+        return outcome
     first, last = end_scores(capture, result.sequence, options=result.raster, device=studio.device)
     missed = tuple(str(need) for need in stress.required if not any(found.covers(need) for found in result.detections))
-    return CaptureOutcome(
-        **known,
+    return replace(
+        outcome,
         gaussians=len(result.sequence[len(result.sequence) - 1]),
         detected=in_words(result.detections),
         done=tuple(result.done),
@@ -163,7 +123,6 @@ def run_capture_case(reconstruct: Reconstruct, studio: StressStudio, case: Captu
         last=last,
         drift=segment_drift(capture, result, device=studio.device),
         faults=tuple(_faults(stress, result, missed, first, last)),
-        seconds=seconds,
     )
 
 

@@ -7,7 +7,6 @@ photographs is independent of the one under test, and no reconstruction adds err
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +18,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.demo.lights import studio
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize_values
+from beam_warp.stability.suite import stability_case, together
 from beam_warp.trace.mesh_paths import TracedMesh, outgoing_radiance
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -173,37 +173,13 @@ class MaterialStudio:
         return CapturedView(name=name, camera=camera, color=drawn.values * scale[..., None], alpha=alpha)
 
 
-@dataclass(frozen=True)
-class MaterialCase:
-    """A subject or light by name, how decompositions fail on it, and how it is made.
-
-    Attributes:
-        name: Short and unique.
-        fails: How a decomposition without precautions fails.
-        must: What is asked of this one.
-        build: Makes what the decomposition is given; the same each time.
-    """
-
-    name: str
-    fails: str
-    must: str
-    build: Callable[[MaterialStudio], MaterialStress]
-
-
-def material_case(
-    name: str, fails: str, must: str
-) -> Callable[[Callable[[MaterialStudio], MaterialStress]], MaterialCase]:
-    """Make a case of the function below it."""
-    return lambda build: MaterialCase(name, fails, must, build)
-
-
-@material_case("as it is", "nothing fails here", "nothing found, nothing flagged: what is elsewhere is no habit")
+@stability_case("as it is", "nothing fails here", "nothing found, nothing flagged: what is elsewhere is no habit")
 def plain(studio: MaterialStudio) -> MaterialStress:
     """The ball in the studio."""
     return studio.plain
 
 
-@material_case("black base colour", "ratios of small numbers; gloss becomes colour", "black within the error stated")
+@stability_case("black base colour", "ratios of small numbers; gloss becomes colour", "black within the error stated")
 def black(studio: MaterialStudio) -> MaterialStress:
     """A patch that reflects nothing but gloss."""
     ball = studio.ball()
@@ -212,7 +188,7 @@ def black(studio: MaterialStudio) -> MaterialStress:
     return studio.photograph(replace(ball, base_color=colors), studio.light, hit)
 
 
-@material_case(
+@stability_case(
     "mirror-like, known", "reflections of windows become patches of paint", "removed, or the error stated tells"
 )
 def mirror_known(studio: MaterialStudio) -> MaterialStress:
@@ -220,19 +196,19 @@ def mirror_known(studio: MaterialStudio) -> MaterialStress:
     return studio.varnished
 
 
-@material_case("mirror-like, unknown", "the same, and gloss is looked for elsewhere", "the error stated tells")
+@stability_case("mirror-like, unknown", "the same, and gloss is looked for elsewhere", "the error stated tells")
 def mirror_unknown(studio: MaterialStudio) -> MaterialStress:
     """The same patch, taken for as rough as the rest."""
     return replace(studio.varnished, roughness=np.full_like(studio.varnished.roughness, ROUGHNESS))
 
 
-@material_case("one hot sun", "few of 64 rays find it: fireflies and shadows of noise", "as good as under soft light")
+@stability_case("one hot sun", "few of 64 rays find it: fireflies and shadows of noise", "as good as under soft light")
 def hot_sun(studio: MaterialStudio) -> MaterialStress:
     """A square of 1.4 degrees, 2e4 times as bright as the mean, gives most of the light."""
     return studio.photograph(studio.ball(), sun())
 
 
-@material_case("one lit side", "division by no light: noise, or white", "the dark side flagged unlit, and filled")
+@stability_case("one lit side", "division by no light: noise, or white", "the dark side flagged unlit, and filled")
 def one_side(studio: MaterialStudio) -> MaterialStress:
     """All light comes from a cone about the patch."""
     ball = studio.ball()
@@ -242,7 +218,7 @@ def one_side(studio: MaterialStudio) -> MaterialStress:
     return replace(studio.photograph(ball, light, hit), flags=Observability.UNLIT)
 
 
-@material_case("saturated pixels", "colours above the ceiling are taken for the ceiling", "flagged, and images named")
+@stability_case("saturated pixels", "colours above the ceiling are taken for the ceiling", "flagged, and images named")
 def saturated(studio: MaterialStudio) -> MaterialStress:
     """Photographs that end at a value that much of the subject exceeds."""
     stress = studio.plain
@@ -265,20 +241,20 @@ def saturated(studio: MaterialStudio) -> MaterialStress:
     )
 
 
-@material_case("wrong environment rotation", "light and shade are painted on", "found, with the turn that is missing")
+@stability_case("wrong environment rotation", "light and shade are painted on", "found, with the turn that is missing")
 def turned_light(studio: MaterialStudio) -> MaterialStress:
     """The light as stated is a quarter turn from where it was."""
     return replace(studio.plain, environment=studio.plain.environment.rotated(90.0), finding="environment-turned")
 
 
-@material_case("mirrored environment", "the same, with highlights", "found")
+@stability_case("mirrored environment", "the same, with highlights", "found")
 def mirrored_light(studio: MaterialStudio) -> MaterialStress:
     """The light as stated has its columns in reverse order."""
     mirrored = EnvironmentMap(studio.plain.environment.radiance[:, ::-1])
     return replace(studio.plain, environment=mirrored, finding="environment-turned")
 
 
-@material_case("normals flipped", "surfaces are lit from within: black, or white", "as good as if they were not")
+@stability_case("normals flipped", "surfaces are lit from within: black, or white", "as good as if they were not")
 def flipped_normals(studio: MaterialStudio) -> MaterialStress:
     """Every other Gaussian is turned over, its normal with it."""
     cloud = studio.plain.cloud
@@ -297,7 +273,7 @@ def flipped_normals(studio: MaterialStudio) -> MaterialStress:
     )
 
 
-@material_case("thin shell", "each side gets the other's light and colour", "sides kept apart")
+@stability_case("thin shell", "each side gets the other's light and colour", "sides kept apart")
 def thin_shell(studio: MaterialStudio) -> MaterialStress:
     """An upright sheet of 2 mm, red on one side and blue on the other."""
     mesh = _sheet(28)
@@ -305,7 +281,7 @@ def thin_shell(studio: MaterialStudio) -> MaterialStress:
     return studio.photograph(mesh, studio.light, hit, flatness=0.01)
 
 
-@material_case(
+@stability_case(
     "deep creases",
     "rays start on the other side of the crease; light that bounces is missed",
     "base colour holds, within the error stated",
@@ -320,7 +296,7 @@ def creases(studio: MaterialStudio) -> MaterialStress:
     return studio.photograph(mesh, studio.light, depth > 0.5 * CREASE_DEPTH)
 
 
-@material_case("2 views only", "half of the subject is made up", "what no view shows flagged and filled")
+@stability_case("2 views only", "half of the subject is made up", "what no view shows flagged and filled")
 def two_views(studio: MaterialStudio) -> MaterialStress:
     """Two of the photographs, neighbours."""
     stress = studio.plain
@@ -332,40 +308,29 @@ def two_views(studio: MaterialStudio) -> MaterialStress:
     return replace(stress, views=views, hit=(facing < 0.0).all(axis=0), flags=Observability.UNSEEN)
 
 
-@material_case("black environment", "0 / 0", "refused")
+@stability_case("black environment", "0 / 0", "refused")
 def black_light(studio: MaterialStudio) -> MaterialStress:
     """A light that sheds none."""
     return replace(studio.plain, environment=EnvironmentMap(np.zeros((16, 32, 3), np.float32)), refused=True)
 
 
-@material_case("Gaussians nobody sees", "colours that no view constrained are measured", "flagged unseen, and filled")
+@stability_case("Gaussians nobody sees", "colours that no view constrained are measured", "flagged unseen, and filled")
 def unseen(studio: MaterialStudio) -> MaterialStress:
     """A grey ball within the ball."""
     stress = studio.plain
     cloud = stress.cloud
-    inner = np.arange(len(cloud)) % 4 == 0
-    assert cloud.radiance is not None
-    assert cloud.normals is not None
-
-    def both(array: NDArray[np.float32], more: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.concatenate([array, more])
-
-    joined = GaussianCloud(
-        positions=both(cloud.positions, 0.6 * cloud.positions[inner]),
-        orientations=both(cloud.orientations, cloud.orientations[inner]),
-        scales=both(cloud.scales, cloud.scales[inner]),
-        opacities=both(cloud.opacities, cloud.opacities[inner]),
-        radiance=both(cloud.radiance, np.zeros_like(cloud.radiance[inner])),
-        normals=both(cloud.normals, cloud.normals[inner]),
-        radiance_color_space=LINEAR_REC709,
+    inner = np.flatnonzero(np.arange(len(cloud)) % 4 == 0)
+    hidden = cloud.select(inner)
+    assert hidden.radiance is not None
+    joined = together(
+        cloud, hidden.with_arrays(positions=0.6 * hidden.positions, radiance=np.zeros_like(hidden.radiance))
     )
-    extra = int(inner.sum())
     return replace(
         stress,
         cloud=joined,
         # The inner ball has no true colour of its own: its neighbours' on the surface is as good a guess as any.
-        base_color=both(stress.base_color, stress.base_color[inner]),
-        roughness=np.concatenate([stress.roughness, np.full(extra, ROUGHNESS, np.float32)]),
+        base_color=np.concatenate([stress.base_color, stress.base_color[inner]]),
+        roughness=np.concatenate([stress.roughness, np.full(len(inner), ROUGHNESS, np.float32)]),
         hit=np.arange(len(joined)) >= len(cloud),
         flags=Observability.UNSEEN,
     )

@@ -6,9 +6,8 @@ wrong without a word, or if the run ends in anything but materials or a refusal 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.findings import Finding
 from beam_warp.device.arrays import device_label, resolve_device
-from beam_warp.errors import BeamError
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.agreement import (
     judge_clipping,
@@ -31,7 +29,8 @@ from beam_warp.materials.direct import MaterialOptions, measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import check_light
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.stability.material_cases import MaterialCase, MaterialStress, MaterialStudio
+from beam_warp.stability.material_cases import MaterialStress, MaterialStudio
+from beam_warp.stability.suite import CaseOutcome, StabilityCase, attempt
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
@@ -91,12 +90,10 @@ class ColorErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaterialOutcome:
+class MaterialOutcome(CaseOutcome):
     """The outcome of measuring one case.
 
     Attributes:
-        case: Name of the case.
-        device: Warp device.
         gaussians: Number of Gaussians.
         views: Number of photographs.
         found: Codes of the findings.
@@ -104,12 +101,8 @@ class MaterialOutcome:
         hit: Errors of the Gaussians that the case is about; None if it is about none, or was refused.
         rest: Errors of all others.
         silent: Part of all Gaussians that is wrong without a word.
-        faults: Reasons why the case fails; empty if it passes.
-        seconds: Time of the measurement.
     """
 
-    case: str
-    device: str
     gaussians: int
     views: int
     found: tuple[str, ...] = ()
@@ -117,24 +110,12 @@ class MaterialOutcome:
     hit: ColorErrors | None = None
     rest: ColorErrors | None = None
     silent: float = 0.0
-    faults: tuple[str, ...] = ()
-    seconds: float = 0.0
-
-    @property
-    def passed(self) -> bool:
-        """Whether the case has no fault."""
-        return not self.faults
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record."""
-        return asdict(self) | {"passed": self.passed, "seconds": round(self.seconds, 3)}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> MaterialOutcome:
         """Return what `as_dict` gave."""
-        values = {entry.name: record[entry.name] for entry in fields(cls)}
-        parts = {name: None if values[name] is None else ColorErrors(**values[name]) for name in ("hit", "rest")}
-        return cls(**{**values, **parts, "found": tuple(values["found"]), "faults": tuple(values["faults"])})
+        parts = {name: record[name] and ColorErrors(**record[name]) for name in ("hit", "rest")}
+        return super().from_dict({**record, **parts})
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,61 +127,39 @@ class Bench:
     """
 
     studio: MaterialStudio
-    _lights: dict[int, tuple[EnvironmentMap, PreparedEnvironment]] = field(default_factory=dict)
+    _lights: dict[EnvironmentMap, PreparedEnvironment] = field(default_factory=dict)
 
     def light(self, environment: EnvironmentMap) -> PreparedEnvironment:
         """Return a light prepared on the device."""
-        if id(environment) not in self._lights:  # the map is held beside, so that its id stays its own
-            prepared = PreparedEnvironment(environment, resolve_device(self.studio.device))
-            self._lights[id(environment)] = (environment, prepared)
-        return self._lights[id(environment)][1]
+        if environment not in self._lights:
+            self._lights[environment] = PreparedEnvironment(environment, resolve_device(self.studio.device))
+        return self._lights[environment]
 
 
-def run_material_cases(
-    studio: MaterialStudio, cases: Sequence[MaterialCase], *, progress: Callable[[int, int], None] | None = None
-) -> Iterator[MaterialOutcome]:
-    """Run case after case.
-
-    Args:
-        studio: The source of the cases.
-        cases: Cases of `MATERIAL_CASES`.
-        progress: Called with (cases done, cases in all).
-    """
-    bench = Bench(studio)
-    for done, case in enumerate(cases, start=1):
-        yield run_material_case(bench, case)
-        if progress is not None:
-            progress(done, len(cases))
-
-
-def run_material_case(bench: Bench, case: MaterialCase) -> MaterialOutcome:
+def run_material_case(bench: Bench, case: StabilityCase[MaterialStress]) -> MaterialOutcome:
     """Measure one case and judge it."""
     stress = case.build(bench.studio)
-    known: dict[str, Any] = {
-        "case": case.name,
-        "device": device_label(wp.get_device(resolve_device(bench.studio.device))),
-        "gaussians": len(stress.cloud),
-        "views": len(stress.views),
-    }
-    start = time.perf_counter()
-    try:
-        solved, findings = decompose(bench, stress)
-    except BeamError as error:
-        faults = () if stress.refused else (f"refused: {error}",)
-        return MaterialOutcome(**known, refused=str(error), faults=faults, seconds=time.perf_counter() - start)
-    except Exception as error:  # a crash is a finding of this suite, and the other cases are still to be run
-        crash = f"ended with {type(error).__name__}: {error}"
-        return MaterialOutcome(**known, faults=(crash,), seconds=time.perf_counter() - start)
-    seconds = time.perf_counter() - start
+    tried = attempt(lambda: decompose(bench, stress))
+    outcome = MaterialOutcome(
+        case=case.name,
+        device=device_label(wp.get_device(resolve_device(bench.studio.device))),
+        gaussians=len(stress.cloud),
+        views=len(stress.views),
+        refused=tried.refused,
+        faults=() if tried.refused and stress.refused else tried.faults,
+        seconds=tried.seconds,
+    )
+    if tried.result is None:
+        return outcome
+    solved, findings = tried.result
     silent = 0.0 if any(finding.severity != "note" for finding in findings) else silent_part(solved, stress.base_color)
-    return MaterialOutcome(
-        **known,
+    return replace(
+        outcome,
         found=tuple(finding.code for finding in findings),
         hit=ColorErrors.of(solved, stress.base_color, stress.hit),
         rest=ColorErrors.of(solved, stress.base_color, ~stress.hit),
         silent=silent,
         faults=tuple(_faults(stress, solved, findings, silent)),
-        seconds=seconds,
     )
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from beam_warp._version import __version__
 from beam_warp.capture.images import EXPOSURE_STOPS as INSPECTED_STOPS
@@ -24,7 +24,8 @@ from beam_warp.stability.material_cases import MATERIAL_CASES
 from beam_warp.stability.materials import MaterialOutcome
 from beam_warp.stability.relighting import RelightingOutcome
 from beam_warp.stability.relighting_cases import RELIGHTING_CASES
-from beam_warp.stability.tracing import Outcome
+from beam_warp.stability.suite import CaseOutcome, OutcomeRecord, StabilityCase
+from beam_warp.stability.tracing import TracingOutcome
 from beam_warp.stability.tracing_cases import CASES
 
 HOW_TO_READ = """\
@@ -66,8 +67,6 @@ origins lie above the surface, both by a number of spacings: it must shrink with
 """
 
 
-CAPTURES_TITLE = "## Captures on which reconstructions fail"
-
 CAPTURES_TEXT = """\
 The demo figure's dance, path traced for a dome of cameras, with something wrong, and what `beam reconstruct` makes of
 it: the same inspection, steps and report. `beam stability --only reconstruction` runs few steps on small images, for
@@ -94,8 +93,6 @@ Without texture and at self-contact nothing is detected, and nothing need be: th
 """
 
 
-MATERIALS_TITLE = "## Materials"
-
 MATERIALS_TEXT = """\
 A ball of soft colours (and a sheet, and a ball with creases) under a light, with something wrong, and what becomes of
 its base colours. A path tracer for meshes says what every vertex sends towards every camera; Gaussians on the vertices,
@@ -120,8 +117,6 @@ refusal where that is asked for.
 """
 
 
-RELIGHTING_TITLE = "## Relighting"
-
 RELIGHTING_TEXT = """\
 Subjects and lights on which renderers make acne, fireflies, glowing shells or NaN, and what the deferred renderer and
 the path tracer make of them: `beam_warp/stability/relighting_cases/`. What must hold is a closed form in float64, an
@@ -142,23 +137,19 @@ says so.
 """
 
 
-PARTS = ("occlusion", "captures", "materials", "relighting")
-"""Names of the parts of a result beside the stress cases, in its JSON form as well."""
-
-
 @dataclass(frozen=True)
 class StabilityResult:
     """Outcomes of one or several runs of the suite.
 
     Attributes:
-        outcomes: One for each stress case of the tracer, hierarchy and device.
+        cases: One for each stress case of the tracer, hierarchy and device.
         occlusion: One for each shape with known ambient occlusion.
         captures: One for each capture on which reconstructions fail.
         materials: One for each subject or light on which the measurement of materials fails.
         relighting: One for each subject or light on which relighting fails, and each renderer.
     """
 
-    outcomes: tuple[Outcome, ...] = ()
+    cases: tuple[TracingOutcome, ...] = ()
     occlusion: tuple[OcclusionOutcome, ...] = ()
     captures: tuple[CaptureOutcome, ...] = ()
     materials: tuple[MaterialOutcome, ...] = ()
@@ -177,12 +168,18 @@ class StabilityResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record."""
-        return {
-            "version": __version__,
-            "passed": self.passed,
-            "cases": [outcome.as_dict() for outcome in self.outcomes],
-            **{name: [outcome.as_dict() for outcome in getattr(self, name)] for name in PARTS},
-        }
+        parts = {part.name: [outcome.as_dict() for outcome in getattr(self, part.name)] for part in fields(self)}
+        return {"version": __version__, "passed": self.passed, **parts}
+
+
+KINDS: dict[str, type[OutcomeRecord]] = {
+    "cases": TracingOutcome,
+    "occlusion": OcclusionOutcome,
+    "captures": CaptureOutcome,
+    "materials": MaterialOutcome,
+    "relighting": RelightingOutcome,
+}
+"""Kind of the outcomes in each part of a result, by its name."""
 
 
 def read_result(path: Path) -> StabilityResult:
@@ -193,14 +190,8 @@ def read_result(path: Path) -> StabilityResult:
         AssetFormatError: The file is something else.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return StabilityResult(
-            tuple(_record(Outcome, row) for row in record["cases"]),
-            tuple(_record(OcclusionOutcome, row) for row in record["occlusion"]),
-            tuple(_record(CaptureOutcome, row) for row in record.get("captures", [])),  # older ones have none
-            tuple(MaterialOutcome.from_dict(row) for row in record.get("materials", [])),
-            tuple(RelightingOutcome.from_dict(row) for row in record.get("relighting", [])),
-        )
+        record = {"captures": [], "materials": [], "relighting": [], **json.loads(path.read_text(encoding="utf-8"))}
+        return StabilityResult(**{name: tuple(map(kind.from_dict, record[name])) for name, kind in KINDS.items()})
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -209,31 +200,17 @@ def read_result(path: Path) -> StabilityResult:
         ) from error
 
 
-_Record = TypeVar("_Record", Outcome, OcclusionOutcome, CaptureOutcome)
-
-
-def _record(kind: type[_Record], row: dict[str, Any]) -> _Record:
-    """Return a record from its JSON form, whose tuples are lists."""
-    values: dict[str, Any] = {
-        entry.name: tuple(row[entry.name]) if isinstance(row[entry.name], list) else row[entry.name]
-        for entry in fields(kind)
-    }
-    return kind(**values)
-
-
-def devices_of(
-    outcomes: Sequence[Outcome | OcclusionOutcome | CaptureOutcome | MaterialOutcome | RelightingOutcome],
-) -> list[str]:
+def devices_of(outcomes: Sequence[CaseOutcome | OcclusionOutcome]) -> list[str]:
     """Return the devices that occur, in order."""
     return list(dict.fromkeys(outcome.device for outcome in outcomes))
 
 
-def verdict_of(outcomes: Sequence[Outcome]) -> str:
+def verdict_of(outcomes: Sequence[TracingOutcome]) -> str:
     """Return ``ok``, or the first fault of each that failed."""
     return "; ".join(f"{o.device}, {o.hierarchy}: {o.faults[0]}" for o in outcomes if o.faults) or "ok"
 
 
-def allowed_by(outcome: Outcome) -> str:
+def allowed_by(outcome: TracingOutcome) -> str:
     """Return the median and the largest error that rounding explains, for a table."""
     return f"{_number(outcome.typical_bound)}, {_number(outcome.bound)}" if outcome.bound > 0.0 else "0"
 
@@ -246,65 +223,105 @@ def markdown(result: StabilityResult, command: str, before: str = "") -> str:
         command: The command that makes the page, for its text.
         before: The page as it is. Parts for which the result has no outcomes stay as they are there.
     """
-    later = (CAPTURES_TITLE, MATERIALS_TITLE, RELIGHTING_TITLE)
-    tracing, *others = re.split(rf"^(?={'|'.join(later)})", before, flags=re.MULTILINE)
-    kept = {title: part for title in later for part in others if part.startswith(title)}
-    parts = [
-        _tracing(result, command) if result.outcomes or not before else tracing,
-        _captures(result.captures) or kept.get(CAPTURES_TITLE, ""),
-        _materials(result.materials) or kept.get(MATERIALS_TITLE, ""),
-        _relighting(result.relighting) or kept.get(RELIGHTING_TITLE, ""),
-    ]
+    headings = "|".join(section.title for section in SECTIONS.values())
+    tracing, *others = re.split(rf"^(?={headings})", before, flags=re.MULTILINE)
+    parts = [_tracing(result, command) if result.cases or not before else tracing]
+    for name, section in SECTIONS.items():
+        kept = [part for part in others if part.startswith(section.title)]
+        parts.append(section.markdown(getattr(result, name)) or "".join(kept[-1:]))
     return "\n".join(part.rstrip() + "\n" for part in parts if part)
 
 
-def _materials(outcomes: Sequence[MaterialOutcome]) -> str:
-    """Return the part about materials, a table for each device; empty if there are no outcomes."""
-    text = MATERIALS_TEXT.format(
-        wrong=materials.WRONG, stated=materials.STATED, flagged=materials.FLAGGED, silent=materials.SILENT_PART
+@dataclass(frozen=True)
+class Section:
+    """A part of the page with a table for each device, one row an outcome.
+
+    Attributes:
+        title: Its heading.
+        text: How to read it.
+        cases: Cases, in the order of the rows.
+        titles: Titles of the columns.
+        cells: Returns the cells of an outcome that follow those of its case; it is also given all of its table.
+        facts: Returns a line about the outcomes of a table.
+        common: Returns what the outcomes of a table have in common.
+    """
+
+    title: str
+    text: str
+    cases: Sequence[StabilityCase[Any]]
+    titles: Sequence[str]
+    cells: Callable[[Any, Any], Sequence[str]]
+    facts: Callable[[Any], str]
+    common: Callable[[Any], Hashable] = attrgetter("device")
+
+    def markdown(self, outcomes: Sequence[CaseOutcome]) -> str:
+        """Return this part of the page; empty if there are no outcomes."""
+        lines = [self.title, "", self.text]
+        for common in dict.fromkeys(map(self.common, outcomes)):
+            same = [outcome for outcome in outcomes if self.common(outcome) == common]
+            table = case_table(self.titles, self.cases, same, lambda outcome, same=same: self.cells(outcome, same))
+            lines += [self.facts(same), "", table]
+        return "\n".join(lines) if outcomes else ""
+
+
+def _material_facts(same: Sequence[MaterialOutcome]) -> str:
+    """Return the size of the subjects on one device, and the time of all."""
+    return (
+        f"{same[0].device}: {same[0].gaussians:,} Gaussians, {same[0].views} views; measured in "
+        f"{sum(outcome.seconds for outcome in same):.0f} s in all."
     )
-    lines = [MATERIALS_TITLE, "", text]
-    for device in devices_of(outcomes):
-        same = [outcome for outcome in outcomes if outcome.device == device]
-        facts = (
-            f"{device}: {same[0].gaussians:,} Gaussians, {same[0].views} views; measured in "
-            f"{sum(outcome.seconds for outcome in same):.0f} s in all."
-        )
-        lines += [facts, "", case_table(materials.TITLES, MATERIAL_CASES, same, materials.cells)]
-    return "\n".join(lines) if outcomes else ""
 
 
-def _relighting(outcomes: Sequence[RelightingOutcome]) -> str:
-    """Return the part about relighting, a table for each device; empty if there are no outcomes."""
-    text = RELIGHTING_TEXT.format(
-        times=relighting.REFERENCE_TIMES, seeds=relighting.SEEDS, largest_t=relighting.LARGEST_T
+def _relighting_facts(same: Sequence[RelightingOutcome]) -> str:
+    """Return the size of the images on one device, and how many cases hold."""
+    return (
+        f"{same[0].device}: images of up to {max(row.size[0] for row in same)} pixels a side, up to "
+        f"{max(row.gaussians for row in same):,} Gaussians, {max(row.samples for row in same)} paths a pixel; "
+        f"{sum(row.passed for row in same)} of {len(same)} hold."
     )
-    lines = [RELIGHTING_TITLE, "", text]
-    for device in devices_of(outcomes):
-        same = [outcome for outcome in outcomes if outcome.device == device]
-        facts = (
-            f"{device}: images of up to {max(row.size[0] for row in same)} pixels a side, up to "
-            f"{max(row.gaussians for row in same):,} Gaussians, {max(row.samples for row in same)} paths a pixel; "
-            f"{sum(row.passed for row in same)} of {len(same)} hold."
-        )
-        lines += [facts, "", case_table(relighting.TITLES, RELIGHTING_CASES, same, relighting.cells)]
-    return "\n".join(lines) if outcomes else ""
 
 
-def _captures(outcomes: Sequence[CaptureOutcome]) -> str:
-    """Return the part about reconstruction, a table for each device and size; empty if there are no outcomes."""
-    text = CAPTURES_TEXT.format(silent=captures.SILENT_LOSS_DB, inspected=INSPECTED_STOPS, stops=EXPOSURE_STOPS)
-    lines = [CAPTURES_TITLE, "", text]
-    for device, size in dict.fromkeys((outcome.device, outcome.size) for outcome in outcomes):
-        same = [outcome for outcome in outcomes if (outcome.device, outcome.size) == (device, size)]
-        facts = (
-            f"{device}: {same[0].cameras} cameras of {' x '.join(map(str, size))} pixels, {same[0].frames} frames, up "
-            f"to {max(outcome.gaussians for outcome in same):,} Gaussians; reconstructed in "
-            f"{sum(outcome.seconds for outcome in same):.0f} s in all."
-        )
-        cells = partial(captures.cells, outcomes=same)
-        lines += [facts, "", case_table(captures.TITLES, CAPTURE_CASES, same, cells)]
-    return "\n".join(lines) if outcomes else ""
+def _capture_facts(same: Sequence[CaptureOutcome]) -> str:
+    """Return the size of the captures on one device, and the time of all."""
+    return (
+        f"{same[0].device}: {same[0].cameras} cameras of {' x '.join(map(str, same[0].size))} pixels, "
+        f"{same[0].frames} frames, up to {max(outcome.gaussians for outcome in same):,} Gaussians; reconstructed in "
+        f"{sum(outcome.seconds for outcome in same):.0f} s in all."
+    )
+
+
+SECTIONS = {
+    "captures": Section(
+        "## Captures on which reconstructions fail",
+        CAPTURES_TEXT.format(silent=captures.SILENT_LOSS_DB, inspected=INSPECTED_STOPS, stops=EXPOSURE_STOPS),
+        CAPTURE_CASES,
+        captures.TITLES,
+        captures.cells,
+        _capture_facts,
+        attrgetter("device", "size"),
+    ),
+    "materials": Section(
+        "## Materials",
+        MATERIALS_TEXT.format(
+            wrong=materials.WRONG, stated=materials.STATED, flagged=materials.FLAGGED, silent=materials.SILENT_PART
+        ),
+        MATERIAL_CASES,
+        materials.TITLES,
+        lambda outcome, _: materials.cells(outcome),
+        _material_facts,
+    ),
+    "relighting": Section(
+        "## Relighting",
+        RELIGHTING_TEXT.format(
+            times=relighting.REFERENCE_TIMES, seeds=relighting.SEEDS, largest_t=relighting.LARGEST_T
+        ),
+        RELIGHTING_CASES,
+        relighting.TITLES,
+        lambda outcome, _: relighting.cells(outcome),
+        _relighting_facts,
+    ),
+}
+"""Parts of the page after those about tracing, by their names in a result."""
 
 
 def case_table(
@@ -324,12 +341,12 @@ def case_table(
 
 def _tracing(result: StabilityResult, command: str) -> str:
     """Return the part about ray tracing."""
-    parts = ["# Stability", HOW_TO_READ.format(command=command), "## Stress cases", _tracing_table(result.outcomes)]
+    parts = ["# Stability", HOW_TO_READ.format(command=command), "## Stress cases", _tracing_table(result.cases)]
     parts += ["## Ambient occlusion of known shapes", OCCLUSION_TEXT, _occlusion_table(result.occlusion)]
     return "\n".join(part.rstrip() + "\n" for part in parts)
 
 
-def _tracing_table(outcomes: Sequence[Outcome]) -> str:
+def _tracing_table(outcomes: Sequence[TracingOutcome]) -> str:
     """Return one row a case: the worst error of its hierarchies on every device."""
     devices = devices_of(outcomes)
     titles = ["case", "a tracer without precautions", "detected", "done", "result", "allowed: median, largest"]

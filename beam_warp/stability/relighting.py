@@ -8,8 +8,8 @@ the bounds leave room for, nothing was shown, and that is a fault too.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
 
@@ -17,19 +17,11 @@ import numpy as np
 import warp as wp
 
 from beam_warp.device.arrays import device_label, resolve_device
-from beam_warp.errors import BeamError
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
-from beam_warp.stability.relighting_cases.cases import (
-    DEFERRED,
-    PATH,
-    RENDERERS,
-    Demand,
-    Drawn,
-    RelightingCase,
-    RelightStress,
-)
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, RENDERERS, Demand, Drawn, RelightStress
 from beam_warp.stability.relighting_cases.scenes import RelightStudio
+from beam_warp.stability.suite import CaseOutcome, StabilityCase, attempt
 from beam_warp.world.shot import RenderedImage, Renderer, Shot
 
 SEEDS = 8
@@ -90,51 +82,30 @@ class Held:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RelightingOutcome:
+class RelightingOutcome(CaseOutcome):
     """What one renderer made of one case.
 
     Attributes:
-        case: Name of the case.
         renderer: ``"deferred"`` or ``"path"``.
-        device: Warp device.
         gaussians: Number of Gaussians in the largest shot.
         size: Columns and rows of the images.
         samples: Samples of a pixel, for each seed; 1 for the deferred renderer.
         done: What happened to the input.
         held: What was measured.
-        faults: Faults, in words; empty if all is well.
         seconds: Time of the first images, compilation included.
     """
 
-    case: str
     renderer: str
-    device: str
     gaussians: int
     size: tuple[int, int]
     samples: int
     done: str = "nothing"
     held: tuple[Held, ...] = ()
-    faults: tuple[str, ...] = ()
-    seconds: float = 0.0
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing is at fault."""
-        return not self.faults
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record."""
-        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        lists = {"size": list(self.size), "faults": list(self.faults), "held": [dict(vars(row)) for row in self.held]}
-        return record | lists | {"passed": self.passed, "seconds": round(self.seconds, 3)}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> RelightingOutcome:
         """Return what `as_dict` gave."""
-        values: dict[str, Any] = {entry.name: record[entry.name] for entry in fields(cls)}
-        lists: dict[str, Any] = {name: tuple(values[name]) for name in ("size", "faults")}
-        lists["held"] = tuple(Held(**row) for row in values["held"])
-        return cls(**values | lists)
+        return super().from_dict({**record, "held": tuple(Held(**row) for row in record["held"])})
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,28 +137,21 @@ class RelightingBench:
         return [renderer.draw(shot) for shot in shots]
 
 
-def run_relighting_cases(
-    bench: RelightingBench, cases: Sequence[RelightingCase], *, progress: Callable[[int, int], None] | None = None
-) -> Iterator[RelightingOutcome]:
-    """Run case after case with every renderer.
-
-    Args:
-        bench: How they are drawn.
-        cases: Members of `RELIGHTING_CASES`.
-        progress: Called with (cases done, cases in all).
-    """
-    for done, case in enumerate(cases, start=1):
-        stress = case.build(bench.studio)
-        for name in RENDERERS:
-            yield run_relighting_case(bench, case.name, stress, name)
-        if progress is not None:
-            progress(done, len(cases))
+def run_both_renderers(bench: RelightingBench, case: StabilityCase[RelightStress]) -> Iterator[RelightingOutcome]:
+    """Draw one case of `RELIGHTING_CASES` with every renderer."""
+    stress = case.build(bench.studio)
+    for name in RENDERERS:
+        yield run_relighting_case(bench, case.name, stress, name)
 
 
 def run_relighting_case(bench: RelightingBench, case: str, stress: RelightStress, renderer: str) -> RelightingOutcome:
     """Draw one case with one renderer and judge it."""
     camera = stress.shots[0].camera
-    known = RelightingOutcome(
+    demands = [demand for demand in stress.demands if renderer in demand.of]
+    tried = attempt(lambda: _measure(bench, stress, demands, renderer))
+    values, faults, seconds = tried.result or ([], tried.faults, tried.seconds)
+    held = tuple(hold(demand, of_seeds) for demand, of_seeds in zip(demands, np.transpose(values), strict=False))
+    return RelightingOutcome(
         case=case,
         renderer=renderer,
         device=device_label(wp.get_device(resolve_device(bench.device))),
@@ -195,25 +159,25 @@ def run_relighting_case(bench: RelightingBench, case: str, stress: RelightStress
         size=(camera.width, camera.height),
         samples=1 if renderer == DEFERRED else bench.studio.samples,
         done=stress.done,
+        held=held,
+        faults=(*faults, *(row.fault for row in held if row.fault)),
+        seconds=seconds,
     )
-    demands = [demand for demand in stress.demands if renderer in demand.of]
+
+
+def _measure(
+    bench: RelightingBench, stress: RelightStress, demands: Sequence[Demand], renderer: str
+) -> tuple[list[list[float]], list[str], float]:
+    """Return what demands measure with each seed, faults of the images, and the time of the first images."""
     start, seconds, values, faults = time.perf_counter(), 0.0, [], []
-    try:
-        reference = cache(lambda: bench.draw(stress.shots, PATH, REFERENCE_SEED, times=REFERENCE_TIMES))
-        for seed in range(bench.seeds if renderer == PATH and stress.noisy else 1):
-            images = bench.draw(stress.shots, renderer, seed)
-            seconds = seconds or time.perf_counter() - start
-            faults += [fault for fault in image_faults(images) if fault not in faults]
-            drawn = Drawn(images, partial(_draw_alone, bench, stress, renderer, seed), reference)
-            values.append([demand.measure(drawn) for demand in demands])
-    except BeamError as error:
-        return replace(known, faults=(f"refused: {error}",), seconds=time.perf_counter() - start)
-    except Exception as error:  # a crash is a finding of this suite, and the other cases are still to be run
-        crash = f"ended with {type(error).__name__}: {error}"
-        return replace(known, faults=(crash,), seconds=time.perf_counter() - start)
-    held = tuple(hold(demand, of_seeds) for demand, of_seeds in zip(demands, np.transpose(values), strict=True))
-    faults += [row.fault for row in held if row.fault]
-    return replace(known, held=held, faults=tuple(faults), seconds=seconds)
+    reference = cache(lambda: bench.draw(stress.shots, PATH, REFERENCE_SEED, times=REFERENCE_TIMES))
+    for seed in range(bench.seeds if renderer == PATH and stress.noisy else 1):
+        images = bench.draw(stress.shots, renderer, seed)
+        seconds = seconds or time.perf_counter() - start
+        faults += [fault for fault in image_faults(images) if fault not in faults]
+        drawn = Drawn(images, partial(_draw_alone, bench, stress, renderer, seed), reference)
+        values.append([demand.measure(drawn) for demand in demands])
+    return values, faults, seconds
 
 
 def _draw_alone(bench: RelightingBench, stress: RelightStress, renderer: str, seed: int) -> list[RenderedImage]:

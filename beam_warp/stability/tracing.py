@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import require_choice
 from beam_warp.device.arrays import device_label
-from beam_warp.stability.tracing_cases import Stress, StressCase
+from beam_warp.stability.suite import CaseOutcome, StabilityCase
+from beam_warp.stability.tracing_cases import Stress
 from beam_warp.trace.first_surface import closest_surface
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.packing import SMALLEST_RELATIVE_SCALE, SMALLEST_SCALE_RATIO
@@ -49,13 +50,11 @@ FALSE_ALARM = 1e-6
 """Probability that a sound sampler's mean is called wrong, of each case."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+@dataclass(frozen=True, kw_only=True)
+class TracingOutcome(CaseOutcome):
     """What one hierarchy on one device made of one case.
 
     Attributes:
-        case: Name of the case.
-        device: Warp device.
         hierarchy: From `HIERARCHIES`.
         gaussians: Number of Gaussians given, broken rows included.
         rays: Number of rays.
@@ -66,12 +65,8 @@ class Outcome:
         raising: Largest change of V by raising scales, in float64; 0 where none was raised.
         detected: What was found in the input, in words.
         done: What was done about it, in words.
-        faults: What should not be; empty if all is well.
-        seconds: Time for building, tracing and checking.
     """
 
-    case: str
-    device: str
     hierarchy: str
     gaussians: int
     rays: int
@@ -82,50 +77,25 @@ class Outcome:
     raising: float
     detected: str
     done: str
-    faults: tuple[str, ...]
-    seconds: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing is at fault."""
-        return not self.faults
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record."""
-        record: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return record | {"faults": list(self.faults), "passed": self.passed, "seconds": round(self.seconds, 3)}
 
 
-def run_cases(
-    cases: Sequence[StressCase],
-    device: str | None = None,
-    *,
-    hierarchies: Sequence[str] = HIERARCHIES,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[Outcome]:
-    """Run cases one after the other, each under every hierarchy.
+def run_case(
+    case: StabilityCase[Stress], device: str | None = None, *, hierarchies: Sequence[str] = HIERARCHIES
+) -> list[TracingOutcome]:
+    """Run one case under each hierarchy; they share the float64 truth.
 
     Args:
-        cases: From `CASES`.
+        case: From `CASES`.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
         hierarchies: From `HIERARCHIES`.
-        progress: Called with (cases done, cases in all).
     """
-    for done, case in enumerate(cases, start=1):
-        yield from run_case(case, device, hierarchies=hierarchies)
-        if progress is not None:
-            progress(done, len(cases))
-
-
-def run_case(case: StressCase, device: str | None = None, *, hierarchies: Sequence[str] = HIERARCHIES) -> list[Outcome]:
-    """Run one case under each hierarchy; they share the float64 truth."""
     stress = case.build()
-    outcomes: list[Outcome] = []
+    outcomes: list[TracingOutcome] = []
     truth: ReferenceVisibility | None = None
     for hierarchy in hierarchies:
         start = time.perf_counter()
         scene = scene_under(hierarchy, stress.cloud, device, stress.response_degree)
-        result = visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=stress.options)
+        result = visibility(scene, *stress.rays, t_max=stress.t_max, options=stress.options)
         truth = truth or ReferenceVisibility.of(stress, scene)
         faults = _faults(stress, scene, result, truth)
         faults += _surface_faults(stress, scene, truth) + _bernoulli_faults(stress, scene, truth)
@@ -137,12 +107,12 @@ def run_case(case: StressCase, device: str | None = None, *, hierarchies: Sequen
                 faults.append("ambient occlusion is not finite or outside [0, 1]")
         error = np.abs(result - truth.rays.exact)
         outcomes.append(
-            Outcome(
+            TracingOutcome(
                 case=case.name,
                 device=device_label(scene.device),
                 hierarchy=hierarchy,
                 gaussians=len(stress.cloud) + len(stress.left_out),
-                rays=len(stress.origins),
+                rays=len(stress.rays[0]),
                 did=did,
                 error=float(np.where(np.isfinite(error), error, 1.0).max(initial=0.0)),
                 bound=float(truth.rays.width.max(initial=0.0)),
@@ -195,13 +165,11 @@ class ReferenceVisibility:
             "response_degree": stress.response_degree,
         }
         traced = traced_cloud(stress.cloud, scene)
-        rays = visibility_enclosure(
-            traced, stress.origins, stress.directions, stop=stress.options.stop, middle=scene.origin, **rules
-        )
+        rays = visibility_enclosure(traced, *stress.rays, stop=stress.options.stop, middle=scene.origin, **rules)
         raising = 0.0
         if scene.report.raised_scales:
             own = _without_zero_scales(stress.cloud, traced)
-            unraised = visibility_reference(own, stress.origins, stress.directions, **rules)
+            unraised = visibility_reference(own, *stress.rays, **rules)
             raising = float(np.abs(unraised - rays.exact).max(initial=0.0))
         return cls(rays, raising)
 
@@ -261,8 +229,7 @@ def _surface_faults(stress: Stress, scene: Scene, truth: ReferenceVisibility) ->
     hits = [
         closest_surface(
             scene,
-            stress.origins,
-            stress.directions,
+            *stress.rays,
             t_max=stress.t_max,
             threshold=threshold,
             options=replace(stress.options, acceptance="product"),
@@ -293,13 +260,13 @@ def _bernoulli_faults(stress: Stress, scene: Scene, truth: ReferenceVisibility) 
     |mean of (b - V)| <= sqrt(2 s L) + L / (3 n), s the mean variance over n, L = ln(2 / delta). It holds for few rays
     and rare hits too, where the mean is far from normal.
     """
-    count = BERNOULLI_SEEDS * len(stress.origins)
+    count = BERNOULLI_SEEDS * len(stress.rays[0])
     if not count:
         return []
     options = replace(stress.options, acceptance="bernoulli")
     drawn = np.array(
         [
-            visibility(scene, stress.origins, stress.directions, t_max=stress.t_max, options=options, seed=seed)
+            visibility(scene, *stress.rays, t_max=stress.t_max, options=options, seed=seed)
             for seed in range(BERNOULLI_SEEDS)
         ]
     )
@@ -338,6 +305,3 @@ def _done(stress: Stress, scene: Scene, raising: float) -> str:
     if shift > 10.0 * max(scene.extent, 1e-30) and shift > 1.0:
         actions.append(f"recentred by {shift:.3g} m")
     return ", ".join(actions) or "nothing"
-
-
-# Building blocks of the cases: each case seeds its own generator, so that it is the same in any selection and order.

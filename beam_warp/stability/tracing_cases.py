@@ -6,13 +6,13 @@ A case gives no tolerance; `beam_warp.stability.tracing` derives the interval of
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_choice
+from beam_warp.stability.suite import StabilityCase
 from beam_warp.trace.reference import visibility_reference
 from beam_warp.trace.transmittance import EXACT, TraceOptions
 from beam_warp.world.gaussians import GaussianCloud, InvalidRows
@@ -27,8 +27,7 @@ class Stress:
 
     Attributes:
         cloud: What is traced.
-        origins: Ray origins [m], ``(N, 3)``.
-        directions: Unit directions, ``(N, 3)``.
+        rays: Ray origins [m] and unit directions, ``(N, 3)`` each.
         t_max: Reach [m], one number or ``(N,)``.
         options: Rules of the trace.
         response_degree: 2 or 4.
@@ -40,8 +39,7 @@ class Stress:
     """
 
     cloud: GaussianCloud
-    origins: NDArray[np.float32]
-    directions: NDArray[np.float32]
+    rays: tuple[NDArray[np.float32], NDArray[np.float32]]
     t_max: Any = np.inf
     options: TraceOptions = EXACT
     response_degree: Any = 2
@@ -52,47 +50,20 @@ class Stress:
     occlusion_points: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
 
-@dataclass(frozen=True)
-class StressCase:
-    """One entry of the registry.
-
-    Attributes:
-        name: Short and unique.
-        fails: How a tracer without precautions fails here.
-        build: Makes the scene; the same each time.
-        large: Needs minutes or gigabytes; run on request.
-    """
-
-    name: str
-    fails: str
-    build: Callable[[], Stress]
-    large: bool
-
-
-CASES: list[StressCase] = []
+CASES: list[StabilityCase[Stress]] = []
 """Every case, in the order of the table."""
 
 
 def stress_case(
-    name: str, fails: str, *, large: bool = False
-) -> Callable[[Callable[[], Stress]], Callable[[], Stress]]:
-    """Register the function below it as a case."""
+    seed: int, name: str, fails: str, *, large: bool = False
+) -> Callable[[Callable[[np.random.Generator], Stress]], Callable[[np.random.Generator], Stress]]:
+    """Register the function below it as a case, which is given a generator of its own: the same in any selection."""
 
-    def register(build: Callable[[], Stress]) -> Callable[[], Stress]:
-        CASES.append(StressCase(name, fails, build, large))
-        return build
+    def register(make: Callable[[np.random.Generator], Stress]) -> Callable[[np.random.Generator], Stress]:
+        CASES.append(StabilityCase(name, fails, "", lambda: make(np.random.default_rng(seed)), large))
+        return make
 
     return register
-
-
-def case_of(name: str) -> StressCase:
-    """Return a case by its name.
-
-    Raises:
-        InvalidOptionError: There is none.
-    """
-    require_choice("case", name, tuple(case.name for case in CASES))
-    return next(case for case in CASES if case.name == name)
 
 
 def _unit(vectors: NDArray[Any]) -> NDArray[np.float32]:
@@ -104,6 +75,11 @@ def _orientations(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
     """Return uniform rotations, xyzw."""
     q = rng.normal(size=(count, 4))
     return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _unturned(count: int) -> NDArray[np.float64]:
+    """Return rotations by nothing, xyzw."""
+    return np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
 
 
 def _cloud(
@@ -155,68 +131,54 @@ def box_planes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.fl
     return (cloud.positions - half).astype(np.float32), (cloud.positions + half).astype(np.float32)
 
 
-@stress_case("round", "nothing: the control")
-def _round() -> Stress:
-    rng = np.random.default_rng(1)
+@stress_case(1, "round", "nothing: the control")
+def _round(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 600, 0.05 * np.exp(rng.normal(0.0, 0.4, (600, 3))))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 600, "raised_scales": 0})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"traced": 600, "raised_scales": 0})
 
 
-@stress_case("round, degree 4", "a support radius of degree 2 for a response of degree 4 cuts or leaks")
-def _quartic() -> Stress:
-    rng = np.random.default_rng(2)
+@stress_case(2, "round, degree 4", "a support radius of degree 2 for a response of degree 4 cuts or leaks")
+def _quartic(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 600, 0.05 * np.exp(rng.normal(0.0, 0.4, (600, 3))))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, response_degree=4)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), response_degree=4)
 
 
-@stress_case("needles 1:10⁴", "the discriminant of the quadratic cancels: errors of 1")
-def _needles() -> Stress:
-    rng = np.random.default_rng(3)
+@stress_case(3, "needles 1:10⁴", "the discriminant of the quadratic cancels: errors of 1")
+def _needles(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, (0.1, 1.001e-5, 1.001e-5))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 0})
 
 
-@stress_case("needles 1:10⁶", "beyond float32: M has entries 10⁶ apart")
-def _thinner_needles() -> Stress:
-    rng = np.random.default_rng(4)
+@stress_case(4, "needles 1:10⁶", "beyond float32: M has entries 10⁶ apart")
+def _thinner_needles(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, (0.1, 1e-7, 1e-7))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 400})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 400})
 
 
-@stress_case("needles along the ray", "the whitened direction is short and its error large")
-def _along_needles() -> Stress:
-    rng = np.random.default_rng(5)
+@stress_case(5, "needles along the ray", "the whitened direction is short and its error large")
+def _along_needles(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 300, (0.1, 1.001e-5, 1.001e-5))
     index = rng.integers(0, 300, 300)
     axes = rotation_matrices(cloud.orientations)[index, :, 0]
     tilt = 10.0 ** rng.uniform(-6.0, -2.0, (300, 1)) * rng.normal(size=(300, 3))
     d = _unit(axes + tilt)
-    return Stress(cloud=cloud, origins=(cloud.positions[index] - 0.6 * d).astype(np.float32), directions=d)
+    return Stress(cloud=cloud, rays=((cloud.positions[index] - 0.6 * d).astype(np.float32), d))
 
 
-@stress_case("discs 1:10⁴", "thin along one axis: the same cancellation")
-def _discs() -> Stress:
-    rng = np.random.default_rng(6)
+@stress_case(6, "discs 1:10⁴", "thin along one axis: the same cancellation")
+def _discs(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, (0.1, 0.1, 1.001e-5), opacities=(0.02, 0.4))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 0})
 
 
-@stress_case("discs of no thickness", "1 / 0")
-def _flat() -> Stress:
-    rng = np.random.default_rng(7)
+@stress_case(7, "discs of no thickness", "1 / 0")
+def _flat(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, (0.1, 0.1, 0.0), opacities=(0.02, 0.4))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 400})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 400})
 
 
-@stress_case("discs, grazing rays", "the peak slides far along a ray that hardly crosses the disc")
-def _grazing() -> Stress:
-    rng = np.random.default_rng(8)
+@stress_case(8, "discs, grazing rays", "the peak slides far along a ray that hardly crosses the disc")
+def _grazing(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 300, (0.1, 0.1, 1e-4), opacities=(0.02, 0.4))
     index = rng.integers(0, 300, 400)
     frames = rotation_matrices(cloud.orientations)[index]
@@ -224,72 +186,59 @@ def _grazing() -> Stress:
     within = np.stack([np.cos(angle), np.sin(angle), 10.0 ** rng.uniform(-6.0, -1.0, 400)], axis=1)
     d = _unit(np.einsum("nij,nj->ni", frames, within))
     target = cloud.positions[index] + frames[:, :, 2] * (1e-4 * rng.normal(size=(400, 1)))
-    return Stress(cloud=cloud, origins=(target - 0.5 * d).astype(np.float32), directions=d)
+    return Stress(cloud=cloud, rays=((target - 0.5 * d).astype(np.float32), d))
 
 
-@stress_case("σ = 10⁻⁶, one metre away", "float32 rays are 0.06 σ coarse: the best that any tracer can do")
-def _tiny() -> Stress:
-    rng = np.random.default_rng(9)
+@stress_case(9, "σ = 10⁻⁶, one metre away", "float32 rays are 0.06 σ coarse: the best that any tracer can do")
+def _tiny(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, 1e-6 * np.exp(rng.uniform(0.0, 2.0, (400, 3))))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 0})
 
 
-@stress_case("scales of 0", "1 / 0 along every axis")
-def _points() -> Stress:
-    rng = np.random.default_rng(10)
+@stress_case(10, "scales of 0", "1 / 0 along every axis")
+def _points(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 200, 0.0)
-    origins, directions = aimed_rays(rng, cloud, 200)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 200})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 200), expected={"raised_scales": 200})
 
 
-@stress_case("10⁴ from the origin", "an affine form M o + b loses every digit")
-def _far_away() -> Stress:
-    rng = np.random.default_rng(11)
+@stress_case(11, "10⁴ from the origin", "an affine form M o + b loses every digit")
+def _far_away(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 500, 0.05 * np.exp(rng.normal(0.0, 0.4, (500, 3))))
     cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 500})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"traced": 500})
 
 
-@stress_case("10⁴ from the origin, thin", "the same, and the centres' own grid of 1 mm is coarser than σ")
-def _far_away_thin() -> Stress:
-    rng = np.random.default_rng(12)
+@stress_case(12, "10⁴ from the origin, thin", "the same, and the centres' own grid of 1 mm is coarser than σ")
+def _far_away_thin(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 500, (0.05, 0.05, 4e-4))
     cloud = cloud.with_arrays(positions=cloud.positions + np.array([1e4, -1e4, 1e4], np.float32))
-    origins, directions = aimed_rays(rng, cloud, 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"raised_scales": 0})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300), expected={"raised_scales": 0})
 
 
-@stress_case("rays from 10³ extents away", "o - μ loses three digits; box tests lose hits")
-def _long_rays() -> Stress:
-    rng = np.random.default_rng(13)
+@stress_case(13, "rays from 10³ extents away", "o - μ loses three digits; box tests lose hits")
+def _long_rays(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, 0.1 * np.exp(rng.normal(0.0, 0.3, (400, 3))), opacities=(0.05, 0.5))
-    origins, directions = aimed_rays(rng, cloud, 300, distance=(1.9e3, 2.1e3))
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300, distance=(1.9e3, 2.1e3)))
 
 
-@stress_case("two clusters, 10⁵ of their sizes apart", "no middle suits both: o - c keeps two digits")
-def _clusters() -> Stress:
-    rng = np.random.default_rng(35)
+@stress_case(35, "two clusters, 10⁵ of their sizes apart", "no middle suits both: o - c keeps two digits")
+def _clusters(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, 1e-3 * np.exp(rng.normal(0.0, 0.3, (400, 3))), side=0.01, opacities=(0.05, 0.6))
     side = np.where(np.arange(400) % 2 == 0, 500.0, -500.0)[:, None] * np.array([1.0, 0.3, -0.7])
     cloud = cloud.with_arrays(positions=cloud.positions + side)
-    origins, directions = aimed_rays(rng, cloud, 300, distance=(0.0, 0.05))
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300, distance=(0.0, 0.05)))
 
 
-@stress_case("axis-parallel rays", "1 / 0 in the box test")
-def _parallel() -> Stress:
-    rng = np.random.default_rng(14)
+@stress_case(14, "axis-parallel rays", "1 / 0 in the box test")
+def _parallel(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 500, 0.08 * np.exp(rng.normal(0.0, 0.4, (500, 3))), opacities=(0.05, 0.6))
-    origins, directions = aimed_rays(rng, cloud, 300, directions=_axis_parallel(rng, 300))
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300, directions=_axis_parallel(rng, 300)))
 
 
-@stress_case("axis-parallel rays on box planes", "0 · ∞ is NaN in the box test: boxes that a ray touches are missed")
-def _on_planes() -> Stress:
-    rng = np.random.default_rng(15)
+@stress_case(
+    15, "axis-parallel rays on box planes", "0 · ∞ is NaN in the box test: boxes that a ray touches are missed"
+)
+def _on_planes(rng: np.random.Generator) -> Stress:
     # A grid whose middle is the origin exactly, so that box planes are at the same floats in world and scene.
     side = np.linspace(-1.0, 1.0, 5)
     positions = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -298,7 +247,7 @@ def _on_planes() -> Stress:
         125,
         rng.uniform(0.1, 0.3, (125, 3)),
         positions=positions,
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (125, 1)),
+        orientations=_unturned(125),
         opacities=(0.05, 0.6),
     )
     count = 900
@@ -308,90 +257,76 @@ def _on_planes() -> Stress:
     origins = np.where(nudge < 0, np.nextafter(origins, np.float32(-9.0)), origins)
     origins = np.where(nudge > 0, np.nextafter(origins, np.float32(9.0)), origins)
     d = _axis_parallel(rng, count)
-    return Stress(cloud=cloud, origins=np.where(d != 0.0, -3.0 * d, origins).astype(np.float32), directions=d)
+    return Stress(cloud=cloud, rays=(np.where(d != 0.0, -3.0 * d, origins).astype(np.float32), d))
 
 
-@stress_case("denormal direction components", "1 / 10⁻⁴⁵ overflows to infinity, and 0 · ∞ follows")
-def _denormal() -> Stress:
-    rng = np.random.default_rng(16)
+@stress_case(16, "denormal direction components", "1 / 10⁻⁴⁵ overflows to infinity, and 0 · ∞ follows")
+def _denormal(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, 0.1 * np.exp(rng.normal(0.0, 0.4, (400, 3))), opacities=(0.05, 0.5))
     d = _axis_parallel(rng, 400)
     tiny = np.float32(10.0) ** rng.uniform(-44.0, -9.0, (400, 3)).astype(np.float32)
     d = np.where(d == 0.0, tiny * rng.choice(np.array([-1.0, 1.0], np.float32), (400, 3)), d).astype(np.float32)
-    origins, directions = aimed_rays(rng, cloud, 400, directions=d)
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 400, directions=d))
 
 
-@stress_case("10⁴ coincident Gaussians", "no split separates them: endless recursion, or a stack that overflows")
-def _coincident() -> Stress:
-    rng = np.random.default_rng(17)
+@stress_case(17, "10⁴ coincident Gaussians", "no split separates them: endless recursion, or a stack that overflows")
+def _coincident(rng: np.random.Generator) -> Stress:
     cloud = _cloud(
         rng,
         10_000,
         0.1,
         positions=np.zeros((10_000, 3)),
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (10_000, 1)),
+        orientations=_unturned(10_000),
         opacities=np.full(10_000, 1.0 / 250.0),
     )
-    origins, directions = aimed_rays(rng, cloud, 30, spread=0.3)
-    origins[:10] += 1.0  # these miss all
+    rays = aimed_rays(rng, cloud, 30, spread=0.3)
+    rays[0][:10] += 1.0  # these miss all
     known = np.full(30, np.nan)
     known[:10] = 1.0
-    return Stress(cloud=cloud, origins=origins, directions=directions, known=known, expected={"traced": 10_000})
+    return Stress(cloud=cloud, rays=rays, known=known, expected={"traced": 10_000})
 
 
-@stress_case("duplicates on 2⁻ᵏ", "each split halves nothing but space: the tree grows as deep as the series")
-def _chain() -> Stress:
-    rng = np.random.default_rng(18)
+@stress_case(18, "duplicates on 2⁻ᵏ", "each split halves nothing but space: the tree grows as deep as the series")
+def _chain(rng: np.random.Generator) -> Stress:
     place = np.repeat(2.0 ** -np.arange(100.0), 8)
     cloud = _cloud(
         rng, 800, (place * 0.2)[:, None], positions=place[:, None] * np.array([1.0, 0.5, 0.25]), opacities=(0.02, 0.2)
     )
-    origins, directions = aimed_rays(rng, cloud, 200)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": 800})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 200), expected={"traced": 800})
 
 
-@stress_case("all centres on a line", "boxes of centres with no area: costs of 0 / 0")
-def _line() -> Stress:
-    rng = np.random.default_rng(19)
+@stress_case(19, "all centres on a line", "boxes of centres with no area: costs of 0 / 0")
+def _line(rng: np.random.Generator) -> Stress:
     positions = rng.uniform(-1.0, 1.0, (500, 1)) * np.array([1.0, 0.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
-    origins, directions = aimed_rays(rng, cloud, 200)
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 200))
 
 
-@stress_case("all centres on a plane", "one axis without extent: 0 / 0 in Morton codes")
-def _plane() -> Stress:
-    rng = np.random.default_rng(20)
+@stress_case(20, "all centres on a plane", "one axis without extent: 0 / 0 in Morton codes")
+def _plane(rng: np.random.Generator) -> Stress:
     positions = rng.uniform(-1.0, 1.0, (500, 3)) * np.array([1.0, 1.0, 0.0])
     cloud = _cloud(rng, 500, rng.uniform(0.01, 0.05, (500, 3)), positions=positions)
-    origins, directions = aimed_rays(rng, cloud, 200)
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 200))
 
 
-@stress_case("all centres at one point, other shapes", "no extent at all")
-def _one_place() -> Stress:
-    rng = np.random.default_rng(21)
+@stress_case(21, "all centres at one point, other shapes", "no extent at all")
+def _one_place(rng: np.random.Generator) -> Stress:
     cloud = _cloud(
         rng, 300, rng.uniform(0.01, 0.2, (300, 3)), positions=np.tile([3.0, 1.0, 2.0], (300, 1)), opacities=(0.01, 0.05)
     )
-    origins, directions = aimed_rays(rng, cloud, 200)
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 200))
 
 
-@stress_case("opacity 0, 1/255, just above, 1", "log 0, a radius of 0, 1 / (1 - α)")
-def _opacities() -> Stress:
-    rng = np.random.default_rng(22)
+@stress_case(22, "opacity 0, 1/255, just above, 1", "log 0, a radius of 0, 1 / (1 - α)")
+def _opacities(rng: np.random.Generator) -> Stress:
     cut = np.float32(1.0 / 255.0)
     levels = np.array([0.0, cut, np.nextafter(cut, np.float32(1.0)), 1.001 * cut, 0.99, 1.0], np.float32)
     cloud = _cloud(rng, 600, 0.05, opacities=np.repeat(levels, 100))
-    origins, directions = aimed_rays(rng, cloud, 400, spread=0.5)
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"dropped": 200, "traced": 400})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 400, spread=0.5), expected={"dropped": 200, "traced": 400})
 
 
-@stress_case("broken rows", "one NaN centre makes every bound, and so every ray, NaN")
-def _broken() -> Stress:
-    rng = np.random.default_rng(23)
+@stress_case(23, "broken rows", "one NaN centre makes every bound, and so every ray, NaN")
+def _broken(rng: np.random.Generator) -> Stress:
     good = _cloud(rng, 500, 0.05 * np.exp(rng.normal(0.0, 0.4, (500, 3))))
     arrays: dict[str, Any] = {name: np.repeat(array, 2, axis=0) for name, array in good.arrays().items()}
     for row, (name, value) in enumerate(
@@ -401,36 +336,31 @@ def _broken() -> Stress:
     arrays["scales"][300:320:2, 1] = -0.1
     arrays["orientations"][400:420:2] = 0.0
     cloud, left_out = GaussianCloud.leaving_out_invalid(**arrays)
-    origins, directions = aimed_rays(rng, cloud, 300)
     return Stress(
         cloud=cloud,
-        origins=origins,
-        directions=directions,
+        rays=aimed_rays(rng, cloud, 300),
         left_out=left_out,
         expected={"traced": 920, "not_finite": 0},
         expected_left_out=(60, 10, 10),
     )
 
 
-@stress_case("rays that start inside, peak in front", "half of a Gaussian counts, or all of it, or none")
-def _inside_peak() -> Stress:
-    rng = np.random.default_rng(24)
+@stress_case(24, "rays that start inside, peak in front", "half of a Gaussian counts, or all of it, or none")
+def _inside_peak(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 300, rng.uniform(0.1, 0.4, (300, 3)), opacities=(0.02, 0.3))
-    origins, directions = aimed_rays(rng, cloud, 300, distance=(-0.1, 0.1))
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 300, distance=(-0.1, 0.1)))
 
 
-@stress_case("rays that start inside, entry in front", "the same; the rule of 3DGRT")
-def _inside_entry() -> Stress:
-    rng = np.random.default_rng(25)
+@stress_case(25, "rays that start inside, entry in front", "the same; the rule of 3DGRT")
+def _inside_entry(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 300, rng.uniform(0.1, 0.4, (300, 3)), opacities=(0.02, 0.3))
-    origins, directions = aimed_rays(rng, cloud, 300, distance=(-0.1, 0.6))
-    return Stress(cloud=cloud, origins=origins, directions=directions, options=TraceOptions(front="entry"))
+    return Stress(
+        cloud=cloud, rays=aimed_rays(rng, cloud, 300, distance=(-0.1, 0.6)), options=TraceOptions(front="entry")
+    )
 
 
-@stress_case("offset 0", "a ray that starts in a centre meets its own Gaussian, or not, by chance")
-def _no_offset() -> Stress:
-    rng = np.random.default_rng(26)
+@stress_case(26, "offset 0", "a ray that starts in a centre meets its own Gaussian, or not, by chance")
+def _no_offset(rng: np.random.Generator) -> Stress:
     side = (np.arange(20) - 9.5) * 0.05
     positions = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     cloud = _cloud(
@@ -438,60 +368,44 @@ def _no_offset() -> Stress:
         400,
         (0.0325, 0.0325, 0.00325),
         positions=positions,
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (400, 1)),
+        orientations=_unturned(400),
         opacities=np.full(400, 0.95),
     )
     up = rng.normal(size=(400, 3))
     up[:, 2] = np.abs(up[:, 2])
     normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (400, 1))
-    return Stress(cloud=cloud, origins=positions, directions=_unit(up), occlusion_points=(positions, normals))
+    return Stress(cloud=cloud, rays=(positions, _unit(up)), occlusion_points=(positions, normals))
 
 
-@stress_case("offset 0, culled by normal", "the layer that a ray starts from hides it from the light")
-def _culled() -> Stress:
-    stress = _no_offset()
+@stress_case(26, "offset 0, culled by normal", "the layer that a ray starts from hides it from the light")
+def _culled(rng: np.random.Generator) -> Stress:
+    stress = _no_offset(rng)
     assert stress.occlusion_points is not None
-    return Stress(
-        cloud=stress.cloud.with_arrays(normals=stress.occlusion_points[1]),
-        origins=stress.origins,
-        directions=stress.directions,
-        options=TraceOptions(cull=True),
-        known=np.ones(400),
-        occlusion_points=stress.occlusion_points,
-    )
+    cloud = stress.cloud.with_arrays(normals=stress.occlusion_points[1])
+    return replace(stress, cloud=cloud, options=TraceOptions(cull=True), known=np.ones(400))
 
 
-@stress_case("σ from 10⁻⁵ to 10² in one scene", "one grid, one offset or one epsilon for all of them")
-def _ratios() -> Stress:
-    rng = np.random.default_rng(27)
+@stress_case(27, "σ from 10⁻⁵ to 10² in one scene", "one grid, one offset or one epsilon for all of them")
+def _ratios(rng: np.random.Generator) -> Stress:
     scales = 10.0 ** rng.uniform(-4.6, 2.0, (800, 1)) * rng.uniform(0.5, 1.0, (800, 3))
     opacities = np.where(scales.max(axis=1) > 0.3, 0.01, rng.uniform(0.1, 1.0, 800))
     cloud = _cloud(rng, 800, scales, opacities=opacities)
-    origins, directions = aimed_rays(rng, cloud.select(np.flatnonzero(opacities > 0.01)), 300)
-    return Stress(cloud=cloud, origins=origins, directions=directions)
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud.select(np.flatnonzero(opacities > 0.01)), 300))
 
 
-@stress_case("t_max cuts through Gaussians", "boxes in reach whose peak is not")
-def _reach() -> Stress:
-    rng = np.random.default_rng(28)
+@stress_case(28, "t_max cuts through Gaussians", "boxes in reach whose peak is not")
+def _reach(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 400, rng.uniform(0.05, 0.3, (400, 3)), opacities=(0.02, 0.3))
-    origins, directions = aimed_rays(rng, cloud, 400, distance=(0.5, 0.5))
+    rays = aimed_rays(rng, cloud, 400, distance=(0.5, 0.5))
     t_max = 0.5 + 0.1 * rng.normal(size=400)
     t_max[:20], t_max[20:40] = 0.0, np.inf
     known = np.full(400, np.nan)
     known[:20] = 1.0
-    return Stress(
-        cloud=cloud,
-        origins=origins,
-        directions=directions,
-        t_max=np.maximum(t_max, 0.0).astype(np.float32),
-        known=known,
-    )
+    return Stress(cloud=cloud, rays=rays, t_max=np.maximum(t_max, 0.0).astype(np.float32), known=known)
 
 
-@stress_case("forth and back", "front-to-back shortcuts that depend on the direction")
-def _symmetry() -> Stress:
-    rng = np.random.default_rng(29)
+@stress_case(29, "forth and back", "front-to-back shortcuts that depend on the direction")
+def _symmetry(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 500, 0.06 * np.exp(rng.normal(0.0, 0.4, (500, 3))), opacities=(0.05, 0.6))
     # On a grid of 2^-10, with axis-parallel directions, the reversed ray lies on the same line to the last bit.
     d = _axis_parallel(rng, 200)
@@ -500,21 +414,19 @@ def _symmetry() -> Stress:
     forth = visibility_reference(cloud, start, d)
     return Stress(
         cloud=cloud,
-        origins=np.concatenate([start, end]).astype(np.float32),
-        directions=np.concatenate([d, -d]),
+        rays=(np.concatenate([start, end]).astype(np.float32), np.concatenate([d, -d])),
         known=np.tile(forth, 2),
     )
 
 
-@stress_case("one Gaussian", "a tree without an inner node")
-def _one() -> Stress:
-    rng = np.random.default_rng(30)
+@stress_case(30, "one Gaussian", "a tree without an inner node")
+def _one(rng: np.random.Generator) -> Stress:
     cloud = _cloud(
         rng,
         1,
         [0.1, 0.2, 0.3],
         positions=np.array([[1.0, 2.0, 3.0]]),
-        orientations=np.array([[0.0, 0.0, 0.0, 1.0]]),
+        orientations=_unturned(1),
         opacities=np.array([0.7]),
     )
     z = np.linspace(-1.2, 1.2, 49)
@@ -523,51 +435,43 @@ def _one() -> Stress:
     alpha = float(cloud.opacities[0]) * np.exp(-0.5 * np.square(offset / float(cloud.scales[0, 2])))
     return Stress(
         cloud=cloud,
-        origins=origins,
-        directions=np.tile(np.array([1.0, 0.0, 0.0], np.float32), (49, 1)),
+        rays=(origins, np.tile(np.array([1.0, 0.0, 0.0], np.float32), (49, 1))),
         known=np.where(alpha >= 1.0 / 255.0, 1.0 - alpha, 1.0),
         expected={"traced": 1},
     )
 
 
-@stress_case("no Gaussian", "an empty array, a box of infinities")
-def _none() -> Stress:
-    rng = np.random.default_rng(31)
+@stress_case(31, "no Gaussian", "an empty array, a box of infinities")
+def _none(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 1, 0.1).select(np.arange(0))
     return Stress(
         cloud=cloud,
-        origins=rng.normal(size=(50, 3)).astype(np.float32),
-        directions=_unit(rng.normal(size=(50, 3))),
+        rays=(rng.normal(size=(50, 3)).astype(np.float32), _unit(rng.normal(size=(50, 3)))),
         known=np.ones(50),
         expected={"traced": 0},
         occlusion_points=(np.zeros((3, 3), np.float32), np.tile(np.array([0.0, 0.0, 1.0], np.float32), (3, 1))),
     )
 
 
-@stress_case("none that can be seen", "a tree over nothing")
-def _invisible() -> Stress:
-    rng = np.random.default_rng(32)
+@stress_case(32, "none that can be seen", "a tree over nothing")
+def _invisible(rng: np.random.Generator) -> Stress:
     cloud = _cloud(rng, 100, 0.1, opacities=np.full(100, 1.0 / 300.0))
-    origins, directions = aimed_rays(rng, cloud, 50)
     return Stress(
-        cloud=cloud, origins=origins, directions=directions, known=np.ones(50), expected={"traced": 0, "dropped": 100}
+        cloud=cloud, rays=aimed_rays(rng, cloud, 50), known=np.ones(50), expected={"traced": 0, "dropped": 100}
     )
 
 
-@stress_case("no rays", "a launch of size 0")
-def _no_rays() -> Stress:
-    rng = np.random.default_rng(33)
+@stress_case(33, "no rays", "a launch of size 0")
+def _no_rays(rng: np.random.Generator) -> Stress:
     nothing = np.zeros((0, 3), np.float32)
-    return Stress(cloud=_cloud(rng, 10, 0.1), origins=nothing, directions=nothing)
+    return Stress(cloud=_cloud(rng, 10, 0.1), rays=(nothing, nothing))
 
 
-@stress_case("2 million Gaussians", "indices of 16 bits, stacks of 32, quadratic builds", large=True)
-def _two_million() -> Stress:
-    rng = np.random.default_rng(34)
+@stress_case(34, "2 million Gaussians", "indices of 16 bits, stacks of 32, quadratic builds", large=True)
+def _two_million(rng: np.random.Generator) -> Stress:
     count = 2_000_000
     direction = _unit(rng.normal(size=(count, 3)))
     positions = direction * (1.0 + 0.01 * rng.normal(size=(count, 1)))
     scales = 0.001 * np.exp(rng.normal(0.0, 0.3, (count, 3)))
     cloud = _cloud(rng, count, scales, positions=positions, opacities=(0.02, 0.6))
-    origins, directions = aimed_rays(rng, cloud, 192, distance=(0.05, 1.5))
-    return Stress(cloud=cloud, origins=origins, directions=directions, expected={"traced": count})
+    return Stress(cloud=cloud, rays=aimed_rays(rng, cloud, 192, distance=(0.05, 1.5)), expected={"traced": count})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +26,8 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.materials_plan import MaterialsPlan
 from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews
-from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
-from beam_warp.study.tracing import device_name
+from beam_warp.study.table import Interval, Metric, Row, Settings, Study, StudySubject
+from beam_warp.study.tracing import SENTENCES, axes_of, device_name
 from beam_warp.study.tracing_plan import parse_offset
 from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
 from beam_warp.trace.scene import Scene
@@ -111,14 +111,11 @@ def materials_study(
     """
     chosen, target = plan or MaterialsPlan(), resolve_device(device)
     bench = _Bench(subject, chosen, target)
-    axes = (
-        Axis("rays", "Rays", chosen.rays, "rays", "Rays a Gaussian; a pixel's for occlusion, and twice for light."),
-        *(Axis(name, name.capitalize(), levels, "", _SENTENCES[name]) for name, levels in chosen.axes().items()),
-    )
+    rays = "Rays a Gaussian; a pixel's for occlusion, and twice for light."
     described = StudySubject(
         name="materials",
         title=f"Error against time of materials: {subject.name}, {len(subject.cloud):,} Gaussians",
-        axes=axes,
+        axes=axes_of(chosen.axes(), chosen.rays, rays, _SENTENCES),
         metrics=(
             Metric(
                 OCCLUSION,
@@ -155,10 +152,9 @@ def materials_study(
 
 
 _SENTENCES = {
+    **SENTENCES,
     "path": "direct: rays from every Gaussian. images: rays from every pixel of every view, baked.",
-    "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
     "offset": "Lift of ray origins: auto, by what lies above the surface, or metres.",
-    "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
     "ratio": "ratio: exact unshadowed light times a ratio of two estimates. plain: one estimate.",
     "bounce": "Light from other surfaces, by their captured radiance.",
     "weight": "What the specular lobe leaves for diffusion.",
@@ -246,33 +242,28 @@ class _Bench:
         """Return what views show, made once and timed the second time: the first compiles."""
         key = observed, offset
         if key not in self._prepared:
-            make = self._maker(observed, offset)
-            make()
+            self._show(observed, offset)
             started = time.perf_counter()
-            evidence, points = make()
+            evidence, points = self._show(observed, offset)
             wp.synchronize_device(self.device)
             self._prepared[key] = _Prepared(evidence, points, time.perf_counter() - started)
         return self._prepared[key]
 
-    def _maker(self, observed: str, offset: str) -> Callable[[], tuple[ViewEvidence, SurfacePoints]]:
+    def _show(self, observed: str, offset: str) -> tuple[ViewEvidence, SurfacePoints]:
+        """Return what views show of the Gaussians, and the points that light is measured at."""
         subject, device = self.subject, str(self.device)
-        cloud = without_color(subject.cloud) if observed == "images" else subject.cloud
         kind, metres = parse_offset(offset)
-
-        def make() -> tuple[ViewEvidence, SurfacePoints]:
-            scene = Scene.from_gaussians(subject.cloud, device)
-            evidence = view_evidence(
-                cloud,
-                [view.camera for view in subject.views],
-                subject.views,
-                options=subject.raster,
-                ceiling=subject.ceiling,
-                device=device,
-            )
-            lift: Any = "auto" if kind == "auto" else metres
-            return evidence, SurfacePoints.seen_by(subject.cloud, evidence, scene, lift)
-
-        return make
+        scene = Scene.from_gaussians(subject.cloud, device)
+        evidence = view_evidence(
+            without_color(subject.cloud) if observed == "images" else subject.cloud,
+            [view.camera for view in subject.views],
+            subject.views,
+            options=subject.raster,
+            ceiling=subject.ceiling,
+            device=device,
+        )
+        lift: Any = "auto" if kind == "auto" else metres
+        return evidence, SurfacePoints.seen_by(subject.cloud, evidence, scene, lift)
 
     def _direct(self, settings: Settings, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return base colour and ambient occlusion by the direct path."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from beam_warp.checks import require_choice, require_count
+from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError
 from beam_warp.materials.direct import DIFFUSE_WEIGHTS
 from beam_warp.study.table import Settings
-from beam_warp.study.tracing_plan import RATIOS, offset_label, parse_offset
+from beam_warp.study.tracing_plan import RATIOS, check_levels, parse_offset
 from beam_warp.trace.denoise import DENOISERS
 from beam_warp.trace.incident import DENSITIES
 from beam_warp.trace.sampling import SAMPLERS
@@ -62,31 +62,22 @@ class MaterialsPlan:
 
     def __post_init__(self) -> None:
         """Check every option once."""
-        for name, choices in (
-            ("paths", PATHS),
-            ("samplers", SAMPLERS),
-            ("densities", DENSITIES),
-            ("ratios", RATIOS),
-            ("bounces", BOUNCES),
-            ("weights", tuple(DIFFUSE_WEIGHTS)),
-            ("fits", FITS),
-            ("observed", OBSERVED),
-            ("denoisers", DENOISERS),
-        ):
-            for value in getattr(self, name):
-                require_choice(name, value, choices)
-        object.__setattr__(self, "offsets", tuple(map(offset_label, self.offsets)))
+        choices = {
+            "paths": PATHS,
+            "samplers": SAMPLERS,
+            "densities": DENSITIES,
+            "ratios": RATIOS,
+            "bounces": BOUNCES,
+            "weights": tuple(DIFFUSE_WEIGHTS),
+            "fits": FITS,
+            "observed": OBSERVED,
+            "denoisers": DENOISERS,
+        }
+        check_levels(self, choices, most_rays=4096)
         for label in self.offsets:
             if parse_offset(label)[0] == "thicknesses":
                 raise InvalidOptionError(f"offsets must be auto or metres such as 0.02, got {label!r}. Choose those.")
-        for count in self.rays:
-            require_count("rays", count, 4, 4096)
-        for name, values in vars(self).items():
-            if isinstance(values, tuple) and (not values or len(set(values)) < len(values)):
-                raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
-        object.__setattr__(self, "rays", tuple(sorted(self.rays)))
         require_count("reference_rays", self.reference_rays, 4, 4096)
-        require_count("repeats", self.repeats, 1, 100)
 
     def axes(self) -> dict[str, tuple[str, ...]]:
         """Return the levels of every factor but rays, by its name."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from beam_warp.checks import require_package
 from beam_warp.image.files import replacing
-from beam_warp.study.table import TOLERANCE, Interval, Table
+from beam_warp.study.table import TOLERANCE, Table
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 1.2em auto; max-width: 1500px; padding: 0 1em; color: #222; }
@@ -55,15 +55,5 @@ def write_page(table: Table, path: Path) -> None:
 def _data(table: Table) -> dict[str, Any]:
     """Return a table as the page's script reads it: an interval is [value, low, high]."""
 
-    def numbers(interval: Interval) -> list[float]:
-        return [interval.value, interval.low, interval.high]
-
-    rows = [
-        {
-            "settings": dict(row.settings),
-            "cost": numbers(row.cost),
-            "errors": {name: numbers(interval) for name, interval in row.errors.items()},
-        }
-        for row in table.rows
-    ]
+    rows = [{"settings": dict(row.settings), "cost": row.cost, "errors": dict(row.errors)} for row in table.rows]
     return {"subject": asdict(table.subject), "rows": rows, "tolerance": TOLERANCE}

@@ -219,8 +219,7 @@ def draw_curves(axes: Any, table: Table, metric: Metric) -> None:
     axes.grid(True, which="major", color="#dddddd", linewidth=0.7)
     axes.grid(True, which="minor", color="#f0f0f0", linewidth=0.5)
     axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
     draw_legend(axes, table, metric, colors, markers, strokes)
 
 
@@ -376,5 +375,4 @@ def draw_effect(axes: Any, table: Table, metric: Metric) -> None:
     axes.set_xlim(0.0, 1.12 * max([error.high for error in errors] + [1e-12]))
     axes.set_title(metric.title, fontsize=11, loc="left", fontweight="bold")
     axes.tick_params(labelsize=9)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,8 +102,7 @@ class Metric:
     sentence: str = ""
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """A value with its confidence interval."""
 
     value: float
@@ -431,12 +430,8 @@ def _cells(subject: StudySubject, row: Row) -> list[str]:
             f"row must have the axes and metrics of its study, got {sorted(unknown)}. Declare them."
         )
     intervals = [row.cost, *(row.errors.get(metric.name) for metric in subject.metrics)]
-    numbers = ["" if v is None else repr(float(n)) for v in intervals for n in (_numbers(v) if v else (0.0,) * 3)]
+    numbers = ["" if v is None else repr(float(n)) for v in intervals for n in (v or (0.0,) * 3)]
     return [*_key(subject, row.settings), *numbers]
-
-
-def _numbers(interval: Interval) -> tuple[float, float, float]:
-    return interval.value, interval.low, interval.high
 
 
 def _row(subject: StudySubject, cells: Sequence[str]) -> Row:

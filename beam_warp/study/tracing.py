@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def tracing_study(
     subject = StudySubject(
         name="tracing",
         title=f"Error against time of traced visibility: {name}, {len(cloud):,} Gaussians, {device_name(target)}",
-        axes=tracing_axes(plan),
+        axes=axes_of(plan.axes(), plan.rays, "Rays per point.", SENTENCES),
         metrics=bench.metrics(environment_name),
         cost=f"Time for all {len(cloud):,} Gaussians",
         cost_unit="s",
@@ -111,27 +112,23 @@ def tracing_study(
     return Study(subject, ordered, bench.measure, bench.work)
 
 
-def tracing_axes(plan: TracingPlan) -> tuple[Axis, ...]:
-    """Return the factors of the study."""
-    sentences = {
-        "acceptance": "product: transmittances multiply, exact. bernoulli: every hit blocks by chance, unbiased.",
-        "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
-        "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
-        "ratio": "ratio: exact unshadowed irradiance times a ratio of two estimates. plain: one estimate.",
-        "offset": "Lift of ray origins: metres, or t, standard deviations of the local thickness; "
-        f"auto is {LIFT_IN_THICKNESSES:g}t.",
-    }
-    levels = {
-        "acceptance": plan.acceptances,
-        "sampler": plan.samplers,
-        "density": plan.densities,
-        "ratio": plan.ratios,
-        "offset": plan.offsets,
-    }
-    return (
-        Axis("rays", "Rays", plan.rays, "rays", "Rays per point."),
-        *(Axis(name, name.capitalize(), levels[name], "", sentences[name]) for name in levels),
-    )
+SENTENCES = {
+    "acceptance": "product: transmittances multiply, exact. bernoulli: every hit blocks by chance, unbiased.",
+    "sampler": "owen: scrambled Sobol' points. stratified: one random point a stratum. iid: independent points.",
+    "density": "product: light times cosine. environment: light. cosine. mis: half cosine, half light, balanced.",
+    "ratio": "ratio: exact unshadowed irradiance times a ratio of two estimates. plain: one estimate.",
+    "offset": "Lift of ray origins: metres, or t, standard deviations of the local thickness; "
+    f"auto is {LIFT_IN_THICKNESSES:g}t.",
+}
+"""What the levels of each factor mean."""
+
+
+def axes_of(
+    levels: Mapping[str, tuple[str, ...]], rays: tuple[int, ...], meaning: str, sentences: Mapping[str, str]
+) -> tuple[Axis, ...]:
+    """Return the factors of a study: its rays, which mean this, and all others in words."""
+    named = (Axis(name, name.capitalize(), values, "", sentences[name]) for name, values in levels.items())
+    return (Axis("rays", "Rays", rays, "rays", meaning), *named)
 
 
 def _plan_note(plan: TracingPlan) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Literal
@@ -15,8 +15,6 @@ from beam_warp.trace.sampling import SAMPLERS
 from beam_warp.trace.transmittance import ACCEPTANCES
 
 RATIOS = ("ratio", "plain")
-
-REPEATS = 3
 
 
 @dataclass(frozen=True)
@@ -50,50 +48,63 @@ class TracingPlan:
     crossing: Literal["star", "full"] = "star"
     points: int | None = None
     reference_rays: int = 16384
-    repeats: int = REPEATS
+    repeats: int = 3
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Check every option once."""
-        for name, choices in (
-            ("acceptances", ACCEPTANCES),
-            ("samplers", SAMPLERS),
-            ("densities", DENSITIES),
-            ("ratios", RATIOS),
-        ):
-            for value in getattr(self, name):
-                require_choice(name, value, choices)
-        object.__setattr__(self, "offsets", tuple(map(offset_label, self.offsets)))
-        for count in self.rays:
-            # Fewest that every estimator takes: half of the rays of mis come from either density, and pair up
-            require_count("rays", count, 4, 1 << 16)
-        for name in ("acceptances", "samplers", "offsets", "densities", "ratios", "rays"):
-            values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
-        object.__setattr__(self, "rays", tuple(sorted(self.rays)))
+        choices = {"acceptances": ACCEPTANCES, "samplers": SAMPLERS, "densities": DENSITIES, "ratios": RATIOS}
+        check_levels(self, choices, most_rays=1 << 16)
         require_choice("crossing", self.crossing, ("star", "full"))
         if self.points is not None:
             require_count("points", self.points, 2, 1 << 20)
         require_count("reference_rays", self.reference_rays, 4, 1 << 20)
-        require_count("repeats", self.repeats, 1, 100)
         require_count("seed", self.seed, 0, 2**31 - 1)
+
+    def axes(self) -> dict[str, tuple[str, ...]]:
+        """Return the levels of every factor but rays, by its name."""
+        return {
+            "acceptance": self.acceptances,
+            "sampler": self.samplers,
+            "density": self.densities,
+            "ratio": self.ratios,
+            "offset": self.offsets,
+        }
 
     def occlusion_settings(self) -> list[Settings]:
         """Return the settings of ambient occlusion without rays, the most telling first."""
-        axes = {"acceptance": self.acceptances, "sampler": self.samplers, "offset": self.offsets}
+        axes = {name: self.axes()[name] for name in ("acceptance", "sampler", "offset")}
         return _crossed(axes, self.crossing, ({"acceptance", "sampler"}, {"offset"}))
 
     def irradiance_settings(self) -> list[Settings]:
         """Return the settings of irradiance without rays; the offset stays at its default."""
-        axes = {
-            "acceptance": self.acceptances,
-            "sampler": self.samplers,
-            "offset": self.offsets[:1],
-            "density": self.densities,
-            "ratio": self.ratios,
-        }
+        axes = self.axes() | {"offset": self.offsets[:1]}
         return _crossed(axes, self.crossing, ({"density", "ratio"}, {"sampler"}, {"acceptance"}))
+
+
+def check_levels(plan: Any, choices: Mapping[str, tuple[str, ...]], *, most_rays: int) -> None:
+    """Check the levels of a plan, name its offsets as charts do, and sort its rays.
+
+    Args:
+        plan: A frozen dataclass, whose tuples are the levels of its factors.
+        choices: What the levels of some factors are chosen from, by the factor's name.
+        most_rays: Most rays of a level.
+
+    Raises:
+        InvalidOptionError: A level is none of its choices, out of range or given twice.
+    """
+    for name, known in choices.items():
+        for value in getattr(plan, name):
+            require_choice(name, value, known)
+    object.__setattr__(plan, "offsets", tuple(map(offset_label, plan.offsets)))
+    for count in plan.rays:
+        # Fewest that every estimator takes: half of the rays of mis come from either density, and pair up
+        require_count("rays", count, 4, most_rays)
+    for name, values in vars(plan).items():
+        if isinstance(values, tuple) and (not values or len(set(values)) < len(values)):
+            raise InvalidOptionError(f"{name} must be one or more different values, got {values}. Name each once.")
+    object.__setattr__(plan, "rays", tuple(sorted(plan.rays)))
+    require_count("repeats", plan.repeats, 1, 100)
 
 
 def parse_offset(text: str) -> tuple[Literal["auto", "metres", "thicknesses"], float]:

@@ -47,12 +47,16 @@ def perfect(tiny_capture):
     return PerfectFrame.of(tiny_capture, 0, 800, resolve_device("cpu"))
 
 
+@pytest.fixture(scope="module")
+def grey(perfect):
+    count = len(perfect.cloud)
+    return Materials(np.full((count, 3), 0.25, np.float32), np.full(count, 0.5, np.float32))
+
+
 class TestScores:
-    def test_true_materials_score_by_what_is_drawn_alone(self, tiny_capture, perfect):
+    def test_true_materials_score_by_what_is_drawn_alone(self, tiny_capture, perfect, grey):
         """One base colour, and the truth is compared with it: the error is the truth's spread, in closed form."""
         truth = TruthViews(tiny_capture, 0, SHARP, 1, "cpu")
-        count = len(perfect.cloud)
-        grey = Materials(np.full((count, 3), 0.25, np.float32), np.full(count, 0.5, np.float32))
         found = truth.score(perfect.cloud, grey)
         exact = truth.records[0].truth()
         solid = exact.channels["A"] > 0.999
@@ -63,11 +67,9 @@ class TestScores:
         # The least-squares scale of a constant is the mean over it.
         np.testing.assert_allclose(found["base_color"]["scale"], colors.mean(axis=0) / 0.25, rtol=1e-3)
 
-    def test_coverage_is_told_from_the_values(self, tiny_capture, perfect):
+    def test_coverage_is_told_from_the_values(self, tiny_capture, perfect, grey):
         truth = TruthViews(tiny_capture, 0, SHARP, 1, "cpu")
-        count = len(perfect.cloud)
-        found = Materials(np.full((count, 3), 0.25, np.float32), np.full(count, 0.5, np.float32))
-        scores = truth.score(perfect.cloud.with_arrays(scales=1.5 * perfect.cloud.scales), found)
+        scores = truth.score(perfect.cloud.with_arrays(scales=1.5 * perfect.cloud.scales), grey)
         assert scores["ambient_occlusion"]["true_coverage_psnr"] > scores["ambient_occlusion"]["psnr"]
 
     def test_light_is_compared_with_many_rays(self, perfect):

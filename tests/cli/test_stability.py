@@ -16,11 +16,12 @@ from beam_warp.stability import tracing_cases as stress_cases
 from beam_warp.stability.capture_cases.cameras import black_camera
 
 NAMES = ("one Gaussian", "broken rows", "2 million Gaussians")
+TRACING_CASES = {case.name: case for case in stress_cases.CASES}
 
 
 @pytest.fixture(autouse=True)
 def few_cases(monkeypatch):
-    monkeypatch.setattr(stress_cases, "CASES", [stress_cases.case_of(name) for name in NAMES])
+    monkeypatch.setattr(stress_cases, "CASES", [TRACING_CASES[name] for name in NAMES])
     disc = next(shape for shape in analytic_occlusion.SHAPES if shape.name == "coaxial disc")
     assert stability_page.CAPTURE_CASES  # imported before: tables name all of them
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [])
@@ -63,7 +64,7 @@ def test_tables_and_a_page_of_two_devices(tmp_path, capsys):
     row = next(line for line in page.splitlines() if line.startswith("| broken rows |"))
     assert "60 not finite, 10 with a negative scale, 10 with a zero quaternion | left out |" in row
     assert row.endswith("| ok |")
-    assert f"| Some GPU, fast: {fault} |" in page
+    assert f"| Some GPU, {stability.HIERARCHIES[0]}: {fault} |" in page
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "page.md"]
 
 
@@ -81,7 +82,7 @@ def test_quietly_a_page_keeps_what_was_not_run(tmp_path, capsys):
 
 
 def test_a_fault_is_told_and_exits_with_one(monkeypatch, capsys):
-    case = stress_cases.case_of("one Gaussian")
+    case = TRACING_CASES["one Gaussian"]
     broken = dataclasses.replace(case, build=lambda: dataclasses.replace(case.build(), expected={"traced": 2}))
     monkeypatch.setattr(stress_cases, "CASES", [broken])
     assert run("--quiet") == 1

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from beam_warp.demo.figure import SKELETON
 from beam_warp.errors import InvalidArrayError, MissingFileError
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.stability.capture_cases import CAPTURE_CASES
 from beam_warp.stability.capture_cases.alterations import evenly, training_cameras, with_every
 from beam_warp.stability.capture_cases.cameras import (
     black_camera,
@@ -126,13 +125,7 @@ class TestTraced:
         assert second > first + 5.0  # some of the ball's 30 pixels are beside the figure
 
 
-class TestRegistry:
-    def test_names_are_unique_and_what_is_expected_is_said(self):
-        names = [case.name for case in CAPTURE_CASES]
-        assert len(set(names)) == len(names)
-        assert names[0] == "as it is"
-        assert all(case.fails and case.must for case in CAPTURE_CASES)
-
+class TestDetections:
     def test_an_inspection_is_read_by_code_and_camera(self):
         said = [
             SimpleNamespace(code="camera-exposure", what="1 camera is off", where="train_1 +1.0"),

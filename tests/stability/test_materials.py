@@ -8,14 +8,7 @@ import pytest
 from beam_warp.errors import BeamError
 from beam_warp.materials.agreement import judge_environment
 from beam_warp.materials.base_color import BaseColor
-from beam_warp.stability.material_cases import (
-    MATERIAL_CASES,
-    MIRROR_ROUGHNESS,
-    SUN_OVER_MEAN,
-    MaterialCase,
-    MaterialStudio,
-    sun,
-)
+from beam_warp.stability.material_cases import MATERIAL_CASES, MIRROR_ROUGHNESS, SUN_OVER_MEAN, MaterialStudio, sun
 from beam_warp.stability.materials import (
     TITLES,
     Bench,
@@ -24,10 +17,10 @@ from beam_warp.stability.materials import (
     cells,
     decompose,
     run_material_case,
-    run_material_cases,
     silent_part,
 )
 from beam_warp.stability.page import case_table
+from beam_warp.stability.suite import StabilityCase
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
@@ -41,7 +34,8 @@ def studio():
 
 @pytest.fixture(scope="module")
 def outcomes(studio):
-    return {outcome.case: outcome for outcome in run_material_cases(studio, MATERIAL_CASES)}
+    bench = Bench(studio)
+    return {case.name: run_material_case(bench, case) for case in MATERIAL_CASES}
 
 
 @pytest.mark.slow
@@ -121,31 +115,27 @@ def test_the_varnish_is_known_to_one_case_only(studio):
     assert (unknown.roughness > 2 * MIRROR_ROUGHNESS).all()
 
 
-def case_of(build, name="trial"):
-    return MaterialCase(name, "", "", build)
+def faults_of(studio, stress):
+    return run_material_case(Bench(studio), StabilityCase("trial", "", "", lambda _: stress)).faults
 
 
 def test_what_must_be_found_and_is_not_is_a_fault(studio):
     stress = replace(studio.plain, finding="environment-turned", flags=Observability.UNLIT, hit=studio.plain.hit | True)
-    faults = run_material_case(Bench(studio), case_of(lambda _: stress)).faults
+    faults = faults_of(studio, stress)
     assert faults[0] == "not found: environment-turned"
     assert "flagged as UNLIT, 90% must be" in faults[1]
 
 
 def test_what_is_found_and_is_not_is_a_fault(studio):
     stress = replace(studio.plain, environment=studio.plain.environment.exposed(-3.0))
-    assert (
-        "found where it is not: environment-exposure"
-        in run_material_case(Bench(studio), case_of(lambda _: stress)).faults
-    )
+    assert "found where it is not: environment-exposure" in faults_of(studio, stress)
 
 
 def test_refusals_are_judged(studio):
     black = replace(studio.plain, environment=EnvironmentMap(np.zeros((16, 32, 3))))
-    [fault] = run_material_case(Bench(studio), case_of(lambda _: black)).faults
+    [fault] = faults_of(studio, black)
     assert fault.startswith("refused: environment must shed light")
-    fine = replace(studio.plain, refused=True)
-    assert run_material_case(Bench(studio), case_of(lambda _: fine)).faults == ("must be refused, and was not",)
+    assert faults_of(studio, replace(studio.plain, refused=True)) == ("must be refused, and was not",)
     with pytest.raises(BeamError):
         decompose(Bench(studio), black)
 
@@ -155,8 +145,7 @@ def test_crashes_are_told(studio, monkeypatch):
         raise ZeroDivisionError("division by zero")
 
     monkeypatch.setattr("beam_warp.stability.materials.decompose", crash)
-    outcome = run_material_case(Bench(studio), case_of(lambda studio: studio.plain))
-    assert outcome.faults == ("ended with ZeroDivisionError: division by zero",)
+    assert faults_of(studio, studio.plain) == ("ended with ZeroDivisionError: division by zero",)
 
 
 def solved(error, stated, flags):

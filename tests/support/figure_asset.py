@@ -6,9 +6,9 @@ from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 
 DISCS = 6_000
-SH_BASIS_0 = 0.28209479177387814
 OPENNESS = 0.8
 
 
@@ -33,7 +33,7 @@ def figure_asset(size=48, frame_count=2, metadata=None):
                 orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
                 scales=np.tile([0.010, 0.010, 1e-3], (DISCS, 1)),
                 opacities=np.full(DISCS, 0.99),
-                radiance=((color - 0.5) / SH_BASIS_0)[:, None, :],
+                radiance=((color - 0.5) / SH_C0)[:, None, :],
                 radiance_color_space=LINEAR_REC709,
                 base_color=color,
                 roughness=np.clip(mesh.interpolate(mesh.roughness, faces, weights), 0.0, 1.0),

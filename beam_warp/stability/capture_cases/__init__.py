@@ -23,3 +23,6 @@ CAPTURE_CASES = [
     subjects.object_appears,
 ]
 """Every case, in the order of the table; the first is the capture as it is."""
+
+TRACED_CASES = [subjects.no_texture, subjects.self_contact, subjects.object_appears]
+"""Cases that show another subject than a given capture, and are path traced."""

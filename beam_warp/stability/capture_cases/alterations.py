@@ -89,9 +89,3 @@ def evenly(names: Sequence[str], count: int) -> tuple[str, ...]:
     if count > len(names):
         raise InvalidArrayError(f"capture must have {count} training cameras, got {len(names)}. Choose a larger one.")
     return tuple(names[index * len(names) // count] for index in range(count))
-
-
-def _victim(capture: Capture) -> str:
-    """Return the camera that something happens to: one of the middle."""
-    names = training_cameras(capture)
-    return names[len(names) // 2]

@@ -15,9 +15,9 @@ from beam_warp.stability.capture_cases.case import (
     MISSING_IMAGE,
     CaptureStress,
     Detection,
-    capture_case,
 )
 from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.suite import stability_case
 
 WRONG_EXPOSURE = 2.0
 SLIGHTLY_WRONG_EXPOSURE = 2.0**-0.5
@@ -39,7 +39,7 @@ def _altered(at: StressStudio, code: str, *, gain: float, coverage: float = 1.0)
     )
 
 
-@capture_case(
+@stability_case(
     "black camera", "black is trained into every Gaussian that the camera sees", "the camera detected and left out"
 )
 def black_camera(at: StressStudio) -> CaptureStress:
@@ -47,7 +47,7 @@ def black_camera(at: StressStudio) -> CaptureStress:
     return _altered(at, BLACK_IMAGE, gain=0.0)
 
 
-@capture_case(
+@stability_case(
     "empty camera",
     "one mask of nothing carves all of the subject out of the visual hull",
     "the camera detected and left out",
@@ -57,7 +57,7 @@ def empty_camera(at: StressStudio) -> CaptureStress:
     return _altered(at, EMPTY_MASK, gain=0.0, coverage=0.0)
 
 
-@capture_case(
+@stability_case(
     "camera without files",
     "the run ends with a stack trace after minutes, when the file is first opened",
     "refused before anything is optimised, or the camera detected and left out",
@@ -75,7 +75,7 @@ def camera_without_files(at: StressStudio) -> CaptureStress:
     )
 
 
-@capture_case(
+@stability_case(
     "camera that stops",
     "loops over cameras that were counted in the first frame read another camera's image",
     "the camera's absence detected from the second frame on",
@@ -88,7 +88,7 @@ def camera_that_stops(at: StressStudio) -> CaptureStress:
     return CaptureStress(capture=replace(base, records=kept), required=(Detection(FRAME_LACKS_CAMERAS, name),))
 
 
-@capture_case(
+@stability_case(
     "wrong exposure",
     "one camera is twice as bright: colour that depends on direction takes it up, floaters stand before the camera",
     "the camera's exposure detected, and corrected or left out",
@@ -98,7 +98,7 @@ def wrong_exposure(at: StressStudio) -> CaptureStress:
     return _altered(at, CAMERA_EXPOSURE, gain=WRONG_EXPOSURE)
 
 
-@capture_case(
+@stability_case(
     "exposure half a stop off",
     "the same, where no histogram shows it: light from one side makes views differ by more",
     "the camera's exposure detected, and corrected",
@@ -108,7 +108,7 @@ def slightly_wrong_exposure(at: StressStudio) -> CaptureStress:
     return _altered(at, CAMERA_EXPOSURE, gain=SLIGHTLY_WRONG_EXPOSURE)
 
 
-@capture_case(
+@stability_case(
     "4 cameras",
     "training views are matched by Gaussians that no other view confirms",
     "few views detected; geometry held by the hull and by smoothness",
@@ -121,7 +121,7 @@ def four_cameras(at: StressStudio) -> CaptureStress:
     )
 
 
-@capture_case(
+@stability_case(
     "8 cameras",
     "concave parts that two cameras at most see bulge to the hull",
     "reconstructed; what is lost against all cameras is told",

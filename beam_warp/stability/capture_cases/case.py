@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.findings import Finding
-from beam_warp.stability.capture_cases.studio import StressStudio
 
 BLACK_IMAGE = "black-image"
 EMPTY_MASK = "empty-mask"
@@ -87,29 +86,3 @@ class CaptureStress:
     required: tuple[Detection, ...] = ()
     may_refuse: bool = False
     is_sound: bool = False
-
-
-@dataclass(frozen=True)
-class CaptureCase:
-    """A stress capture by name, how reconstructions fail on it, and how it is made.
-
-    Attributes:
-        name: Short and unique.
-        fails: How a reconstruction without precautions fails here.
-        must: What is asked of this one.
-        build: Makes the capture; the same each time.
-        traced: Whether the case shows another subject than a given capture, and is path traced.
-    """
-
-    name: str
-    fails: str
-    must: str
-    build: Callable[[StressStudio], CaptureStress]
-    traced: bool
-
-
-def capture_case(
-    name: str, fails: str, must: str, *, traced: bool = False
-) -> Callable[[Callable[[StressStudio], CaptureStress]], CaptureCase]:
-    """Make a case of the function below it."""
-    return lambda build: CaptureCase(name, fails, must, build, traced)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from beam_warp.demo.figure import Figure
 from beam_warp.stability.capture_cases.alterations import with_every
-from beam_warp.stability.capture_cases.case import NEW_SURFACE, CaptureStress, Detection, capture_case
+from beam_warp.stability.capture_cases.case import NEW_SURFACE, CaptureStress, Detection
 from beam_warp.stability.capture_cases.studio import StressStudio
+from beam_warp.stability.suite import stability_case
 from beam_warp.world.mesh import MaterialMesh
 
 GREY = 0.35
@@ -31,13 +32,13 @@ SPHERE_CENTER = (0.42, -0.30, 0.14)
 SPHERE_COLOR = (0.65, 0.12, 0.08)
 
 
-@capture_case("as it is", "nothing fails here", "nothing detected: what is found elsewhere is no habit")
+@stability_case("as it is", "nothing fails here", "nothing detected: what is found elsewhere is no habit")
 def as_it_is(at: StressStudio) -> CaptureStress:
     """The capture, unchanged."""
     return CaptureStress(capture=at.base(), is_sound=True)
 
 
-@capture_case(
+@stability_case(
     "every second frame",
     "motion of several pixels a frame drives Gaussians into the nearest colour that fits",
     "followed, or the loss detected and a key frame started",
@@ -47,17 +48,16 @@ def every_second_frame(at: StressStudio) -> CaptureStress:
     return CaptureStress(capture=with_every(at.base(), 2))
 
 
-@capture_case("every third frame", "the same, faster", "followed, or the loss detected and a key frame started")
+@stability_case("every third frame", "the same, faster", "followed, or the loss detected and a key frame started")
 def every_third_frame(at: StressStudio) -> CaptureStress:
     """Motion three times as fast."""
     return CaptureStress(capture=with_every(at.base(), 3))
 
 
-@capture_case(
+@stability_case(
     "no texture",
     "colour says nothing about where a point went: Gaussians slide over the surface",
     "outlines and shading hold the surface; drift is reported",
-    traced=True,
 )
 def no_texture(at: StressStudio) -> CaptureStress:
     """The figure in one grey."""
@@ -75,22 +75,20 @@ def no_texture(at: StressStudio) -> CaptureStress:
     return CaptureStress(capture=at.traced("no texture", plain))
 
 
-@capture_case(
+@stability_case(
     "self-contact",
     "what is near in space but not on the surface is smoothed together: hands tear off a piece of the dress",
     "hands and dress keep apart in the motion; drift is reported",
-    traced=True,
 )
 def self_contact(at: StressStudio) -> CaptureStress:
     """The figure lowers its hands until they touch its dress."""
     return CaptureStress(capture=at.traced("self-contact", lambda: touching(at.figure, at.frame_count)))
 
 
-@capture_case(
+@stability_case(
     "an object appears",
     "nothing is there to move: Gaussians of the feet are stretched over the ball",
     "new surface detected in the frame where it appears, and a key frame started",
-    traced=True,
 )
 def object_appears(at: StressStudio) -> CaptureStress:
     """A ball lies beside the feet from the middle frame on."""

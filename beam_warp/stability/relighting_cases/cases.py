@@ -6,7 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from beam_warp.stability.relighting_cases.scenes import RelightStudio
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.stability.relighting_cases.measures import WRONG_PART, wrong_parts
 from beam_warp.world.shot import RenderedImage, Shot
 
 DEFERRED, PATH = "deferred", "path"
@@ -78,32 +81,23 @@ class RelightStress:
     done: str = "nothing"
 
 
-Build = Callable[[RelightStudio], RelightStress]
+def shadow_demands(
+    dark: Callable[[Drawn], NDArray[np.bool_]], expected: NDArray[np.bool_], judged: NDArray[np.bool_]
+) -> tuple[Demand, Demand]:
+    """Return that few pixels may be falsely shadowed, and few falsely lit, where the wall's shadow is known.
 
-
-@dataclass(frozen=True)
-class RelightingCase:
-    """A case, by name.
-
-    Attributes:
-        name: Name of the case, in words.
-        fails: How a renderer without precautions fails.
-        must: What is asked.
-        build: Makes it.
-        large: Whether it is run on request only.
+    Args:
+        dark: Returns which pixels are in shadow, ``(H, W)``.
+        expected: Pixels that must be, ``(H, W)``.
+        judged: Pixels of which that is known, ``(H, W)``.
     """
-
-    name: str
-    fails: str
-    must: str
-    build: Callable[[RelightStudio], RelightStress]
-    large: bool = False
-
-
-def relighting_case(name: str, fails: str, must: str, *, large: bool = False) -> Callable[[Build], RelightingCase]:
-    """Make a case of the function that follows, which builds its shots."""
-
-    def make(build: Build) -> RelightingCase:
-        return RelightingCase(name, fails, must, build, large)
-
-    return make
+    shadowed, lit = (
+        Demand(
+            what=what,
+            measure=lambda drawn, part=part: wrong_parts(dark(drawn), expected, judged)[part],
+            high=WRONG_PART,
+            because="height / tan 10° long: closed form, 1 px and half a Gaussian from edges",
+        )
+        for part, what in enumerate(("falsely shadowed", "falsely lit"))
+    )
+    return shadowed, lit

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import Demand, RelightStress, relighting_case
-from beam_warp.stability.relighting_cases.measures import WRONG_PART, wall_seen, wall_shadow, wrong_parts
+from beam_warp.stability.relighting_cases.cases import Demand, RelightStress, shadow_demands
+from beam_warp.stability.relighting_cases.measures import wall_seen, wall_shadow
 from beam_warp.stability.relighting_cases.scenes import (
     GRAZING,
     RADIUS,
@@ -15,12 +15,13 @@ from beam_warp.stability.relighting_cases.scenes import (
     sun_at,
     white,
 )
+from beam_warp.stability.suite import stability_case
 from beam_warp.world.camera import Camera
 from beam_warp.world.shapes import tile
 from beam_warp.world.shot import Shot
 
 
-@relighting_case(
+@stability_case(
     "shadow catcher far from everything", "0 / 0 where no light is missing: grey ground", "nothing seen of it"
 )
 def far_catcher(studio: RelightStudio) -> RelightStress:
@@ -55,7 +56,7 @@ def far_catcher(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "shadow catcher under grazing light",
     "the catcher shadows itself, or loses the shadow's foot",
     "the wall's shadow, sharp",
@@ -67,13 +68,5 @@ def grazing_catcher(studio: RelightStudio) -> RelightStress:
     wall = relightable(tile(studio.wall()), 0.8)
     return RelightStress(
         shots=(Shot(cloud=wall, camera=camera, lights=(sun_at(GRAZING),), mesh=square(5.0, catches=True)),),
-        demands=tuple(
-            Demand(
-                what=what,
-                measure=lambda drawn, lit=lit: wrong_parts(drawn.images[0].alpha > 0.5, expected, judged)[lit],
-                high=WRONG_PART,
-                because="height / tan 10° long: closed form, 1 px and half a Gaussian from edges",
-            )
-            for lit, what in enumerate(("falsely shadowed", "falsely lit"))
-        ),
+        demands=shadow_demands(lambda drawn: drawn.images[0].alpha > 0.5, expected, judged),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, Drawn, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, Drawn, RelightStress
 from beam_warp.stability.relighting_cases.measures import (
     FURNACE,
     brightness,
@@ -14,6 +14,7 @@ from beam_warp.stability.relighting_cases.measures import (
     sky_closed_form,
 )
 from beam_warp.stability.relighting_cases.scenes import RelightStudio, firefly, white
+from beam_warp.stability.suite import stability_case
 from beam_warp.world.lights import SUN_DIAMETER, DirectionalLight
 from beam_warp.world.shot import Shot
 
@@ -66,7 +67,7 @@ def _highlight(studio: RelightStudio, roughness: float, first: int) -> tuple[tup
     return tuple(Shot(cloud=cloud, camera=camera, lights=(sun,)) for sun in suns), demands
 
 
-@relighting_case("roughness 0.03", "D overflows, lobes miss the sun: fireflies or nothing", "energy, and highlights")
+@stability_case("roughness 0.03", "D overflows, lobes miss the sun: fireflies or nothing", "energy, and highlights")
 def nearly_mirror(studio: RelightStudio) -> RelightStress:
     """A plane that is almost a mirror."""
     shots, demands = _furnace(studio, 0.03)
@@ -74,7 +75,7 @@ def nearly_mirror(studio: RelightStudio) -> RelightStress:
     return RelightStress(shots=shots + more, demands=demands + others)
 
 
-@relighting_case("roughness 1", "the widest lobe loses energy at grazing", "energy, and highlights")
+@stability_case("roughness 1", "the widest lobe loses energy at grazing", "energy, and highlights")
 def fully_rough(studio: RelightStudio) -> RelightStress:
     """A plane that is as rough as can be."""
     shots, demands = _furnace(studio, 1.0)
@@ -82,7 +83,7 @@ def fully_rough(studio: RelightStudio) -> RelightStress:
     return RelightStress(shots=shots + more, demands=demands + others)
 
 
-@relighting_case(
+@stability_case(
     "firefly environment",
     "few samples find the texel: black images with white dots",
     "the mean right, and little noise",
@@ -134,9 +135,7 @@ def hot_texel(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
-    "black and missing environment", "0 / 0 in tables of where light comes from", "black, coverage as ever"
-)
+@stability_case("black and missing environment", "0 / 0 in tables of where light comes from", "black, coverage as ever")
 def no_light(studio: RelightStudio) -> RelightStress:
     """Even light, a black map, and none."""
     cloud, camera = studio.ball(), studio.at_ball()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import Demand, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.cases import Demand, RelightStress
 from beam_warp.stability.relighting_cases.measures import (
     FURNACE,
     ROUNDING,
@@ -24,15 +24,15 @@ from beam_warp.stability.relighting_cases.scenes import (
     sheet,
     square,
     sun_at,
-    together,
     white,
 )
+from beam_warp.stability.suite import stability_case, together
 from beam_warp.world.camera import Camera
 from beam_warp.world.lights import DirectionalLight
 from beam_warp.world.shot import Shot
 
 
-@relighting_case("empty frame", "arrays of no length, a tree over nothing", "nothing; the floor that is there as ever")
+@stability_case("empty frame", "arrays of no length, a tree over nothing", "nothing; the floor that is there as ever")
 def empty_frame(studio: RelightStudio) -> RelightStress:
     """No Gaussians: alone, and over a floor of triangles."""
     cloud, camera = nothing(studio), studio.at_plane(45.0)
@@ -57,7 +57,7 @@ def empty_frame(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "camera inside Gaussians", "splats of infinite size, rays that start in what they hit", "finite, no light made"
 )
 def camera_inside(studio: RelightStudio) -> RelightStress:
@@ -85,7 +85,7 @@ def camera_inside(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "frames of different counts",
     "what was kept of the frame before: wrong sizes, old shadows",
     "as drawn alone, same bits",
@@ -109,7 +109,7 @@ def different_counts(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case("10⁶ Gaussians", "memory, indices of 16 bits, minutes", "the furnace of a ball", large=True)
+@stability_case("10⁶ Gaussians", "memory, indices of 16 bits, minutes", "the furnace of a ball", large=True)
 def million(studio: RelightStudio) -> RelightStress:
     """A ball of a million Gaussians under even light."""
     cloud = studio.ball(spacing=float(np.sqrt(4.0 * np.pi * RADIUS**2 / 1e6)))
@@ -127,7 +127,7 @@ def million(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "normals that all face away",
     "negative cosines: black, negative or infinite",
     "finite, no light made, coverage as ever",
@@ -156,7 +156,7 @@ def turned_normals(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "a leaking front before a dark inside", "the inside shines through: surfaces look dirty", "the front's own colour"
 )
 def leaking_front(studio: RelightStudio) -> RelightStress:

@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, RelightStress
 from beam_warp.stability.relighting_cases.measures import ROUNDING, largest_difference
 from beam_warp.stability.relighting_cases.scenes import RelightStudio, firefly, sun_at, white
+from beam_warp.stability.suite import stability_case
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import Shot
 
 
-@relighting_case(
+@stability_case(
     "a frame with rows of NaN", "one NaN makes every bound, and so the image, NaN", "as without them, same bits"
 )
 def broken_rows(studio: RelightStudio) -> RelightStress:
@@ -40,7 +41,7 @@ def broken_rows(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case("environment turned by 360°", "a jump in a turntable's last frame", "as not turned at all")
+@stability_case("environment turned by 360°", "a jump in a turntable's last frame", "as not turned at all")
 def full_turn(studio: RelightStudio) -> RelightStress:
     """A sky with one hot texel, as it is and turned once around."""
     cloud, camera = studio.ball(base_color=0.6, roughness=0.3), studio.at_ball()

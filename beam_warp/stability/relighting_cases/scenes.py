@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -117,13 +116,6 @@ def relightable(cloud: GaussianCloud, base_color: float = 1.0, roughness: float 
         roughness=np.full(count, roughness, np.float32),
         ambient_occlusion=np.ones(count, np.float32),
     )
-
-
-def together(*clouds: GaussianCloud) -> GaussianCloud:
-    """Return all Gaussians as one cloud."""
-    names = clouds[0].arrays()
-    arrays: dict[str, Any] = {name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in names}
-    return GaussianCloud(**arrays)
 
 
 def nothing(studio: RelightStudio) -> GaussianCloud:

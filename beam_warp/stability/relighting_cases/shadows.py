@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import DEFERRED, Demand, Drawn, RelightStress, relighting_case
+from beam_warp.stability.relighting_cases.cases import DEFERRED, Demand, Drawn, RelightStress, shadow_demands
 from beam_warp.stability.relighting_cases.measures import (
     ROUNDING,
     WRONG_PART,
@@ -20,12 +20,13 @@ from beam_warp.stability.relighting_cases.measures import (
     wrong_parts,
 )
 from beam_warp.stability.relighting_cases.scenes import ACNE, GRAZING, RADIUS, THICKNESS, WALL, RelightStudio, sun_at
+from beam_warp.stability.suite import stability_case
 from beam_warp.world.lights import PointLight
 from beam_warp.world.shapes import TiledSurface
 from beam_warp.world.shot import Shot
 
 
-@relighting_case(
+@stability_case(
     "light inside the subject", "a shell that leaks glows from within", "the outside dark, whatever the lamp's size"
 )
 def light_inside(studio: RelightStudio) -> RelightStress:
@@ -47,7 +48,7 @@ def light_inside(studio: RelightStudio) -> RelightStress:
     )
 
 
-@relighting_case(
+@stability_case(
     "a lamp on the surface", "1 / 0 at its place, shadows of the surface on itself", "finite; the closed form near it"
 )
 def lamp_on_surface(studio: RelightStudio) -> RelightStress:
@@ -105,9 +106,7 @@ def _wrong_by_reference(drawn: Drawn, lit: bool) -> float:
     return wrong_parts(part < 0.5, expected < 0.5, judged)[int(lit)]
 
 
-@relighting_case(
-    "sun at grazing incidence, bare floor", "acne: Gaussians shadow themselves", "no pixel of it in shadow"
-)
+@stability_case("sun at grazing incidence, bare floor", "acne: Gaussians shadow themselves", "no pixel of it in shadow")
 def acne(studio: RelightStudio) -> RelightStress:
     """A sun of 3 degrees over a floor of many Gaussians: nothing is in its way."""
     cloud, camera, sun = studio.floor(), studio.from_above(), sun_at(ACNE)
@@ -137,25 +136,16 @@ def _behind(studio: RelightStudio, wall: tuple[TiledSurface, ...]) -> RelightStr
     """Return a sun of 10 degrees, and a wall of 15 cm on the floor: its shadow is 85 cm long."""
     cloud, camera, sun = studio.floor(wall), studio.from_above(), sun_at(GRAZING)
     expected, judged = wall_shadow(studio, camera, studio.spacing)
-    names = ("falsely shadowed", "falsely lit")
-    by_form = tuple(
-        Demand(
-            what=what,
-            measure=lambda drawn, lit=lit: wrong_parts(arriving_part(*drawn.images) < 0.5, expected, judged)[lit],
-            high=WRONG_PART,
-            because="height / tan 10° long: closed form, 1 px and half a Gaussian from edges",
-        )
-        for lit, what in enumerate(names)
-    )
+    by_form = shadow_demands(lambda drawn: arriving_part(*drawn.images) < 0.5, expected, judged)
     by_paths = tuple(
         Demand(
-            what=f"{what}, by paths",
+            what=f"{demand.what}, by paths",
             measure=lambda drawn, lit=lit: _wrong_by_reference(drawn, bool(lit)),
             high=WRONG_PART,
             because="of pixels that the reference has lit or shadowed by 3/4, 1 px from edges",
             of=(DEFERRED,),
         )
-        for lit, what in enumerate(names)
+        for lit, demand in enumerate(by_form)
     )
     place, height, half = WALL
     points = floor_points(camera)
@@ -176,7 +166,7 @@ def _behind(studio: RelightStudio, wall: tuple[TiledSurface, ...]) -> RelightStr
     )
 
 
-@relighting_case(
+@stability_case(
     "sun at grazing incidence, a wall",
     "a bias that hides acne takes the shadow off the wall's foot (peter-panning)",
     "shadows where they are, to a pixel",
@@ -186,7 +176,7 @@ def peter_panning(studio: RelightStudio) -> RelightStress:
     return _behind(studio, studio.wall())
 
 
-@relighting_case(
+@stability_case(
     "sun at grazing incidence, a sheet",
     "a layer that faces the sun is lit from its front when it is seen from behind, and lights what is in its shadow",
     "shadows where they are, to a pixel",
