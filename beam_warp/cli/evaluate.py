@@ -81,7 +81,8 @@ def evaluate(args: Evaluate) -> int:
     capture = Capture.read(args.truth)
     sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
 
-    from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
+    from beam_warp.evaluate.asset import evaluate_asset
+    from beam_warp.evaluate.materials import EvaluateOptions
 
     options = EvaluateOptions(
         frames=args.capture_frames or None,

@@ -10,11 +10,8 @@ from typing import Any
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.matching import match_frames, scored_frames
-from beam_warp.checks import require_choice
 from beam_warp.device.arrays import resolve_device
-from beam_warp.evaluate.drawn import SAMPLES
-from beam_warp.evaluate.materials import score_materials
-from beam_warp.evaluate.relighters import RELIGHTERS
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.scores import MaterialScores
 from beam_warp.evaluate.sheet import evaluation_sheet
 from beam_warp.evaluate.views import ScoredView
@@ -22,40 +19,11 @@ from beam_warp.image.files import write_exr, write_png
 from beam_warp.jobs.progress import Progress, no_progress
 from beam_warp.jobs.report import device_facts, versions, write_json
 from beam_warp.jobs.store import make_folders
-from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.preview import opposite_cameras
 from beam_warp.world.gaussians import GaussianSequence
 
 REPORT_NAME = "evaluation.json"
 SHEET_NAME = "evaluation.png"
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """Options of `evaluate_asset`.
-
-    Attributes:
-        frames: The capture's number of every frame of the asset; None takes what the asset states, else 0, 1, 2, ….
-        split: Which records of the capture.
-        raster: How splats are drawn; None draws them as the asset states.
-        samples: Side of the square of samples of a pixel.
-        relighters: Of `beam_warp.evaluate.relighters.RELIGHTERS`.
-        scaled_relighting: Also relight with base colour scaled.
-        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
-    """
-
-    frames: tuple[int, ...] | None = None
-    split: str = "test"
-    raster: RasterOptions | None = None
-    samples: int = SAMPLES
-    relighters: tuple[str, ...] = ("deferred",)
-    scaled_relighting: bool = False
-    device: str | None = None
-
-    def __post_init__(self) -> None:
-        """Check the names."""
-        for name in self.relighters:
-            require_choice("relight", name, tuple(RELIGHTERS))
 
 
 @dataclass(frozen=True)
@@ -111,19 +79,7 @@ def evaluate_asset(
         if out is not None and view.record.name in shown:
             kept[view.record.name] = view
 
-    scores = score_materials(
-        sequence,
-        capture,
-        frames=chosen.frames,
-        split=chosen.split,
-        raster=chosen.raster,
-        samples=chosen.samples,
-        relighters={name: RELIGHTERS[name] for name in chosen.relighters},
-        scaled_relighting=chosen.scaled_relighting,
-        device=chosen.device,
-        observe=observe,
-        progress=progress,
-    )
+    scores = score_materials(sequence, capture, chosen, observe=observe, progress=progress)
     report = {
         **scores.as_dict(),
         "capture": str(capture.folder),

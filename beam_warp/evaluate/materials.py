@@ -9,14 +9,14 @@ follow    `beam_warp.evaluate.steadiness`   base colour over time
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.matching import match_frames, scored_frames
-from beam_warp.checks import require_count
+from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import InvalidOptionError
 from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.drawn import SAMPLES
@@ -41,18 +41,46 @@ GOOD_OVERLAP = 0.8
 Observer = Callable[[ScoredView], None]
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Options of `score_materials` and `beam_warp.evaluate.asset.evaluate_asset`.
+
+    Attributes:
+        frames: The capture's number of every frame of the asset; None takes what the asset's metadata states, else
+            0, 1, 2, ….
+        split: Which records of the capture.
+        raster: How splats are drawn; None draws them as the asset's metadata states.
+        samples: Side of the square of samples of a pixel.
+        relighters: Names in `beam_warp.evaluate.relighters.RELIGHTERS`.
+        scaled_relighting: Also relight with base colour scaled, as is the custom where the capture's light is unknown.
+        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+
+    Raises:
+        InvalidOptionError: There is no such relighter, or the samples are out of range.
+    """
+
+    frames: tuple[int, ...] | None = None
+    split: str = "test"
+    raster: RasterOptions | None = None
+    samples: int = SAMPLES
+    relighters: tuple[str, ...] = ("deferred",)
+    scaled_relighting: bool = False
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check names and samples."""
+        require_count("samples", self.samples, 1, 64)
+        for name in self.relighters:
+            require_choice("relight", name, tuple(RELIGHTERS))
+
+
 def score_materials(
     sequence: GaussianSequence,
     capture: Capture,
+    options: EvaluateOptions | None = None,
     *,
-    frames: Sequence[int] | None = None,
-    split: str = "test",
-    raster: RasterOptions | None = None,
-    samples: int = SAMPLES,
     relighters: Mapping[str, Relighter] | None = None,
-    scaled_relighting: bool = False,
     metrics: PerceptualMetrics | None = None,
-    device: str | None = None,
     observe: Observer | None = None,
     progress: Progress = no_progress,
 ) -> MaterialScores:
@@ -65,15 +93,9 @@ def score_materials(
         sequence: Relightable, in any axes, in the capture's world.
         capture: Its records of the split have ``truth``, and ``relit`` if relighting is to be scored; the light NAME is
             ``truth/NAME.exr``.
-        frames: The capture's number of every frame of the asset; None takes what the asset's metadata states, else
-            0, 1, 2, ….
-        split: Which records.
-        raster: How splats are drawn; None draws them as the asset's metadata states.
-        samples: Side of the square of samples of a pixel.
-        relighters: By name; None takes the deferred one.
-        scaled_relighting: Also relight with base colour scaled, as is the custom where the capture's light is unknown.
+        options: See `EvaluateOptions`.
+        relighters: Ways to relight by name, in place of those that the options name.
         metrics: Perceptual differences; None takes what is installed.
-        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
         observe: Given every view when it is scored; nothing is kept after that.
         progress: Called with (stage, done, total).
 
@@ -86,61 +108,38 @@ def score_materials(
 
     Source: BEAM §4 (bounding box, black background); Stanford-ORB, Kuang et al. 2023 (scale by least squares).
     """
-    require_count("samples", samples, 1, 64)
-    matched = match_frames(sequence, frames)
-    asset = ComparedAsset(sequence, capture, matched, split)
-    drawn = raster or RasterOptions.from_metadata(sequence.metadata)
-    made = {"deferred": RELIGHTERS["deferred"]} if relighters is None else relighters
+    chosen = options or EvaluateOptions()
+    matched = match_frames(sequence, chosen.frames)
+    asset = ComparedAsset(sequence, capture, matched, chosen.split)
+    drawn = chosen.raster or RasterOptions.from_metadata(sequence.metadata)
+    made = {name: RELIGHTERS[name] for name in chosen.relighters} if relighters is None else relighters
     scorer = ViewScorer(
         raster=drawn,
-        samples=samples,
-        renderers={name: make(drawn, samples, device) for name, make in made.items()},
+        samples=chosen.samples,
+        renderers={name: make(drawn, chosen.samples, chosen.device) for name, make in made.items()},
         metrics=metrics or PerceptualMetrics.installed(),
-        device=device,
+        device=chosen.device,
     )
-    shown = scored_frames(capture, matched, split=split)
+    shown = scored_frames(capture, matched, split=chosen.split)
     lights = asset.lights(shown) if scorer.renderers else {}
     _require_overlap(asset, scorer, shown[0])
-    views, scales = _score_views(asset, scorer, shown, lights, observe, progress)
-    scale = scales.of_all()
+    views, color_sums = _score_views(asset, scorer, shown, lights, observe, progress)
+    scale = _scale_of(np.sum(list(color_sums.values()), axis=0)) if color_sums else None
     if scale is not None:
-        views = _with_scale(asset, scorer, views, scale, lights if scaled_relighting else {}, progress)
+        views = _with_scale(asset, scorer, views, scale, lights if chosen.scaled_relighting else {}, progress)
     return MaterialScores(
         views=tuple(views),
         base_color_scale=scale,
-        frame_scales=scales.of_frames(),
+        frame_scales={frame: _scale_of(sums) for frame, sums in color_sums.items()},
         temporal=_temporal(asset, scorer, progress),
-        conditions={"frames": list(shown), "split": split, **scorer.conditions()},
+        conditions={"frames": list(shown), "split": chosen.split, **scorer.conditions()},
         absent=_absent(scorer, views, lights),
         notes=_notes(asset, shown, views),
     )
 
 
-class _ColorScales:
-    """Factors that best carry base colour to its truth, by least squares over the solid pixels of views."""
-
-    def __init__(self) -> None:
-        self._sums: dict[int, NDArray[np.float64]] = {}
-
-    def add(self, view: ScoredView) -> None:
-        """Count the solid pixels of a view; one without true base colour counts nothing."""
-        pair = view.solid_base_color()
-        if pair is not None:
-            a, b = (np.asarray(colors, np.float64) for colors in pair)
-            sums = self._sums.setdefault(view.record.frame, np.zeros((2, 3)))
-            sums += np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0)])
-
-    def of_all(self) -> Scales | None:
-        """Return the factors of all frames together; None without truth."""
-        return _scale_of(np.sum(list(self._sums.values()), axis=0)) if self._sums else None
-
-    def of_frames(self) -> dict[int, Scales]:
-        """Return the factors of every frame by itself."""
-        return {frame: _scale_of(sums) for frame, sums in self._sums.items()}
-
-
 def _scale_of(sums: NDArray[np.float64]) -> Scales:
-    """Return sums of products over sums of squares; 1 where all is black."""
+    """Return the factors that best carry base colour to its truth, by `ScoredView.color_sums`; 1 where all is black."""
     products, squares = sums
     return as_triple(np.divide(products, squares, out=np.ones(3), where=squares > 0.0))
 
@@ -163,21 +162,23 @@ def _score_views(
     lights: Mapping[str, EnvironmentMap],
     observe: Observer | None,
     progress: Progress,
-) -> tuple[list[MaterialViewScores], _ColorScales]:
-    """Draw, relight and score the views of all frames, one frame at a time."""
+) -> tuple[list[MaterialViewScores], dict[int, NDArray[np.float64]]]:
+    """Draw, relight and score the views of all frames, one at a time; return also color sums by frame."""
     views: list[MaterialViewScores] = []
-    scales = _ColorScales()
+    color_sums: dict[int, NDArray[np.float64]] = {}
     total = sum(len(asset.records(frame)) for frame in frames)
     for frame in frames:
         cloud, records = asset.cloud(frame), asset.records(frame)
         for record, relit in zip(records, scorer.relit(cloud, records, lights), strict=True):
             scored = scorer.score(cloud, record, relit)
-            scales.add(scored)
+            sums = scored.color_sums()
+            if sums is not None:
+                color_sums[frame] = color_sums.get(frame, np.zeros((2, 3))) + sums
             views.append(scored.scores)
             if observe is not None:
                 observe(scored)
             progress("score views", len(views), total)
-    return views, scales
+    return views, color_sums
 
 
 def _with_scale(
@@ -198,10 +199,9 @@ def _with_scale(
         relit = scorer.relit(recolored, records, lights) if lights else [{}] * len(records)
         for record, images in zip(records, relit, strict=True):
             truth, view = record.truth(), by_name[record.name]
-            color = scorer.score_scaled_color(cloud, record, truth, scale)
             by_name[record.name] = replace(
                 view,
-                channels={**view.channels, "base_color_scaled": color},
+                channels={**view.channels, **scorer.score_scaled_color(cloud, record, truth, scale)},
                 relit_scaled=scorer.score_relit(record, truth.channels["A"], images),
             )
             done += 1
@@ -214,10 +214,7 @@ def _temporal(asset: ComparedAsset, scorer: ViewScorer, progress: Progress) -> T
     numbers = [number for number, _ in sorted(asset.matched.items(), key=lambda pair: pair[1])]
     gaussians = gaussian_deviation(asset.sequence, numbers)
     surface = surface_scores(
-        asset.sequence,
-        asset.capture,
-        asset.matched,
-        split=asset.split,
+        asset,
         raster=scorer.raster,
         samples=scorer.samples,
         device=scorer.device,

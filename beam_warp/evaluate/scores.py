@@ -15,6 +15,9 @@ from beam_warp.image.metrics import Compared
 
 Scales = tuple[float, float, float]
 
+GEOMETRY = ("normals_median_degrees", "normals_mean_degrees", "depth_median_mm", "overlap")
+"""Scores of a view's normals, depth and coverage."""
+
 
 @dataclass(frozen=True)
 class ImageScore:
@@ -95,10 +98,7 @@ class MaterialViewScores:
             "relit": _as_records(self.relit),
             "relit_scaled": _as_records(self.relit_scaled),
             "base_color_scale": self.base_color_scale,
-            "normals_median_degrees": self.normals_median_degrees,
-            "normals_mean_degrees": self.normals_mean_degrees,
-            "depth_median_mm": self.depth_median_mm,
-            "overlap": self.overlap,
+            **{name: getattr(self, name) for name in GEOMETRY},
         }
 
 
@@ -110,7 +110,7 @@ class MaterialScores:
         views: One by one, in the order of frames.
         base_color_scale: Factor per channel that best carries base colour to the truth, by least squares over the
             solid pixels of all views and frames; None without truth.
-        frame_scales: The same for every frame by itself.
+        frame_scales: The same for every frame by itself; a frame whose true base colour is not known has none.
         temporal: How steady base colour is.
         conditions: How it was measured, JSON-able.
         absent: What could not be measured, by name, and why.
@@ -164,10 +164,7 @@ class MaterialScores:
             },
             "relit_scaled": _as_records(self.mean_relit(scaled=True)),
             "base_color_scale": self.mean_view_scale,
-            **{
-                name: self.mean(name)
-                for name in ("normals_median_degrees", "normals_mean_degrees", "depth_median_mm", "overlap")
-            },
+            **{name: self.mean(name) for name in GEOMETRY},
         }
         return {
             "mean": mean,

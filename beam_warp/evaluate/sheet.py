@@ -49,17 +49,15 @@ def evaluation_sheet(views: Sequence[ScoredView]) -> NDArray[np.uint8]:
     height = max(rows.stop - rows.start for rows, _ in boxes)
     width = max(columns.stop - columns.start for _, columns in boxes)
     panels: list[Panel] = []
-    most = max(len(list(_channels(view))) for view in views)
-    in_line = -(-most // 2)
-    for view, box in zip(views, boxes, strict=True):
-        count = 0
-        for channel in _channels(view):
-            title = channel.title if count else f"{view.record.name}: {channel.title}"
+    channels = [list(_channels(view)) for view in views]
+    in_line = -(-max(map(len, channels)) // 2)
+    for view, box, compared in zip(views, boxes, channels, strict=True):
+        for number, channel in enumerate(compared):
+            title = channel.title if number else f"{view.record.name}: {channel.title}"
             for caption, pixels, behind in _triple(title, channel, view.truth.channels["A"]):
                 panels.append((caption, _fitted(_padded(pixels[box], height, width, behind))))
-            count += 1
         blank = _fitted(np.full((height, width, 3), SHADE, np.uint8))
-        panels += [("", blank)] * 3 * (2 * in_line - count)
+        panels += [("", blank)] * 3 * (2 * in_line - len(compared))
     return lay_out(panels, 3 * in_line)
 
 
@@ -126,10 +124,9 @@ def _box(view: ScoredView) -> tuple[slice, slice]:
 
 def _padded(pixels: NDArray[np.uint8], height: int, width: int, shade: int) -> NDArray[np.uint8]:
     """Centre a panel on a larger one."""
-    result = np.full((height, width, 3), shade, np.uint8)
-    top, left = (height - pixels.shape[0]) // 2, (width - pixels.shape[1]) // 2
-    result[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
-    return result
+    rows, columns = height - pixels.shape[0], width - pixels.shape[1]
+    around = ((rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0))
+    return np.pad(pixels, around, constant_values=shade)
 
 
 def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:

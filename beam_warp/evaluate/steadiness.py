@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,14 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.checks import require_count
+from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.drawn import SAMPLES, draw_materials
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 
 POINT_COUNT = 20_000
 """Points on the surface of a person: 10 mm apart."""
@@ -146,15 +147,11 @@ def gaussian_deviation(sequence: GaussianSequence, frames: Sequence[int]) -> Dev
 
 
 def surface_scores(
-    sequence: GaussianSequence,
-    capture: Capture,
-    matched: Mapping[int, int],
+    asset: ComparedAsset,
     *,
-    split: str = "test",
     raster: RasterOptions | None = None,
     samples: int = SAMPLES,
     point_count: int = POINT_COUNT,
-    seed: int = 0,
     device: str | None = None,
     progress: Progress | None = None,
 ) -> SurfaceScores | str:
@@ -167,16 +164,12 @@ def surface_scores(
     averaged over the views in which the point is seen in at least two frames.
 
     Args:
-        sequence: With base colour.
-        capture: Its ``truth/mesh_FFFF.npz`` are of one topology; triangles that are cut otherwise in some frame are
-            left out.
-        matched: See `beam_warp.capture.matching.match_frames`.
-        split: Which records are the views. A camera that stands still is used in all frames, also in those of which
-            there is no image.
+        asset: Relightable. The capture's ``truth/mesh_FFFF.npz`` are of one topology; triangles that are cut otherwise
+            in some frame are left out. Records of its split are the views; a camera that stands still is used in all
+            frames, also in those of which there is no image.
         raster: How splats are drawn.
         samples: Side of the square of samples of a pixel.
         point_count: Points on the surface.
-        seed: Of the points.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
         progress: Called with (frames done, frames in all).
 
@@ -184,7 +177,8 @@ def surface_scores(
         AssetFormatError: A file of the truth is damaged.
     """
     require_count("point_count", point_count, 1, 10**8)
-    frames = [frame for frame in sorted(matched) if (capture.folder / f"truth/mesh_{frame:04d}.npz").is_file()]
+    capture = asset.capture
+    frames = [frame for frame in sorted(asset.matched) if (capture.folder / f"truth/mesh_{frame:04d}.npz").is_file()]
     if len(frames) < 2:
         return "fewer than two frames of the asset have a true surface"
     lasting = _lasting_faces(capture, frames)
@@ -195,11 +189,11 @@ def surface_scores(
         mesh = read_truth_mesh(capture, frame)
         tree = SurfaceTree(mesh.vertices, mesh.faces, device=device)
         if followed is None:
-            faces, weights = tree.sample(point_count, seed)
+            faces, weights = tree.sample(point_count, 0)
             followed = _Followed(tree, faces[lasting[faces]], weights[lasting[faces]])
         followed.tree = tree
-        cloud = change_axes(sequence[matched[frame]], WORLD_AXES)
-        for name, camera, record in _views(capture, split, frame):
+        cloud = asset.cloud(frame)
+        for name, camera, record in _views(capture, asset.split, frame):
             drawn = draw_materials(
                 cloud, camera, channels=("base_color",), raster=raster, samples=samples, device=device
             )
@@ -212,17 +206,13 @@ def surface_scores(
 
 def _lasting_faces(capture: Capture, frames: Sequence[int]) -> NDArray[np.bool_]:
     """Return which triangles are of the same vertices in all frames, ``(F,)``; one False if surfaces differ in size."""
-    first: NDArray[Any] | None = None
-    lasting = np.zeros(1, bool)
-    vertex_count = 0
-    for frame in frames:
+    first = read_truth_mesh(capture, frames[0])
+    lasting = np.ones(len(first.faces), bool)
+    for frame in frames[1:]:
         mesh = read_truth_mesh(capture, frame)
-        faces = np.asarray(mesh.faces)
-        if first is None:
-            first, lasting, vertex_count = faces, np.ones(len(faces), bool), len(mesh.vertices)
-        if faces.shape != first.shape or len(mesh.vertices) != vertex_count:
+        if mesh.faces.shape != first.faces.shape or mesh.vertices.shape != first.vertices.shape:
             return np.zeros(1, bool)
-        lasting &= (faces == first).all(axis=1)
+        lasting &= (np.asarray(mesh.faces) == first.faces).all(axis=1)
     return lasting
 
 
@@ -242,10 +232,7 @@ def _views(capture: Capture, split: str, frame: int) -> list[tuple[str, Camera, 
 
 
 def _same(one: Camera, two: Camera) -> bool:
-    lens = ("width", "height", "focal_x", "focal_y", "center_x", "center_y")
-    return all(getattr(one, name) == getattr(two, name) for name in lens) and np.array_equal(
-        one.camera_to_world, two.camera_to_world
-    )
+    return all(np.array_equal(getattr(one, field.name), getattr(two, field.name)) for field in fields(Camera))
 
 
 class _Followed:
@@ -254,9 +241,9 @@ class _Followed:
     def __init__(self, tree: SurfaceTree, faces: NDArray[np.int32], weights: FloatArray) -> None:
         self.tree = tree
         self._faces, self._weights = faces, weights
-        self._ours: dict[str, RunningVariance] = {}
-        self._where_known: dict[str, RunningVariance] = {}
-        self._truth: dict[str, RunningVariance] = {}
+        self._ours, self._where_known, self._truth = (
+            defaultdict[str, RunningVariance](lambda: RunningVariance(len(faces), 3)) for _ in range(3)
+        )
         self._known_frames: set[int] = set()
         self._squares, self._compared = 0.0, 0
 
@@ -271,14 +258,14 @@ class _Followed:
         """Take what a view shows of the points."""
         places, seen = readable_points(self.tree, camera, self._faces, self._weights)
         ours = linear_to_srgb(np.clip(interpolated(colors, alpha, places[:, :2], seen), 0.0, 1.0))
-        self._of(self._ours, view).add(ours, seen)
+        self._ours[view].add(ours, seen)
         truth = None if record is None or record.truth_path is None else record.truth()
         if truth is None or record is None or "base_color.R" not in truth.channels:
             return
         known = truth.stack("base_color.R", "base_color.G", "base_color.B")
         theirs = linear_to_srgb(np.clip(interpolated(known, truth.channels["A"], places[:, :2], seen), 0.0, 1.0))
-        self._of(self._where_known, view).add(ours, seen)
-        self._of(self._truth, view).add(theirs, seen)
+        self._where_known[view].add(ours, seen)
+        self._truth[view].add(theirs, seen)
         self._known_frames.add(record.frame)
         self._squares += float(((ours - theirs)[seen] ** 2).sum())
         self._compared += 3 * int(np.count_nonzero(seen))
@@ -295,9 +282,6 @@ class _Followed:
             Deviation.of(_mean_over_views(self._truth), known),
             float(np.sqrt(self._squares / self._compared)) if self._compared else None,
         )
-
-    def _of(self, running: dict[str, RunningVariance], view: str) -> RunningVariance:
-        return running.setdefault(view, RunningVariance(len(self._faces), 3))
 
 
 def readable_points(

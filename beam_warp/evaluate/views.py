@@ -42,13 +42,17 @@ class ScoredView:
     relit: RelitViews
     scores: MaterialViewScores
 
-    def solid_base_color(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Return base colour and its truth where the truth is solid, ``(N, 3)`` each; None without truth."""
+    def color_sums(self) -> NDArray[np.float64] | None:
+        """Return, over solid pixels, the sums of base colour times its truth and of its square, ``(2, 3)``.
+
+        None without true base colour.
+        """
         known = true_channel(self.truth, "base_color")
         if known is None:
             return None
         solid = self.truth.channels["A"] > SOLID_ALPHA
-        return self.drawn.channels["base_color"][solid], known[solid]
+        a, b = (np.asarray(colors[solid], np.float64) for colors in (self.drawn.channels["base_color"], known))
+        return np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0)])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,23 +101,18 @@ class ViewScorer:
         truth = record.truth()
         truth_alpha = truth.channels["A"]
         solid = truth_alpha > SOLID_ALPHA
-        both = {"alpha": drawn.alpha, "truth_alpha": truth_alpha}
         channels: dict[str, ImageScore] = {}
         scale = None
         for name in ("ambient_occlusion", "base_color", "roughness"):
             known = true_channel(truth, name)
             if known is None:
                 continue
-            is_color = known.ndim == 3
-            compared = as_compared(drawn.channels[name], known, is_color=is_color, premultiplied=False, **both)
-            channels[name] = ImageScore.of(compared, self.metrics)
-            if is_color:
+            channels[name] = self._compare(drawn.channels[name], known, drawn.alpha, truth_alpha, premultiplied=False)
+            if known.ndim == 3:
                 scale = as_triple(least_squares_scale(drawn.channels[name], known, solid))
         if drawn.radiance is not None:
             image = record.image().linear_rgba()[..., :3]
-            channels["novel_view"] = ImageScore.of(
-                as_compared(drawn.radiance, image, is_color=True, premultiplied=True, **both), self.metrics
-            )
+            channels["novel_view"] = self._compare(drawn.radiance, image, drawn.alpha, truth_alpha)
         normals, depth = true_channel(truth, "normals"), true_channel(truth, "depth")
         angles = None if normals is None else angles_between(drawn.channels["normals"][solid], normals[solid])
         depth_error = None
@@ -139,33 +138,25 @@ class ViewScorer:
         """Score the images of one view under every light, by relighter and light."""
         lights = dict.fromkeys(light for by_light in relit.values() for light in by_light)
         known = {light: record.relit(light).linear_rgba()[..., :3] for light in lights}
-
-        def score(light: str, image: RenderedImage) -> ImageScore:
-            both = {"alpha": image.alpha, "truth_alpha": truth_alpha}
-            return ImageScore.of(
-                as_compared(image.rgb, known[light], is_color=True, premultiplied=True, **both), self.metrics
-            )
-
         return {
-            name: {light: score(light, image) for light, image in by_light.items()} for name, by_light in relit.items()
+            name: {
+                light: self._compare(image.rgb, known[light], image.alpha, truth_alpha)
+                for light, image in by_light.items()
+            }
+            for name, by_light in relit.items()
         }
 
     def score_scaled_color(
         self, cloud: GaussianCloud, record: CaptureRecord, truth: Image, scale: Scales
-    ) -> ImageScore:
-        """Score base colour times a factor per channel, cut at 1; the truth must have base colour."""
-        drawn = self._draw(cloud, record, channels=("base_color",))
+    ) -> dict[str, ImageScore]:
+        """Score base colour times a factor per channel, cut at 1, as ``base_color_scaled``; nothing without truth."""
         known = true_channel(truth, "base_color")
-        assert known is not None
-        compared = as_compared(
-            drawn.channels["base_color"] * np.asarray(scale),
-            known,
-            alpha=drawn.alpha,
-            truth_alpha=truth.channels["A"],
-            is_color=True,
-            premultiplied=False,
-        )
-        return ImageScore.of(compared, self.metrics)
+        if known is None:
+            return {}
+        drawn = self._draw(cloud, record, channels=("base_color",))
+        color = drawn.channels["base_color"] * np.asarray(scale)
+        score = self._compare(color, known, drawn.alpha, truth.channels["A"], premultiplied=False)
+        return {"base_color_scaled": score}
 
     def coverage_overlap(self, cloud: GaussianCloud, records: Sequence[CaptureRecord]) -> float:
         """Return the coverage that a cloud shares with the truth of some records, mean over them, in [0, 1]."""
@@ -174,6 +165,20 @@ class ViewScorer:
             drawn = self._draw(cloud, record, channels=(), samples=1)
             overlaps.append(overlap(drawn.alpha, record.truth().channels["A"]))
         return float(np.mean(overlaps))
+
+    def _compare(
+        self,
+        image: NDArray[Any],
+        truth: NDArray[Any],
+        alpha: NDArray[np.float32],
+        truth_alpha: NDArray[np.float32],
+        *,
+        premultiplied: bool = True,
+    ) -> ImageScore:
+        """Score one channel, ``(H, W)``, or colour, ``(H, W, 3)``."""
+        how = {"is_color": image.ndim == 3, "premultiplied": premultiplied}
+        compared = as_compared(image, truth, alpha=alpha, truth_alpha=truth_alpha, **how)
+        return ImageScore.of(compared, self.metrics)
 
     def _draw(self, cloud: GaussianCloud, record: CaptureRecord, **how: Any) -> DrawnMaterials:
         """Draw a cloud for a record."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from beam_warp.capture.findings import Finding, count_of, names_of
 from beam_warp.capture.records import CaptureContents
 from beam_warp.capture.views import CapturedView
-from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.materials.light import looks_like_ldr
 from beam_warp.raster.gbuffer import rasterize
@@ -72,22 +71,6 @@ class SilhouetteMatch:
     overlap: float
     view_count: int
     finding: Finding | None
-
-
-def capture_light(capture: CaptureContents, given: Path | None = None) -> EnvironmentMap:
-    """Read the light of a capture, or the one given instead.
-
-    Raises:
-        MissingFileError: There is neither.
-        AssetFormatError: It is no high-dynamic-range lat-long image.
-    """
-    path = given or capture.environment_path
-    if path is None:
-        raise MissingFileError(
-            f"environment must be given, got none with {capture.folder}. Name the light that the capture was taken "
-            "under, a lat-long .exr or .hdr, with --environment; from colours alone base colour cannot be told."
-        )
-    return EnvironmentMap.read(path)
 
 
 def judge_environment(environment: EnvironmentMap) -> list[Finding]:
@@ -263,7 +246,7 @@ def _way_out(
     overlap: float,
 ) -> str:
     """Return a remedy: the axes or units in which the sequence would match, if any do."""
-    few, small = _coarse(cloud), _small(views, SEARCH_VIEWS, SEARCH_SIDE)
+    few, small = _shape(cloud, max(1, -(-len(cloud) // SEARCH_GAUSSIANS))), _small(views, SEARCH_VIEWS, SEARCH_SIDE)
 
     def turned(shape: GaussianCloud, code: str) -> GaussianCloud:
         return change_axes(replace(shape, axes=code), cloud.axes)
@@ -282,20 +265,8 @@ def _way_out(
     return "Check axes and units of the sequence, that its frames are those of the capture, and the masks."
 
 
-def _shape(cloud: GaussianCloud) -> GaussianCloud:
-    """Return a cloud with nothing but its shape: that is all that a silhouette shows."""
-    return GaussianCloud(
-        positions=cloud.positions,
-        orientations=cloud.orientations,
-        scales=cloud.scales,
-        opacities=cloud.opacities,
-        axes=cloud.axes,
-    )
-
-
-def _coarse(cloud: GaussianCloud) -> GaussianCloud:
-    """Return the shape of a cloud with fewer Gaussians, so much larger that they cover as much."""
-    step = max(1, -(-len(cloud) // SEARCH_GAUSSIANS))
+def _shape(cloud: GaussianCloud, step: int = 1) -> GaussianCloud:
+    """Return the shape, all that a silhouette shows, of every ``step``-th Gaussian, enlarged to cover as much."""
     return GaussianCloud(
         positions=cloud.positions[::step],
         orientations=cloud.orientations[::step],

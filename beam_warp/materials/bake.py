@@ -25,13 +25,7 @@ from beam_warp.checks import require_array, require_choice, require_count, requi
 from beam_warp.device.array_checks import device_array
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.materials.baking import (
-    launch_add_pull,
-    launch_add_rows,
-    launch_clamp_rows,
-    launch_weigh_pixels,
-    launch_weigh_residuals,
-)
+from beam_warp.kernels.materials.baking import launch_add_pull, launch_add_rows, launch_clamp_rows, launch_weigh_pixels
 from beam_warp.kernels.materials.bounded_solve import (
     ColumnState,
     Problem,
@@ -48,6 +42,9 @@ from beam_warp.world.camera import Camera
 Solver = Literal["cg", "adam"]
 
 SOLVERS = ("cg", "adam")
+
+LEARNING_RATE = 0.05
+"""Learning rate of ``"adam"`` at first; it falls to a hundredth exponentially."""
 
 MOST_COLUMNS = CHANNEL_COUNTS[-1]
 """Most columns of one problem: those that the rasteriser composites in one pass."""
@@ -88,7 +85,6 @@ class BakeOptions:
         passes: Most passes over all views of ``"cg"``, each a drawing and its transpose.
         tolerance: ``"cg"`` ends where the projected gradient of every column is below this part of what it is at 0.
         steps: Steps of ``"adam"``, a view each.
-        learning_rate: Of ``"adam"``, at first; it falls to a hundredth exponentially.
         ridge: Pull towards the prior, in pixels: that of a pixel which sees the Gaussian alone.
         temporal: Pull towards the previous frame, likewise.
         low: Least value.
@@ -103,7 +99,6 @@ class BakeOptions:
     passes: int = 30
     tolerance: float = 1e-2
     steps: int = 5000
-    learning_rate: float = 0.05
     ridge: float = 0.1
     temporal: float = 0.0
     low: float = 0.0
@@ -116,7 +111,6 @@ class BakeOptions:
         require_count("passes", self.passes)
         require_number("tolerance", self.tolerance, 0.0, 1.0)
         require_count("steps", self.steps)
-        require_number("learning_rate", self.learning_rate, 0.0)
         require_number("ridge", self.ridge, 0.0)
         require_number("temporal", self.temporal, 0.0)
         require_number("high", self.high, require_number("low", self.low))
@@ -187,7 +181,9 @@ def bake(
     if not views:
         raise InvalidOptionError("views must hold at least one view, got none. Pass what the cameras saw.")
     chosen = options or BakeOptions()
-    count, columns = len(gaussians.positions), require_columns(views)
+    shape = np.shape(views[0].targets)
+    count, columns = len(gaussians.positions), shape[2] if len(shape) == 3 else 0
+    require_count("columns of targets", columns, 1, MOST_COLUMNS)
     given = {}
     for name, array, width in (("prior", prior, columns), ("start", start, columns), ("previous", previous, None)):
         if array is not None:
@@ -213,12 +209,6 @@ def bake(
         return BakedValues(values.numpy()[:, :columns], evidence[:, :columns], passes, residuals[:, :columns])
 
 
-def require_columns(views: Sequence[BakeTarget]) -> int:
-    """Return the number of columns of all targets."""
-    shape = np.shape(views[0].targets)
-    return require_count("columns of targets", shape[2] if len(shape) == 3 else 0, 1, MOST_COLUMNS)
-
-
 @dataclass(eq=False)
 class _Group:
     """Views that are drawn together; of each, what it should show and what that counts, ``(pixels of the view, K)``."""
@@ -227,16 +217,6 @@ class _Group:
     targets: list[wp.array]
     weights: list[wp.array]
     rows: wp.array  # (V * N, K), room for what each view says
-
-    def pixels_by_view(self, pixels: wp.array) -> list[wp.array]:
-        """Return each view's part of what was drawn."""
-        ends = self.rasterizer.first_pixels
-        return [pixels[start:end] for start, end in pairwise(ends)]
-
-    def back_project(self, pixels: wp.array, out: wp.array) -> None:
-        """Write the transpose of drawing values: for every Gaussian the sum of pixels by its blending weights."""
-        self.rasterizer.back_project(pixels, self.rows)
-        self.rasterizer.sum_views(self.rows, out)
 
 
 class _BlendedImages:
@@ -263,21 +243,13 @@ class _BlendedImages:
         rows = wp.empty((max(len(part) for part in parts) * self.count, self.width), dtype=float)
         # All groups draw into the same images: what one drew is used up before the next one draws.
         first = max(parts, key=lambda part: sum(views[i].camera.width * views[i].camera.height for i in part))
-        room = Rasterizer(
-            self.count, [views[i].camera for i in first], value_count=self.width, options=raster_options, device=device
-        )
+        how: dict[str, Any] = {"value_count": self.width, "options": raster_options, "device": device}
+        room = Rasterizer(self.count, [views[i].camera for i in first], **how)
         self.groups = []
         for part in parts:
             rasterizer = room
             if part is not first:
-                rasterizer = Rasterizer(
-                    self.count,
-                    [views[i].camera for i in part],
-                    value_count=self.width,
-                    options=raster_options,
-                    device=device,
-                    images_of=room,
-                )
+                rasterizer = Rasterizer(self.count, [views[i].camera for i in part], images_of=room, **how)
             rasterizer.draw(gaussians._replace(values=self._drawn_values, radiance=None))
             group = _Group(rasterizer, [], [], rows[: len(part) * self.count])
             for i in part:
@@ -286,10 +258,12 @@ class _BlendedImages:
                     given = device_array(f"views[{i}].{name}", getattr(views[i], name), shape, device)
                     held.append(given.contiguous().reshape((-1, columns)))
             self.groups.append(group)
-        self.evidence = self._row_sums()
+        self._nothing = wp.empty((0, 0), dtype=float)
+        # W' M W 1: how many pixels each value is seen by
+        self.evidence = wp.zeros((self.count, self.width), dtype=float)
+        self.apply_pixels(wp.full((self.count, self.width), 1.0, dtype=float), self.evidence)
         self.strength = wp.zeros((self.count, self.width), dtype=float)
         self._anchors = wp.zeros((self.count, self.width), dtype=float)
-        self._no_anchors = wp.empty((0, 0), dtype=float)
 
     def mean_targets(self, evidence: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the mean of what each Gaussian is seen in, ``(N, K)``: W' M t / W' M W 1."""
@@ -323,41 +297,32 @@ class _BlendedImages:
         result[:, : self.columns] = values
         return result
 
-    def _draw(self, group: _Group, values: wp.array) -> wp.array:
-        """Return what a group shows of values, ``(P, K)``."""
-        wp.copy(self._drawn_values, values)
-        return group.rasterizer.redraw_values().channels[0]
-
-    def _row_sums(self) -> wp.array:
-        """Return W' M W 1: how many pixels each value is seen by."""
-        result = wp.zeros((self.count, self.width), dtype=float)
-        ones = wp.full((self.count, self.width), 1.0, dtype=float)
-        self.apply_pixels(ones, result)
-        return result
-
     def apply_pixels(self, values: wp.array, out: wp.array) -> None:
         """Add W' M W values to ``out``."""
         for group in self.groups:
-            pixels = self._draw(group, values)
-            for part, weights in zip(group.pixels_by_view(pixels), group.weights, strict=True):
-                launch_weigh_pixels(part, weights, part, self.device)
-            group.back_project(pixels, self._summed)
-            launch_add_rows(self._summed, out, self.device)
+            self._add_pixels(group, values, [self._nothing] * len(group.weights), out)
+
+    def _add_pixels(self, group: _Group, values: wp.array, targets: list[wp.array], out: wp.array) -> None:
+        """Add W' M (W values - targets) of a group to ``out``; empty targets are targets of 0."""
+        wp.copy(self._drawn_values, values)
+        pixels = group.rasterizer.redraw_values().channels[0]
+        ends = pairwise(group.rasterizer.first_pixels)
+        for (start, end), target, weights in zip(ends, targets, group.weights, strict=True):
+            part = pixels[start:end]
+            launch_weigh_pixels(part, target, weights, part, self.device)
+        group.rasterizer.back_project(pixels, group.rows)
+        group.rasterizer.sum_views(group.rows, self._summed)
+        launch_add_rows(self._summed, out, self.device)
 
     def apply(self, values: wp.array, out: wp.array) -> None:
         """Write A values to ``out``, A = W' M W + ridge + temporal."""
         out.zero_()
         self.apply_pixels(values, out)
-        launch_add_pull(values, self._no_anchors, self.strength, 1.0, out, self.device)
+        launch_add_pull(values, self._nothing, self.strength, 1.0, out, self.device)
 
     def add_gradient(self, group: _Group, values: wp.array, out: wp.array) -> None:
         """Add what the pixels of a group say to half of the objective's gradient."""
-        pixels = self._draw(group, values)
-        parts = group.pixels_by_view(pixels)
-        for part, targets, weights in zip(parts, group.targets, group.weights, strict=True):
-            launch_weigh_residuals(part, targets, weights, part, self.device)
-        group.back_project(pixels, self._summed)
-        launch_add_rows(self._summed, out, self.device)
+        self._add_pixels(group, values, group.targets, out)
 
     def add_pulls(self, values: wp.array, scale: float, out: wp.array) -> None:
         """Add ``scale`` times what the pulls are to half of the objective's gradient."""
@@ -428,11 +393,11 @@ def _solve_by_adam(images: _BlendedImages, values: wp.array) -> tuple[float, NDA
     """Move values by the gradients of one random view a step, in place."""
     options, device = images.options, images.device
     gradients = wp.zeros((images.count, images.width), dtype=float)
-    adam = Adam({"values": Parameters(values, gradients, options.learning_rate)})
+    adam = Adam({"values": Parameters(values, gradients, LEARNING_RATE)})
     order = np.random.default_rng(options.seed).integers(0, len(images.groups), options.steps)
     share = 1.0 / len(images.groups)
     for step, place in enumerate(order):
-        adam.set_learning_rate("values", options.learning_rate * 0.01 ** (step / options.steps))
+        adam.set_learning_rate("values", LEARNING_RATE * 0.01 ** (step / options.steps))
         gradients.zero_()
         images.add_gradient(images.groups[place], values, gradients)
         images.add_pulls(values, share, gradients)

@@ -84,7 +84,6 @@ def reduced_target(target: BakeTarget, factor: int, device: Any) -> BakeTarget:
     return BakeTarget(whole.reduced(factor), means, sums)
 
 
-def reduced_options(options: RasterOptions | None, factor: int) -> RasterOptions:
+def reduced_options(options: RasterOptions, factor: int) -> RasterOptions:
     """Return how reduced views are drawn: splats of the same shape in the scene, sampled at fewer places."""
-    chosen = options or RasterOptions()
-    return replace(chosen, low_pass=max(chosen.low_pass / factor**2, LOW_PASS_RANGE[0]))
+    return replace(options, low_pass=max(options.low_pass / factor**2, LOW_PASS_RANGE[0]))

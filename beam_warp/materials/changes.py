@@ -9,7 +9,6 @@ out from it counts. Where colour does change, each frame's is drawn towards the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,11 +47,6 @@ class ColorChange:
     variance: NDArray[np.float64]
     dispersion: float
 
-    @property
-    def changing_part(self) -> float:
-        """Part of the Gaussians that change."""
-        return float(self.changing.mean()) if len(self.changing) else 0.0
-
     def frame_color(self, evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the colour of one frame of every Gaussian and its standard error, ``(N, 3)`` each.
 
@@ -69,25 +63,19 @@ class ChangeTest:
 
     def __init__(self) -> None:
         """Start without frames."""
-        self._frames: NDArray[Any] | float = 0.0
-        self._weights: NDArray[Any] | float = 0.0
-        self._sums: NDArray[Any] | float = 0.0
-        self._squares: NDArray[Any] | float = 0.0
+        self._sums = np.zeros((4, 1, 1))
 
     def add(self, evidence: ColorEvidence) -> None:
         """Count the evidence of one frame."""
         color, variance, known = _frame(evidence)
         weight = np.where(known, 1.0 / variance, 0.0)
-        self._frames = self._frames + known
-        self._weights = self._weights + weight
-        self._sums = self._sums + weight * color
-        self._squares = self._squares + weight * color**2
+        self._sums = self._sums + np.stack([known, weight, weight * color, weight * color**2])
 
     def result(self) -> ColorChange:
         """Test every Gaussian; false discoveries are bounded over all of them (Benjamini and Hochberg 1995)."""
-        frames, weights = np.asarray(self._frames), np.asarray(self._weights)
-        mean = np.divide(self._sums, weights, out=np.zeros_like(weights), where=weights > 0.0)
-        q = np.maximum(np.asarray(self._squares) - mean * np.asarray(self._sums), 0.0)
+        frames, weights, sums, squares = self._sums
+        mean = np.divide(sums, weights, out=np.zeros_like(weights), where=weights > 0.0)
+        q = np.maximum(squares - mean * sums, 0.0)
         degrees = np.maximum(frames - 1.0, 0.0)
         total, freedom = q.sum(axis=1), degrees.sum(axis=1)
         tested = freedom > 0.0
@@ -102,10 +90,11 @@ class ChangeTest:
             out=variance,
             where=(weights > 0.0) & (degrees > 0.0),
         )
-        chance = np.ones(len(total))
-        chance[tested] = stats.chi2.sf(total[tested] / dispersion, freedom[tested])
         large = np.sqrt(variance.mean(axis=1)) >= LEAST_CHANGE
-        changing = _discoveries(chance, tested) & large
+        changing = large & tested
+        if tested.any():
+            chance = stats.false_discovery_control(stats.chi2.sf(total[tested] / dispersion, freedom[tested]))
+            changing[tested] &= chance <= FALSE_DISCOVERIES
         return ColorChange(changing, mean, np.where(changing[:, None], variance, 0.0), dispersion)
 
 
@@ -133,12 +122,3 @@ def _frame(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.flo
     raw, error = least_squares(evidence)
     known = (np.asarray(evidence.denominator) > 0.0).all(axis=1) & (np.asarray(evidence.unseen) == 0.0)
     return np.clip(raw, 0.0, 1.0), np.maximum(error, LEAST_ERROR) ** 2, np.broadcast_to(known[:, None], raw.shape)
-
-
-def _discoveries(chance: NDArray[np.float64], tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which hypotheses are rejected when `FALSE_DISCOVERIES` of the rejected may be true."""
-    rows = np.flatnonzero(tested)
-    ordered = np.sort(chance[rows])
-    passing = np.flatnonzero(ordered <= FALSE_DISCOVERIES * np.arange(1, len(rows) + 1) / max(len(rows), 1))
-    limit = ordered[passing[-1]] if len(passing) else -1.0
-    return tested & (chance <= limit)

@@ -8,7 +8,7 @@ own captured radiance around the normal.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -137,18 +137,8 @@ class ColorEvidence:
     unseen: NDArray[Any]
     frames: int = 1
 
-    ARRAYS: ClassVar[tuple[str, ...]] = (
-        "numerator",
-        "denominator",
-        "observed",
-        "irradiance",
-        "openness",
-        "noise",
-        "views",
-        "facing",
-        "saturated",
-        "unseen",
-    )
+    ARRAYS: ClassVar[tuple[str, ...]]
+    """Names of the arrays."""
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], frames: int = 1) -> ColorEvidence:
@@ -163,6 +153,9 @@ class ColorEvidence:
         return ColorEvidence.from_arrays(sums, self.frames + other.frames)
 
 
+ColorEvidence.ARRAYS = tuple(field.name for field in fields(ColorEvidence) if field.name != "frames")
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialMeasurement:
     """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour."""
@@ -170,14 +163,6 @@ class MaterialMeasurement:
     ambient_occlusion: NDArray[np.float32]
     ambient_occlusion_error: NDArray[np.float32]
     evidence: ColorEvidence
-
-
-@dataclass(frozen=True, eq=False)
-class LitBatch:
-    """Some points, the rays that were traced from them, and their rows among those that are measured."""
-
-    batch: RayBatch
-    rays: LightRays
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,10 +332,10 @@ def light_batches(
     hit_radiance: NDArray[np.float32] | None,
     frame: int,
     progress: Progress,
-) -> Iterator[LitBatch]:
+) -> Iterator[tuple[RayBatch, LightRays]]:
     """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
 
-    A batch's rays are gone when the next one is asked for.
+    Each batch comes with its rays, which are gone when the next one is asked for.
 
     Args:
         scene: Occluders.
@@ -414,7 +399,7 @@ def light_batches(
             measured.views,
             device,
         )
-        yield LitBatch(batch, found)
+        yield batch, found
         done += len(batch.rows)
         progress(done, len(measured.rows))
 

@@ -22,6 +22,9 @@ MISFIT_SLACK = 1e-2
 WELL_LIT_PART = 0.5
 """Gaussians that get at least this part of the mean irradiance have a say in the exposure."""
 
+ASKED = 4096
+"""Most Gaussians to look at, spread evenly over the cloud."""
+
 EXPOSURE_FACTORS = np.exp2(np.arange(-10.0, 10.0 + 1e-9, 1.0 / 16.0))
 """Candidates of `estimate_exposure`, a sixteenth of a stop apart."""
 
@@ -34,7 +37,6 @@ def estimate_exposure(
     light: PreparedEnvironment,
     *,
     options: MaterialOptions,
-    subset: int = 4096,
 ) -> float:
     """Find the factor on an environment that makes display-referred captured colour physically plausible.
 
@@ -54,12 +56,11 @@ def estimate_exposure(
         roughness: Their roughness.
         light: The light of the capture up to a factor.
         options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
-        subset: Gaussians to look at, spread evenly over the cloud.
 
     Returns:
         A positive factor; 1 where nothing was observed.
     """
-    rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(subset, len(cloud))).astype(np.int64))
+    rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(ASKED, len(cloud))).astype(np.int64))
     # Weights that depend on the light would make the sums more than linear in it.
     direct = replace(options, bounce=False, robust=False)
     full, half = (

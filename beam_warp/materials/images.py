@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import (
@@ -39,20 +38,20 @@ from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixe
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
+from beam_warp.materials.base_color import fill_from_neighbors
 from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
     FEWEST_LIGHT_SAMPLES,
     SURFACE_DEPTHS,
     SurfaceDepth,
     ViewSurfaces,
-    surface_occlusion,
     surface_residues,
     view_surfaces,
 )
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
-from beam_warp.trace.occlusion import Progress
+from beam_warp.trace.occlusion import Progress, ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 from beam_warp.world.harmonics import SH_C0
@@ -68,8 +67,6 @@ CROP_MARGIN = 16
 
 UNSEEN_EVIDENCE = 1e-2
 """Gaussians that are worth fewer pixels than this over all views take the values of their neighbours."""
-
-FILL_NEIGHBORS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,10 +219,10 @@ def decompose_by_images(
         cropped = crop_to_subject(view)
         # Views of one frame, and frames, have independent noise.
         number = (frame * len(views) + i) % 2**32
-        found = _measure_view(scene, gaussians, cropped, light, chosen, drawn_as, number, kind, stages)
+        target, count = _measure_view(scene, gaussians, cropped, light, chosen, drawn_as, number, kind, stages)
         with stages("bake"):
-            targets.append(reduced_target(found.target, factor, scene.device))
-        shown += found.surface_count
+            targets.append(reduced_target(target, factor, scene.device))
+        shown += count
         if progress is not None:
             progress(i + 1, len(views))
     reduced = reduced_options(drawn_as, factor)
@@ -270,13 +267,6 @@ def crop_to_subject(view: CapturedView) -> CapturedView:
     return view.cropped(left, top, right - left, bottom - top)
 
 
-class _MeasuredView(NamedTuple):
-    """Bake target of one view, and how many of its pixels show a surface."""
-
-    target: BakeTarget
-    surface_count: int
-
-
 def _measure_view(
     scene: Scene,
     gaussians: GaussianArrays,
@@ -287,8 +277,8 @@ def _measure_view(
     number: int,
     denoiser: Denoiser,
     stages: StageTimer,
-) -> _MeasuredView:
-    """Find base colour and ambient occlusion of a view's pixels, to be baked."""
+) -> tuple[BakeTarget, int]:
+    """Return base colour and ambient occlusion of a view's pixels, to be baked, and how many show a surface."""
     device = scene.device
     with stages("draw"):
         surfaces = view_surfaces(
@@ -296,7 +286,14 @@ def _measure_view(
         )
     stream: dict[str, Any] = {"offset": options.offset, "seed": options.seed, "frame": number}
     with stages("occlusion rays"):
-        occlusion = surface_occlusion(scene, surfaces, sample_count=options.occlusion_samples, **stream)
+        occlusion = ambient_occlusion(
+            scene,
+            surfaces.rows.positions,
+            surfaces.rows.normals,
+            sample_count=options.occlusion_samples,
+            sampler="iid",  # BEAM Eq. 3
+            **stream,
+        )
     with stages("light rays"):
         residues = surface_residues(
             scene, surfaces, light, sample_count=options.light_samples, diffuse_weight=options.diffuse_weight, **stream
@@ -310,7 +307,7 @@ def _measure_view(
         guides = SurfaceGuides(view.camera, surfaces.image(surfaces.rows.normals), surfaces.depth)
         clean = denoise(noisy, guides, denoiser=denoiser)
     with stages("base colour"):
-        return _MeasuredView(_bake_target(surfaces, view, clean, light), len(surfaces))
+        return _bake_target(surfaces, view, clean, light), len(surfaces)
 
 
 def _bake_target(
@@ -365,7 +362,8 @@ def _bake(
         filled = np.stack([color, occlusion], axis=1) <= UNSEEN_EVIDENCE
         values = baked.values.copy()
         for columns, missing in ((slice(0, 3), filled[:, 0]), (slice(3, 4), filled[:, 1])):
-            values[:, columns] = _filled(cloud.positions, values[:, columns], missing)
+            some = values[:, columns]
+            values[:, columns], _ = fill_from_neighbors(cloud.positions, some, np.zeros_like(some), missing)
     return replace(baked, values=values), filled
 
 
@@ -375,19 +373,3 @@ def captured_color(cloud: GaussianCloud) -> NDArray[np.float32]:
         return np.full((len(cloud), 3), 0.5, np.float32)
     mean = np.clip(0.5 + SH_C0 * cloud.radiance[:, 0], 0.0, 1.0)
     return (srgb_to_linear(mean) if cloud.radiance_color_space == DISPLAY_SRGB else mean).astype(np.float32)
-
-
-def _filled(
-    positions: NDArray[np.float32], values: NDArray[np.float32], missing: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Give what is missing the mean of its nearest neighbours that are not, by the inverse of their distance."""
-    known = np.flatnonzero(~missing)
-    if not missing.any() or not len(known):
-        return values
-    nearest = min(FILL_NEIGHBORS, len(known))
-    distance, index = cKDTree(positions[known]).query(positions[missing], k=nearest, workers=-1)
-    weight = 1.0 / np.maximum(distance.reshape(-1, nearest), 1e-9)
-    weight /= weight.sum(axis=1, keepdims=True)
-    result = values.copy()
-    result[missing] = np.einsum("nk,nkc->nc", weight, values[known[index.reshape(-1, nearest)]])
-    return result

@@ -111,26 +111,19 @@ def run(
     folder, digests = make_folders(out, "frames", "digests")
     log = JobLog(progress, len(sequence), device)
     source = Source(
-        sequence=sequence,
-        images=images,
-        options=chosen.materials,
-        digests=CaptureDigests(digests),
-        device=str(device),
-        log=log,
+        sequence=sequence, images=images, options=chosen, digests=CaptureDigests(digests), device=str(device), log=log
     )
     described = _described(chosen, images, is_cuda=device.is_cuda)
-    light = prepare_light(environment, source, chosen, described, folder, log)
+    light = prepare_light(environment, source, described, folder)
     plan = JobPlan(
         source=source,
         light=light,
-        options=chosen,
         persistent=chosen.persistent or sequence.topology == "constant",
         key=array_digest(light.environment.radiance, text=described),
         archive=FrameArchive(folder, source.first.cloud.radiance_color_space),
-        log=log,
     )
     first_key = source.key(plan.key, source.first)
-    findings = light_findings(source.first, light.environment, folder / "findings.json", first_key, log)
+    findings = light_findings(source.first, light.environment, folder / "findings.json", first_key)
     roughness = RoughnessFinder(plan)
     frames = FrameMeasurement(plan, roughness)
     if chosen.images is not None:

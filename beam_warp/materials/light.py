@@ -136,20 +136,20 @@ class LightCheck:
         misfit_as_given: Logarithm of how much is left unexplained by either, above the best turn's.
         exposure_stops: Exposure that base colours as a whole ask for; 0 where they are plausible as they are.
         point_count: How many Gaussians were asked.
-        findings: What is wrong.
+        findings: What is wrong; a check that could judge nothing says here why, and is 0 elsewhere.
     """
 
-    best_rotation_degrees: float
-    is_mirrored: bool
-    spread_as_given: float
-    spread_best: float
-    spread_undivided: float
-    gloss_as_given: float
-    gloss_best: float
-    misfit_as_given: float
-    exposure_stops: float
+    best_rotation_degrees: float = 0.0
+    is_mirrored: bool = False
+    spread_as_given: float = 0.0
+    spread_best: float = 0.0
+    spread_undivided: float = 0.0
+    gloss_as_given: float = 0.0
+    gloss_best: float = 0.0
+    misfit_as_given: float = 0.0
+    exposure_stops: float = 0.0
     point_count: int
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def check_light(
@@ -214,19 +214,20 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
     count = int(asked.sum())
     if not environment.radiance.any():
         remedy = "Check its exposure and the file; nothing can be measured without light."
-        return _unjudged(count, Finding("error", "environment-black", "environment is black", remedy=remedy))
+        finding = Finding("error", "environment-black", "environment is black", remedy=remedy)
+        return LightCheck(point_count=count, findings=(finding,))
     if count < LEAST_POINTS or len(weights) < LEAST_VIEWS:
         what = (
             f"environment is not checked: {count} Gaussians are seen well in {count_of(len(weights), 'view')}, "
             f"{LEAST_POINTS} and {LEAST_VIEWS} are needed"
         )
         remedy = "More views, or views from nearer, would allow it."
-        return _unjudged(count, Finding("note", "light-unchecked", what, remedy=remedy))
+        return LightCheck(point_count=count, findings=(Finding("note", "light-unchecked", what, remedy=remedy),))
     weights, total, observed, luminance = weights[:, asked], total[asked], observed[asked], luminance[:, asked]
     normals, openness = evidence.normals[asked], evidence.openness[asked]
     lights = _turns(environment)
-    diffuse = _diffuse_transfer(normals, openness)
-
+    # what each cell's radiance adds to the irradiance of each point
+    diffuse = np.maximum(normals @ _cell_directions().T, 0.0) * openness * _cell_angles()
     irradiance = diffuse @ (lights @ LUMINANCE).T.astype(np.float32) / np.float32(np.pi)
     spreads = _spreads(observed, irradiance)
     # Relative to what a point shows on the whole: bright points must not decide alone.
@@ -262,7 +263,6 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
         misfit_as_given=float(misfits[0] - misfits[best]),
         exposure_stops=stops,
         point_count=count,
-        findings=(),
     )
     return replace(check, findings=tuple(_findings(check, has_gloss=bool(gloss.any()))))
 
@@ -316,11 +316,6 @@ def _turns(environment: EnvironmentMap) -> NDArray[np.float64]:
             for turn in range(LIGHT_COLUMNS)
         ]
     )
-
-
-def _diffuse_transfer(normals: NDArray[np.float32], openness: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what each cell's radiance adds to the irradiance of each point, ``(M, L)``."""
-    return np.maximum(normals @ _cell_directions().T, 0.0) * openness * _cell_angles()
 
 
 def _mirrored(
@@ -431,20 +426,3 @@ def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
             )
         )
     return findings
-
-
-def _unjudged(count: int, finding: Finding) -> LightCheck:
-    """Return a check that judges nothing, with the finding that says why."""
-    return LightCheck(
-        best_rotation_degrees=0.0,
-        is_mirrored=False,
-        spread_as_given=0.0,
-        spread_best=0.0,
-        spread_undivided=0.0,
-        gloss_as_given=0.0,
-        gloss_best=0.0,
-        misfit_as_given=0.0,
-        exposure_stops=0.0,
-        point_count=count,
-        findings=(finding,),
-    )

@@ -1,9 +1,9 @@
-"""Ambient occlusion and reflected light of the surface points that a camera's pixels show.
+"""Surface points that a camera's pixels show, and the light that they reflect to it.
 
-The paper's Gaussian sampler (BEAM §3.2, Eqs. 3 to 7), for one view at a time, on the pixels that show a surface and no
-others. The paper states sample counts, not densities. Here occlusion rays are drawn by the cosine; light rays by
-multiple importance, half of them by the environment, a quarter by the cosine and a quarter by the visible normals of
-the GGX lobe, joined by the balance heuristic; all samples are independent.
+The light part of the paper's Gaussian sampler (BEAM §3.2, Eqs. 4 to 7), for one view at a time, on the pixels that show
+a surface and no others. The paper states sample counts, not densities. Here rays are drawn by multiple importance, half
+of them by the environment, a quarter by the cosine and a quarter by the visible normals of the GGX lobe, joined by the
+balance heuristic; all samples are independent.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.trace.occlusion import AmbientOcclusion, ambient_occlusion
 from beam_warp.trace.rays import ray_batches, room_for_rays
 from beam_warp.trace.sampling import sample_set
 from beam_warp.trace.scene import Scene
@@ -121,39 +120,6 @@ def view_surfaces(
     return ViewSurfaces(camera, images.alpha, images.depth, rows)
 
 
-def surface_occlusion(
-    scene: Scene, surfaces: ViewSurfaces, *, sample_count: int = 50, offset: float = 0.02, seed: int = 0, frame: int = 0
-) -> AmbientOcclusion:
-    """Estimate ambient occlusion by independent cosine-distributed rays.
-
-    Args:
-        scene: Occluders.
-        surfaces: On the scene's device.
-        sample_count: Rays a pixel.
-        offset: Lift of ray origins along the normal [m].
-        seed: Same seed, same device, same bits.
-        frame: Number of the noise: views and moments of different numbers have independent samples.
-
-    Returns:
-        Visibility and standard error by row of ``surfaces``, on the device.
-
-    Raises:
-        InvalidOptionError: An option is out of range.
-
-    Source: BEAM Eq. 3.
-    """
-    return ambient_occlusion(
-        scene,
-        surfaces.rows.positions,
-        surfaces.rows.normals,
-        sample_count=sample_count,
-        offset=require_number("offset", offset),
-        seed=seed,
-        frame=frame,
-        sampler="iid",
-    )
-
-
 def surface_residues(
     scene: Scene,
     surfaces: ViewSurfaces,
@@ -177,7 +143,7 @@ def surface_residues(
         offset: Lift of ray origins along the normal [m].
         diffuse_weight: w_d, one of `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
         seed: Same seed, same device, same bits.
-        frame: As for `surface_occlusion`.
+        frame: Number of the noise: views and moments of different numbers have independent samples.
 
     Returns:
         Both residues [W/(m^2 sr)] by channel, and their standard errors over the mean of the channels, by row of

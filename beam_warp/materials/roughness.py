@@ -22,7 +22,7 @@ Bissiri, Holmes and Walker 2016 (evidence from a misfit, exp(-T A), and the choi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -178,7 +178,6 @@ def measure_roughness_profile(
     *,
     options: MaterialOptions,
     frame: int = 0,
-    rows: NDArray[np.integer[Any]] | None = None,
     progress: Progress | None = None,
 ) -> RoughnessProfile:
     """Trace the light of one frame and try every candidate on what its views show.
@@ -191,17 +190,16 @@ def measure_roughness_profile(
         views: What views with images show; None takes the captured radiance around each normal.
         options: Rays, offset, bounce, seed; as for `beam_warp.materials.direct.measure_materials`.
         frame: Number of the frame, for the rays' random streams.
-        rows: Gaussians to measure; all of them if None.
         progress: Called now and then with (Gaussians done, Gaussians in all).
 
     Raises:
         InvalidArrayError: The cloud has no captured radiance.
     """
     device = scene.device
-    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
-    shown = chosen[points.seen[chosen]]
+    count = len(cloud)
+    shown = np.flatnonzero(points.seen)
     # Any roughness will do here: the candidates take its place.
-    measured = lit_points(cloud, points, np.ones(len(cloud), np.float32), light, shown, views)
+    measured = lit_points(cloud, points, np.ones(count, np.float32), light, shown, views)
     candidates = upload(np.array(CANDIDATES, np.float32), float, device)
     fit = ProfileFit()
     fit.misfit = wp.zeros((int(PARTS), len(shown), len(CANDIDATES)), dtype=float, device=device)
@@ -209,18 +207,18 @@ def measure_roughness_profile(
 
     def report(done: int, total: int) -> None:
         if progress is not None:
-            progress(len(chosen) - (total - done), len(chosen))
+            progress(count - (total - done), count)
 
     normals, observed, lobes = measured.surface.normals, measured.views, light.blurred
     bounced = mean_radiance(cloud, views) if options.bounce else None
-    for lit in light_batches(scene, points, light, measured, options, bounced, frame, report):
-        shares = wp.empty((len(lit.batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
-        launch_lobe_shares(lit.batch, lit.rays, measured.light, normals, observed, shares, device)
-        launch_profile(lit.batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
-    misfit = np.zeros((int(PARTS), len(cloud), len(CANDIDATES)), np.float32)
-    counted = np.zeros(len(cloud), np.float32)
+    for batch, rays in light_batches(scene, points, light, measured, options, bounced, frame, report):
+        shares = wp.empty((len(batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
+        launch_lobe_shares(batch, rays, measured.light, normals, observed, shares, device)
+        launch_profile(batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
+    misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
+    counted = np.zeros(count, np.float32)
     misfit[:, shown], counted[shown] = fit.misfit.numpy(), fit.views.numpy()
-    return RoughnessProfile(misfit[:, chosen], counted[chosen])
+    return RoughnessProfile(misfit, counted)
 
 
 def solve_roughness(
@@ -248,7 +246,11 @@ def solve_roughness(
         )
     known = np.flatnonzero(profile.views > 0.0)
     if not len(known):
-        return _told_by(prior or RoughnessPrior(), len(places), profile.frames)
+        chosen = prior or RoughnessPrior()
+        moments = _moments(_log_prior(chosen))
+        means, errors = (np.full(len(places), value) for value in (moments[0], np.hypot(moments[1], MODEL_ERROR)))
+        report = {"near": _Evidence(0.0, 0.0), "wide": _Evidence(0.0, 0.0), "step": 0.0, "frames": profile.frames}
+        return _estimate(means, errors, np.zeros(len(places), bool), chosen, moments, report)
     seen = places[known]
     tree = cKDTree(seen[_morton_order(seen)][::CLUSTER])
     clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], tree.query(seen, workers=-1)[1], tree.n)
@@ -262,61 +264,36 @@ def solve_roughness(
     step = _most_probable_step(outside[asked], inside[asked])
     distribution = _normalized(_widened(outside, step) + inside)
     mean, spread = _moments(distribution)
-    prior_mean, prior_spread = _moments(_widened(_log_prior(chosen), step))
+    moments = _moments(_widened(_log_prior(chosen), step))
     weight, index = _nearest(tree, places)
     roughness = (weight * mean[index]).sum(axis=1)
     error = np.sqrt((weight * np.square(spread[index])).sum(axis=1) + MODEL_ERROR**2)
-    informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * prior_spread
-    return RoughnessEstimate(
-        roughness.astype(np.float32),
-        error.astype(np.float32),
-        informed,
-        chosen,
-        {
-            "informed_part": float(informed.mean()),
-            "median_error": float(np.median(error)),
-            "frames": profile.frames,
-            "prior_mean": float(prior_mean),
-            "prior_spread": float(prior_spread),
-            "step": step,
-            "near": near_evidence.record(),
-            "wide": wide_evidence.record(),
-        },
-    )
+    informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * moments[1]
+    report = {"near": near_evidence, "wide": wide_evidence, "step": step, "frames": profile.frames}
+    return _estimate(roughness, error, informed, chosen, moments, report)
 
 
-@dataclass(frozen=True)
-class _Evidence:
+class _Evidence(NamedTuple):
     """Weight of misfits, exp(-precision misfit), and the logarithm of the odds that halves of the views agree."""
 
     precision: float
     agreement: float
 
-    def record(self) -> dict[str, float]:
-        """Return it JSON-ready."""
-        return {"precision": self.precision, "agreement": self.agreement}
 
-
-def _told_by(prior: RoughnessPrior, count: int, frames: int) -> RoughnessEstimate:
-    """Return the prior as the estimate of Gaussians that no view shows."""
-    mean, spread = _moments(_log_prior(prior))
-    nothing = _Evidence(0.0, 0.0).record()
-    return RoughnessEstimate(
-        np.full(count, mean, np.float32),
-        np.full(count, np.hypot(spread, MODEL_ERROR), np.float32),
-        np.zeros(count, bool),
-        prior,
-        {
-            "informed_part": 0.0,
-            "median_error": float(np.hypot(spread, MODEL_ERROR)),
-            "frames": frames,
-            "prior_mean": float(mean),
-            "prior_spread": float(spread),
-            "step": 0.0,
-            "near": nothing,
-            "wide": nothing,
-        },
-    )
+def _estimate(
+    roughness: NDArray[np.float64],
+    error: NDArray[np.float64],
+    informed: NDArray[np.bool_],
+    prior: RoughnessPrior,
+    prior_moments: tuple[Any, Any],
+    report: dict[str, Any],
+) -> RoughnessEstimate:
+    """Return an estimate with its report; ``prior_moments`` are what a Gaussian without evidence gets."""
+    report = {name: value._asdict() if isinstance(value, _Evidence) else value for name, value in report.items()}
+    report["prior_mean"], report["prior_spread"] = (float(value) for value in prior_moments)
+    report["informed_part"] = float(informed.mean()) if len(informed) else 0.0
+    report["median_error"] = float(np.median(error)) if len(error) else 0.0
+    return RoughnessEstimate(roughness.astype(np.float32), error.astype(np.float32), informed, prior, report)
 
 
 def _weigh(

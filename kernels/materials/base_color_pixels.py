@@ -1,7 +1,5 @@
 """Base colour of pixels from their captured radiance and both residues, and which pixels baking may rely on."""
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -55,7 +53,7 @@ def write_bake_targets_kernel(
     out_weights[pixel, 3] = wp.where(drawn, 1.0, 0.0)
 
 
-def launch_write_bake_targets(pixels: Any, guards: Any, out_targets: Any, out_weights: Any, device: Any) -> None:
+def launch_write_bake_targets(pixels, guards, out_targets, out_weights, device):
     """Write every pixel's targets and weights, ``(P, 4)`` each."""
     launch(
         write_bake_targets_kernel,

@@ -226,7 +226,7 @@ class SolveSums:
         self.step = wp.empty((LANES, columns), dtype=wp.vec4d, device=device)
 
 
-def launch_take_step(problem: Any, state: Any, sums: SolveSums, device: Any) -> None:
+def launch_take_step(problem, state, sums, device):
     """Choose every column's step along the direction that A was applied to, and take it."""
     columns = problem.x.shape[1]
     launch(sum_direction_kernel, LANES * columns, inputs=[problem], outputs=[sums.direction, sums.rooms], device=device)
@@ -234,9 +234,7 @@ def launch_take_step(problem: Any, state: Any, sums: SolveSums, device: Any) -> 
     launch(take_step_kernel, LANES * columns, inputs=[problem, state], outputs=[sums.step], device=device)
 
 
-def launch_choose_direction(
-    problem: Any, state: Any, sums: SolveSums, round: int, out_residuals: Any, device: Any
-) -> None:
+def launch_choose_direction(problem, state, sums, round, out_residuals, device):
     """Choose what every column does next, and the direction that A must be applied to for it."""
     launch(
         choose_mode_kernel, problem.x.shape[1], inputs=[sums.step, round], outputs=[state, out_residuals], device=device

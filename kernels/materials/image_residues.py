@@ -5,8 +5,6 @@ normals of its GGX lobe; each is divided by the density of all three together (b
 that none alone can make a sample weigh much.
 """
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
@@ -21,7 +19,7 @@ from beam_warp.kernels.common.sampling import (
     tangent_frame,
 )
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.light.brdf import ALPHA_FLOOR, fresnel_schlick, specular_albedo, specular_brdf
+from beam_warp.kernels.light.brdf import ALPHA_FLOOR, PI, fresnel_schlick, specular_albedo, specular_brdf
 from beam_warp.kernels.light.environment_sampling import (
     EnvironmentDistribution,
     environment_radiance,
@@ -30,13 +28,12 @@ from beam_warp.kernels.light.environment_sampling import (
 )
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
 from beam_warp.kernels.materials.pixel_surfaces import PixelSurfaces
-from beam_warp.kernels.materials.residues import FRESNEL_HV
+from beam_warp.kernels.materials.residues import FRESNEL_HV, brightness
 from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
 from beam_warp.kernels.trace.visibility import Rays
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979323846)
 RESIDUE_STREAM = wp.constant(wp.uint32(0x52455349))
 
 
@@ -126,11 +123,6 @@ def draw_residue_rays_kernel(
     out_rays.reaches[ray] = wp.where(weight[0] + weight[1] + weight[2] > 0.0, float(LARGEST_FLOAT), -1.0)
 
 
-@wp.func
-def mean_channel(v: wp.vec3) -> float:
-    return (v[0] + v[1] + v[2]) / 3.0
-
-
 @wp.kernel
 def reduce_residues_kernel(
     first: int,
@@ -165,8 +157,8 @@ def reduce_residues_kernel(
         to_specular = arriving * specular_brdf(n, v, light, roughness)
         diffuse += to_diffuse
         specular += to_specular
-        diffuse_spread = add_term(diffuse_spread, mean_channel(to_diffuse))
-        specular_spread = add_term(specular_spread, mean_channel(to_specular))
+        diffuse_spread = add_term(diffuse_spread, brightness(to_diffuse) / 3.0)
+        specular_spread = add_term(specular_spread, brightness(to_specular) / 3.0)
     count = float(batch.sample_count)
     out_residues.diffuse[row] = diffuse / count
     out_residues.specular[row] = specular / count
@@ -175,20 +167,13 @@ def reduce_residues_kernel(
 
 
 def launch_draw_residue_rays(
-    samples: Any,
-    distribution: Any,
-    batch: Any,
-    surfaces: Any,
-    stream: tuple[int, int],
-    out_rays: Any,
-    out_weights: Any,
-    device: Any,
-) -> None:
+    samples, distribution, batch, surfaces, stream: tuple[int, int], out_rays, out_weights, device
+):
     """Draw a batch's rays towards the light; ``stream`` is (seed, frame)."""
     launch(
         draw_residue_rays_kernel,
         len(batch.rows) * samples.set.count,
-        inputs=[samples, distribution, batch, surfaces, wp.uint32(stream[0]), wp.uint32(stream[1])],
+        inputs=[samples, distribution, batch, surfaces, *map(wp.uint32, stream)],
         outputs=[out_rays, out_weights],
         device=device,
         block_dim=128,
@@ -196,16 +181,8 @@ def launch_draw_residue_rays(
 
 
 def launch_reduce_residues(
-    batch: Any,
-    surfaces: Any,
-    directions: Any,
-    weights: Any,
-    visibility: Any,
-    albedo_table: Any,
-    diffuse_weight: int,
-    out_residues: Any,
-    device: Any,
-) -> None:
+    batch, surfaces, directions, weights, visibility, albedo_table, diffuse_weight, out_residues, device
+):
     """Add up each point's samples, in its own row."""
     launch(
         reduce_residues_kernel,

@@ -1,7 +1,5 @@
 """The surface points that the pixels of one view show: which pixels have one, and where it is."""
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -100,21 +98,19 @@ def scatter_vectors_kernel(first: int, pixels: wp.array[int], values: wp.array[w
     out_image[pixels[row]] = values[row]
 
 
-def launch_mark_surfaces(images: Any, least_alpha: float, out_marks: Any, device: Any) -> None:
+def launch_mark_surfaces(images, least_alpha, out_marks, device):
     """Find the pixels that show a surface."""
     launch(mark_surfaces_kernel, len(images.alpha), inputs=[images, least_alpha], outputs=[out_marks], device=device)
 
 
-def launch_gather_surfaces(
-    images: Any, view: RasterView, marks: Any, ends: Any, out_surfaces: Any, device: Any
-) -> None:
+def launch_gather_surfaces(images, view, marks, ends, out_surfaces, device):
     """Write the point of every marked pixel to its row; ``ends`` are the inclusive sums of ``marks``."""
     launch(
         gather_surfaces_kernel, len(marks), inputs=[images, view, marks, ends], outputs=[out_surfaces], device=device
     )
 
 
-def launch_scatter(pixels: Any, values: Any, out_image: Any, device: Any) -> None:
+def launch_scatter(pixels, values, out_image, device):
     """Write floats or vectors of rows to their pixels."""
     kernel = scatter_vectors_kernel if values.dtype is wp.vec3 else scatter_floats_kernel
     launch(kernel, len(pixels), inputs=[pixels, values], outputs=[out_image], device=device)

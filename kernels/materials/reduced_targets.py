@@ -1,7 +1,5 @@
 """Reduction of bake targets to blocks of pixels: means by weight, and sums of the weights."""
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -39,9 +37,7 @@ def reduce_targets_kernel(
     out_weights[y, x, column] = weight_sum
 
 
-def launch_reduce_targets(
-    targets: Any, weights: Any, factor: int, out_targets: Any, out_weights: Any, device: Any
-) -> None:
+def launch_reduce_targets(targets, weights, factor, out_targets, out_weights, device):
     """Reduce ``(H, W, K)`` targets and weights to ``(ceil(H / factor), ceil(W / factor), K)``."""
     launch(
         reduce_targets_kernel,

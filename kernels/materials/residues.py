@@ -344,15 +344,7 @@ def launch_trace_bounce(scene, settings, batch, gaussian_radiance, stream, sampl
     launch(
         trace_bounce_kernel,
         len(batch.rows),
-        inputs=[
-            scene.occluders,
-            settings,
-            batch,
-            gaussian_radiance,
-            wp.uint32(stream[0]),
-            wp.uint32(stream[1]),
-            sample_count,
-        ],
+        inputs=[scene.occluders, settings, batch, gaussian_radiance, *map(wp.uint32, stream), sample_count],
         outputs=[out_irradiance],
         device=scene.device,
         block_dim=64,

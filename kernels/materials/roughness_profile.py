@@ -6,8 +6,6 @@ is taken at four roughnesses and interpolated; the lobe's own radiance and its d
 are looked up for every candidate.
 """
 
-from typing import Any
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
@@ -19,16 +17,20 @@ from beam_warp.kernels.light.brdf import (
     specular_albedo,
 )
 from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
-from beam_warp.kernels.materials.residues import GatheredLight, LightRays, Observations, brightness, facing_weight
+from beam_warp.kernels.materials.residues import (
+    ROUNDS,
+    GatheredLight,
+    LightRays,
+    Observations,
+    brightness,
+    facing_weight,
+)
 from beam_warp.kernels.trace.surface_rays import RayBatch
 
 wp.set_module_options({"enable_backward": False})
 
 SHARE_ROUGHNESS = wp.constant(wp.vec4(0.15, 0.35, 0.6, 1.0))
 """Perceptual roughnesses at which the open share of the lobe is summed over rays."""
-
-ROUNDS = wp.constant(3)
-"""Rounds of reweighting: by then the weights have settled."""
 
 SPREAD_PART = wp.constant(0.06)
 """Residual at which a view counts half, as a part of what a white surface would show with nothing in the way.
@@ -178,9 +180,7 @@ def profile_kernel(
         out_fit.views[row] = weight_sum
 
 
-def launch_lobe_shares(
-    batch: Any, rays: Any, light: Any, normals: Any, views: Any, out_shares: Any, device: Any
-) -> None:
+def launch_lobe_shares(batch, rays, light, normals, views, out_shares, device):
     """Write the open share of every view's lobe of a batch's points, ``(points, views)`` vec4.
 
     Views that count for nothing are left as they are.
@@ -195,17 +195,7 @@ def launch_lobe_shares(
     )
 
 
-def launch_profile(
-    batch: Any,
-    light: Any,
-    lobes: Any,
-    normals: Any,
-    views: Any,
-    shares: Any,
-    candidates: Any,
-    out_fit: Any,
-    device: Any,
-) -> None:
+def launch_profile(batch, light, lobes, normals, views, shares, candidates, out_fit, device):
     """Write the misfit of every candidate and part of the views of a batch's points."""
     launch(
         profile_kernel,

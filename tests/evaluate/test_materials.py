@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from support.figure_asset import OPENNESS, changed, figure_asset
 
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidOptionError, MissingFileError
-from beam_warp.evaluate.asset import EvaluateOptions, evaluate_asset
-from beam_warp.evaluate.materials import score_materials
+from beam_warp.evaluate.asset import evaluate_asset
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.relighters import RELIGHTERS
-from beam_warp.image.files import read_image
+from beam_warp.image.files import read_image, write_exr
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.shot import RenderedImage
@@ -71,8 +72,19 @@ def mirror(evaluated, relit_capture, tmp_path_factory):
     return Capture.read(folder)
 
 
-def score(sequence, capture, device, **options):
-    return score_materials(sequence, capture, device=device, **{"metrics": NO_METRICS, "relighters": {}, **options})
+def score(sequence, capture, device, *, metrics=NO_METRICS, relighters=MappingProxyType({}), **options):
+    options = EvaluateOptions(device=device, **options)
+    return score_materials(sequence, capture, options, metrics=metrics, relighters=relighters)
+
+
+def truth_of(capture, view):
+    (record,) = (record for record in capture.records if record.name == view.name)
+    return record.truth()
+
+
+def box_of(alpha):
+    rows, columns = np.nonzero(alpha > 0.5)
+    return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
 
 
 class TestAgainstItself:
@@ -121,13 +133,10 @@ class TestAgainstItself:
         )
         found = score(darker, mirror, device)
         for view in found.views:
-            (record,) = (record for record in mirror.records if record.name == view.name)
-            alpha = record.truth().channels["A"].astype(np.float64)
-            rows, columns = np.nonzero(alpha > 0.5)
-            box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+            alpha = truth_of(mirror, view).channels["A"].astype(np.float64)
             found_here = view.channels["ambient_occlusion"]
             # A mean of equal values in float32 is off by less than 1e-6: 1e-5 of the error, or 1e-4 dB.
-            for value, part in ((found_here.psnr, box), (found_here.solid_psnr, alpha > 0.999)):
+            for value, part in ((found_here.psnr, box_of(alpha)), (found_here.solid_psnr, alpha > 0.999)):
                 assert value == pytest.approx(-10.0 * np.log10(np.mean((0.1 * alpha[part]) ** 2)), abs=1e-3)
             assert found_here.solid_psnr == pytest.approx(20.0, abs=0.01)  # alpha above .999: 0.009 dB
 
@@ -138,8 +147,7 @@ class TestAgainstItself:
         turned = changed(asset, lambda _, cloud: cloud.with_arrays(normals=cloud.normals @ turn.T))
         found = score(turned, mirror, device)
         for view in found.views:
-            (record,) = (record for record in mirror.records if record.name == view.name)
-            truth = record.truth()
+            truth = truth_of(mirror, view)
             normals = truth.stack("normal.X", "normal.Y", "normal.Z")[truth.channels["A"] > 0.999].astype(np.float64)
             cosine = np.einsum("ni,ij,nj->n", normals, turn, normals)  # turning commutes with blending
             angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -164,9 +172,7 @@ def protocol(capture, renders):
     found = {}
 
     def add(name, a, b, alpha):
-        rows, columns = np.nonzero(alpha > 0.5)
-        box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-        errors = [np.mean((a[part] - b[part]) ** 2) for part in (box, alpha > 0.999)]
+        errors = [np.mean((a[part] - b[part]) ** 2) for part in (box_of(alpha), alpha > 0.999)]
         found.setdefault(name, []).append([-10 * np.log10(max(error, 1e-12)) for error in errors])
 
     for record in capture.select(split="test"):
@@ -271,6 +277,22 @@ class TestWhatIsThere:
             "surface": "fewer than two frames of the asset have a true surface",
         }
 
+    def test_a_frame_without_true_base_colour_has_no_scale(self, asset, mirror, tmp_path):
+        """Its other channels are scored; base colour and its scale are those of the other frame."""
+        folder = tmp_path / "capture"
+        shutil.copytree(mirror.folder, folder)
+        for record in mirror.select(split="test", frames={1}):
+            channels = record.truth().channels
+            path = folder / record.truth_path.relative_to(mirror.folder)
+            write_exr(path, {name: array for name, array in channels.items() if "base_color" not in name})
+        found = score(asset, Capture.read(folder), "cpu")
+        assert set(found.frame_scales) == {0}
+        assert found.base_color_scale == found.frame_scales[0] == pytest.approx((1.0, 1.0, 1.0), abs=1e-12)
+        assert found.scale_deviation is None
+        for view in found.views:
+            assert "roughness" in view.channels
+            assert ("base_color_scaled" in view.channels) == (view.frame == 0)
+
     def test_what_is_absent_is_said(self, asset, mirror):
         dull = changed(asset, lambda _, cloud: cloud.with_arrays(radiance=None, radiance_color_space=None))
         found = score(dull, mirror, "cpu")
@@ -317,7 +339,7 @@ class TestWhatIsThere:
             return float(np.abs(image - truth).mean())
 
         metrics = PerceptualMetrics({"flip": measure})
-        found = score_materials(asset, mirror, metrics=metrics, relighters={}, device="cpu")
+        found = score(asset, mirror, "cpu", metrics=metrics)
         assert all(image.shape == truth.shape and image.shape[2] == 3 for image, truth in seen)
         # Scaled colours differ by rounding: 1e-6 of colour, at most 12.92 times as much when encoded.
         assert all(score.perceptual["flip"] < 2e-5 for score in found.mean_channels().values())

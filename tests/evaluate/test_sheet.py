@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.figure_asset import figure_asset
 
-from beam_warp.evaluate.materials import score_materials
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.sheet import SHADE, evaluation_sheet
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
@@ -18,10 +18,8 @@ def views(relit_capture):
     score_materials(
         figure_asset(),
         relit_capture,
+        EvaluateOptions(samples=1, relighters=(), device="cpu"),
         metrics=PerceptualMetrics(),
-        relighters={},
-        samples=1,
-        device="cpu",
         observe=kept.append,
     )
     return kept

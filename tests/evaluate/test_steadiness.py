@@ -3,12 +3,14 @@
 import json
 import shutil
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 from support.figure_asset import changed, figure_asset
 
 from beam_warp.capture.capture import Capture
+from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.steadiness import (
     Deviation,
     RunningVariance,
@@ -23,12 +25,23 @@ from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.camera import Camera
 
 POINTS = 2_000
+STEP = np.array([0.05, 0.02, 0.01])
 BOTH = {0: 0, 1: 1}
 
 
 @pytest.fixture(scope="module")
 def asset():
     return figure_asset()
+
+
+@pytest.fixture
+def folder(relit_capture, tmp_path):
+    """A copy of the capture's folder, to be changed."""
+    return shutil.copytree(relit_capture.folder, tmp_path / "capture")
+
+
+def scores(sequence, capture, device, matched=MappingProxyType(BOTH)):
+    return surface_scores(ComparedAsset(sequence, capture, matched, "test"), point_count=POINTS, device=device)
 
 
 def flickering(asset, middle, step):
@@ -87,10 +100,9 @@ class TestInterpolation:
 
 class TestGaussians:
     def test_known_flicker(self, asset):
-        step = np.array([0.05, 0.02, 0.01])
-        found = gaussian_deviation(flickering(asset, np.array([0.5, 0.4, 0.3]), step), (0, 1))
+        found = gaussian_deviation(flickering(asset, np.array([0.5, 0.4, 0.3]), STEP), (0, 1))
         # Float32 of linear colours: 6e-8 of at most 0.3, 4 times as much when encoded, of 0.03.
-        expected = np.sqrt((step**2).mean())
+        expected = np.sqrt((STEP**2).mean())
         assert (found.mean, found.p95) == (pytest.approx(expected, rel=1e-5), pytest.approx(expected, rel=1e-5))
         assert (found.count, found.frames) == (len(asset[0]), (0, 1))
 
@@ -143,10 +155,9 @@ def test_points_are_read_where_four_pixels_show_their_piece(device):
 class TestSurface:
     def test_known_flicker_at_every_point(self, asset, relit_capture, device):
         """What is drawn is one colour in every frame, whatever covers a pixel."""
-        step = np.array([0.05, 0.02, 0.01])
-        sequence = flickering(asset, np.array([0.5, 0.4, 0.3]), step)
-        found = surface_scores(sequence, relit_capture, BOTH, point_count=POINTS, device=device)
-        expected = np.sqrt((step**2).mean())
+        sequence = flickering(asset, np.array([0.5, 0.4, 0.3]), STEP)
+        found = scores(sequence, relit_capture, device)
+        expected = np.sqrt((STEP**2).mean())
         # Means of equal values in float32: 1e-6 of at most 0.3, 4 times as much when encoded, of 0.03.
         assert found.ours.mean == pytest.approx(expected, rel=1e-4)
         assert found.ours.p95 == pytest.approx(expected, rel=1e-4)
@@ -156,7 +167,7 @@ class TestSurface:
 
     def test_a_steady_asset_is_steady(self, asset, relit_capture):
         sequence = flickering(asset, np.array([0.5, 0.4, 0.3]), 0.0)
-        found = surface_scores(sequence, relit_capture, BOTH, point_count=POINTS, device="cpu")
+        found = scores(sequence, relit_capture, "cpu")
         assert found.ours.p95 < 1e-5
         # The true images are of a painted surface that moves over coarse pixels: some of it is all that they have.
         assert 0.0 < found.truth.mean < 0.1
@@ -164,48 +175,39 @@ class TestSurface:
     def test_error_is_that_to_the_true_images(self, asset, relit_capture):
         """A colour of one is off by what the truth lacks of it: more than where discs have the truth's colours."""
         white = changed(asset, lambda _, cloud: cloud.with_arrays(base_color=np.ones((len(cloud), 3))))
-        errors = [
-            surface_scores(sequence, relit_capture, BOTH, point_count=POINTS, device="cpu").error
-            for sequence in (asset, white)
-        ]
+        errors = [scores(sequence, relit_capture, "cpu").error for sequence in (asset, white)]
         assert errors[0] < 0.25 * errors[1]
 
-    def test_cameras_that_stand_still_need_no_image(self, asset, relit_capture, tmp_path):
+    def test_cameras_that_stand_still_need_no_image(self, asset, relit_capture, folder):
         """Without records of the second frame, what they would show of it is drawn all the same."""
-        folder = tmp_path / "capture"
-        shutil.copytree(relit_capture.folder, folder)
         text = (folder / "transforms.json").read_text()
         (folder / "transforms.json").write_text(text.replace('"frame": 1,', '"frame": 9,'))
-        found = surface_scores(asset, Capture.read(folder), BOTH, point_count=POINTS, device="cpu")
-        whole = surface_scores(asset, relit_capture, BOTH, point_count=POINTS, device="cpu")
+        found = scores(asset, Capture.read(folder), "cpu")
+        whole = scores(asset, relit_capture, "cpu")
         assert found.ours == whole.ours
         assert found.truth is None
 
-    def test_cameras_that_move_do(self, asset, relit_capture, tmp_path):
-        folder = tmp_path / "capture"
-        shutil.copytree(relit_capture.folder, folder)
+    def test_cameras_that_move_do(self, asset, relit_capture, folder):
         content = json.loads((folder / "transforms.json").read_text())
         for record in content["frames"]:
             if record["frame"] == 1:
                 record["frame"] = 9
                 record["transform_matrix"][0][3] += 0.01
         (folder / "transforms.json").write_text(json.dumps(content))
-        said = surface_scores(asset, Capture.read(folder), BOTH, point_count=POINTS, device="cpu")
+        said = scores(asset, Capture.read(folder), "cpu")
         assert said == "no point of the true surface is seen in two frames by a camera"
 
-    def test_triangles_that_are_cut_otherwise_are_left_out(self, asset, relit_capture, tmp_path):
-        folder = tmp_path / "capture"
-        shutil.copytree(relit_capture.folder, folder)
+    def test_triangles_that_are_cut_otherwise_are_left_out(self, asset, relit_capture, folder):
         mesh = read_truth_mesh(relit_capture, 1)
         for shift, of_one in ((2, True), (2 + len(mesh.faces) // 2, False)):
             faces = np.array(mesh.faces)
             faces[:shift] = np.roll(faces[:shift], 1, axis=1)  # the same triangles, said in another order
             np.savez(folder / "truth/mesh_0001.npz", vertices=mesh.vertices, faces=faces)
-            found = surface_scores(asset, Capture.read(folder), BOTH, point_count=POINTS, device="cpu")
+            found = scores(asset, Capture.read(folder), "cpu")
             assert (found != "the true surface is not of one topology in all frames") == of_one
 
     def test_one_frame_is_not_enough(self, asset, relit_capture):
-        said = surface_scores(asset, relit_capture, {0: 0}, point_count=POINTS, device="cpu")
+        said = scores(asset, relit_capture, "cpu", {0: 0})
         assert said == "fewer than two frames of the asset have a true surface"
 
 

@@ -9,11 +9,10 @@ from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import Camera
 from beam_warp.device.arrays import resolve_device, upload
-from beam_warp.materials.bake import BakeOptions, BakeTarget, bake
+from beam_warp.materials.bake import BakeTarget
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.sources import upload_gaussians
 
 NEAR = 0.01
 
@@ -28,14 +27,15 @@ def around(azimuth, width, height, distance=4.0):
 
 
 class TestFactor:
+    CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+    POINTS = np.array([(x, y, 5.0) for x in range(-2, 3) for y in range(-2, 3)])
+
     @pytest.mark.parametrize(("pixels", "wanted"), [(0.4, 1), (3.99, 1), (4.01, 2), (5.99, 2), (6.01, 3), (15.0, 7)])
     def test_a_pixel_is_at_most_half_as_wide_as_a_splat(self, pixels, wanted):
         """Tiles of one size in a plane that faces the camera: all deviations are ``pixels``."""
-        camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
-        points = np.array([(x, y, 5.0) for x in range(-2, 3) for y in range(-2, 3)])
-        flat = tiles(points, np.tile((0.0, 0.0, -1.0), (25, 1)), 1.0)
+        flat = tiles(self.POINTS, np.tile((0.0, 0.0, -1.0), (25, 1)), 1.0)
         flat["scales"] = np.tile([0.01 * pixels, 0.02 * pixels, 1e-4], (25, 1))  # the middle one is 5 / 500 a pixel
-        assert reduction_factor(cloud_of(flat), [camera], near=NEAR) == wanted
+        assert reduction_factor(cloud_of(flat), [self.CAMERA], near=NEAR) == wanted
 
     def test_the_view_that_sees_splats_smallest_decides(self):
         near, far = around(0.0, 400, 400, 3.0), around(90.0, 400, 400, 9.0)
@@ -51,15 +51,13 @@ class TestFactor:
 
     def test_many_small_splats_keep_pixels_small(self):
         """More than a quarter of the tiles is 5 pixels wide, the others 12."""
-        camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
-        points = np.array([(x, y, 5.0) for x in range(-2, 3) for y in range(-2, 3)])
-        flat = tiles(points, np.tile((0.0, 0.0, -1.0), (25, 1)), 0.12 / 0.65)
+        flat = tiles(self.POINTS, np.tile((0.0, 0.0, -1.0), (25, 1)), 0.12 / 0.65)
         flat["scales"][::3] *= 5.0 / 12.0
-        assert reduction_factor(cloud_of(flat), [camera], near=NEAR) == 2
+        assert reduction_factor(cloud_of(flat), [self.CAMERA], near=NEAR) == 2
 
 
 class TestBlocks:
-    @pytest.mark.parametrize("factor", [1, 2, 3, 16])
+    @pytest.mark.parametrize("factor", [1, 3, 16])
     @pytest.mark.parametrize("shape", [(1, 7, 1), (8, 11, 5)])
     def test_means_and_sums(self, device, rng, factor, shape):
         height, width, columns = shape
@@ -104,39 +102,3 @@ class TestBlocks:
         difference = np.abs(found.values[:13, :17] - whole.values[1::3, 1::3])
         assert np.quantile(difference, 0.99) < 2e-5
         assert difference.max() < 1.5 / 255
-
-
-class TestBake:
-    def test_noisy_images_bake_to_the_same(self, device):
-        """Splats of 4 pixels, noise finer than these: other views are drawn as well as from all pixels, to 0.1 dB."""
-        made, where = ball(280), resolve_device(device)
-        truth = (0.5 + 0.4 * np.sin(5.0 * made.positions)).astype(np.float32)
-        noise = np.random.default_rng(1)
-        views = []
-        for azimuth in range(0, 360, 60):
-            camera = around(azimuth, 91, 91)
-            drawn = rasterize_values(made, camera, truth, device=device)
-            shown = drawn.values + noise.normal(0.0, 0.1, drawn.values.shape)
-            weights = np.repeat((drawn.alpha > 0.9)[..., None], 3, axis=2)
-            arrays = (upload(a.astype(np.float32), float, where) for a in (shown, weights))
-            views.append(BakeTarget(camera, *arrays))
-        factor = reduction_factor(made, [view.camera for view in views], near=NEAR)
-        assert factor == 2
-        gaussians, options = upload_gaussians(made, where), BakeOptions(passes=40)
-        whole = bake(gaussians, views, options=options, device=where)
-        found = bake(
-            gaussians,
-            [reduced_target(view, factor, where) for view in views],
-            options=options,
-            raster_options=reduced_options(None, factor),
-            device=where,
-        )
-        # evidence is counted in the images' own pixels
-        np.testing.assert_allclose(found.evidence.sum(), whole.evidence.sum(), rtol=0.01)
-        errors = np.zeros(2)
-        for azimuth in (30.0, 150.0, 270.0):
-            wanted = rasterize_values(made, around(azimuth, 91, 91), truth, device=device).values
-            for i, baked in enumerate((whole, found)):
-                shown = rasterize_values(made, around(azimuth, 91, 91), baked.values, device=device).values
-                errors[i] += ((shown - wanted) ** 2).sum()
-        assert abs(10.0 * np.log10(errors[1] / errors[0])) < 0.1

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from support.color_evidence import color_evidence
 
 from beam_warp.materials.base_color import BaseColor
 from beam_warp.materials.changes import FALSE_DISCOVERIES, ChangeTest, with_changes
-from beam_warp.materials.direct import ColorEvidence
 
 COUNT, FRAMES = 4000, 8
 VIEWS = 1e6
@@ -13,23 +13,11 @@ VIEWS = 1e6
 
 def evidence(colors, error, *, stated=None, unseen=None):
     """Evidence of one frame whose least-squares solution is ``colors``, give or take ``stated``."""
-    count = len(colors)
-    ones = np.ones((count, 3))
-    zeros = np.zeros(count)
-    said = np.broadcast_to(error if stated is None else stated, (count,))
-    return ColorEvidence(
-        numerator=colors * ones,
-        denominator=ones,
-        observed=colors**2
-        + VIEWS * (said**2)[:, None],  # so many views that their scatter is known: said^2 of the mean
-        irradiance=ones,
-        openness=np.ones(count),
-        noise=zeros,
-        views=np.full(count, VIEWS),
-        facing=np.ones(count),
-        saturated=zeros,
-        unseen=zeros if unseen is None else unseen.astype(float),
-    )
+    said = np.broadcast_to(error if stated is None else stated, (len(colors),))
+    # so many views that their scatter is known: said^2 of the mean
+    observed = colors**2 + VIEWS * (said**2)[:, None]
+    hidden = 0.0 if unseen is None else unseen
+    return color_evidence(len(colors), numerator=colors, denominator=1.0, observed=observed, views=VIEWS, unseen=hidden)
 
 
 def frames_of(rng, truth, error, **said):

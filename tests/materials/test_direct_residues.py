@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 from support.estimates import LARGEST_Z
-from support.shapes import cloud_of, disc_points, tiles
+from support.shapes import cloud_of, disc_points, sphere_points, tiles
+from support.structures import filled
 
 from beam_warp import Scene
 from beam_warp.kernels.materials.residues import (
@@ -40,13 +41,6 @@ def single(array):
     return np.asarray(array, np.float32).astype(np.float64)
 
 
-def sphere_directions(count):
-    i = np.arange(count) + 0.5
-    z, phi = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
-
-
 def structured(directions):
     """Radiance of a sky with a gradient, a warm lobe and a cool one, ``(..., 3)``."""
     warm, cool = unit(np.array([0.4, -0.5, 0.8])), unit(np.array([-0.7, 0.2, 0.3]))
@@ -69,24 +63,20 @@ class Points:
         count, samples = directions.shape[:2]
         self.device, self.count = device, count
         self.rows = np.arange(count)[::-1].copy()  # batches come in another order than rows
-        self.batch = RayBatch()
-        self.batch.normals = to_device(normals[self.rows], wp.vec3, device)
-        self.batch.rows = wp.array(self.rows.astype(np.int32), dtype=int, device=device)
-        self.batch.sample_count = samples
-        self.rays = LightRays()
-        self.rays.directions = to_device(directions[self.rows].reshape(-1, 3), wp.vec3, device)
-        self.rays.weights = to_device(weights[self.rows].reshape(-1, 3), wp.vec3, device)
-        self.rays.visibility = to_device(visibility[self.rows].reshape(-1), float, device)
-        self.rays.paired = int(paired)
-        self.light = GatheredLight()
-        for name in ("unshadowed", "arriving", "bounce"):
-            setattr(self.light, name, wp.zeros(count, dtype=wp.vec3, device=device))
-        for name in ("noise", "tilt"):
-            setattr(self.light, name, wp.zeros(count, dtype=float, device=device))
-        self.light.bounce.assign(np.full((count, 3), bounce, np.float32))
-        self.surface = ShadedPoints()
-        self.surface.normals = to_device(normals, wp.vec3, device)
-        self.surface.roughness = to_device(np.full(count, roughness), float, device)
+        self.batch = filled(RayBatch, device, normals=normals[self.rows], rows=self.rows, sample_count=samples)
+        self.rays = filled(
+            LightRays,
+            device,
+            directions=directions[self.rows].reshape(-1, 3),
+            weights=weights[self.rows].reshape(-1, 3),
+            visibility=visibility[self.rows].reshape(-1),
+            paired=int(paired),
+        )
+        black, zero = np.zeros((count, 3)), np.zeros(count)
+        self.light = filled(
+            GatheredLight, device, unshadowed=black, arriving=black, bounce=black + bounce, noise=zero, tilt=zero
+        )
+        self.surface = filled(ShadedPoints, device, normals=normals, roughness=np.full(count, roughness))
 
     def gather(self, ratio, unshadowed):
         self.light.unshadowed.assign(np.asarray(unshadowed, np.float32))
@@ -94,14 +84,16 @@ class Points:
         return {name: getattr(self.light, name).numpy().copy() for name in ("arriving", "noise", "tilt")}
 
     def residues(self, sky, views, diffuse_weight=ALBEDO_SCALING, weights=None):
-        found = Observations()
-        shape = views.shape[:2]
-        colors = np.zeros((*shape, 4), np.float32)
+        colors = np.zeros((*views.shape[:2], 4))
         colors[..., 3] = 1.0 if weights is None else weights
-        found.colors = wp.array(colors, dtype=wp.vec4, device=self.device)
-        found.directions = wp.array(views.astype(np.float32), dtype=wp.vec3, device=self.device)
-        found.specular = wp.zeros(shape, dtype=wp.vec3, device=self.device)
-        found.diffuse_share = wp.zeros(shape, dtype=float, device=self.device)
+        found = filled(
+            Observations,
+            self.device,
+            colors=colors,
+            directions=views,
+            specular=np.zeros(views.shape),
+            diffuse_share=np.zeros(views.shape[:2]),
+        )
         launch_view_residues(
             self.batch, self.rays, self.light, sky.blurred, self.surface, int(diffuse_weight), found, self.device
         )
@@ -212,7 +204,7 @@ def sky():
 def even_rays(normals, samples, visible=None):
     """Rays evenly over the sphere (density 1 / 4 pi) under the structured sky; half of them lie below the surface."""
     count = len(normals)
-    directions = np.tile(sphere_directions(samples), (count, 1, 1))
+    directions = np.tile(sphere_points(samples)[0], (count, 1, 1))
     cosine = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)
     weights = structured(directions) * (4.0 * cosine)[..., None]
     visibility = np.ones((count, samples)) if visible is None else visible(directions)
@@ -252,7 +244,7 @@ class TestResidues:
         np.testing.assert_allclose(share, np.broadcast_to(1.0 - albedo[:, None], share.shape), atol=TABLE_ERROR)
         mirrored = 2.0 * np.einsum("ni,vni->vn", normals, views)[..., None] * normals - views
         # the blur itself, from fine even directions, with the lobe that n = v = d has: n.h against D n.l
-        fine = sphere_directions(20_000)
+        fine, _ = sphere_points(20_000)
         light = structured(fine)
         for v, p in ((0, 0), (1, 5), (2, 17), (3, 29), (4, 32)):
             d = mirrored[v, p]
@@ -266,25 +258,6 @@ class TestResidues:
             spread = np.abs(expected[0] - expected[1])
             # tree blur 2 %, linear in log roughness between levels 2 %, and what masking makes of the lobe
             assert (np.abs(specular[v, p] - expected.mean(0)) < spread + 0.04 * expected.max() + TABLE_ERROR).all()
-
-    def test_the_rendering_equation_along_the_normal(self, device, sky):
-        """Seen along the normal the lobe does not stretch: the whole integral of specular light, by quadrature."""
-        rng = np.random.default_rng(3)
-        normals = unit(rng.normal(size=(9, 3)))
-        points = Points(normals, *even_rays(normals, 64), device, roughness=0.5)
-        points.gather(True, np.ones((9, 3)))
-        specular, _ = points.residues(sky(device), normals[None])
-        fine = sphere_directions(40_000)
-        for p, n in enumerate(normals):
-            up = fine[fine @ n > 0.0]
-            brdf = specular_brdf(n, n, up, 0.5)
-            expected = (structured(up) * (brdf * (up @ n))[:, None]).sum(0) * 4.0 * np.pi / len(fine)
-            # what the split sum leaves out: under its lobe alone, D n.l, masking and Fresnel do not vary
-            lobe = ggx_distribution(unit(up + n) @ n, 0.25) * (up @ n)
-            split = (structured(up) * lobe[:, None]).sum(0) / lobe.sum() * specular_albedo(1.0, 0.5)
-            assert (np.abs(specular[0, p] - split) < 0.04 * split.max()).all()  # blur 2 %, between levels 2 %
-            assert (np.abs(specular[0, p] - expected) < np.abs(split - expected) + 0.04 * split.max()).all()
-            assert (np.abs(split - expected) < 0.1 * expected.max()).all()
 
     @pytest.mark.parametrize("roughness", [0.4, 0.8])
     def test_what_is_in_the_way_takes_its_share_of_the_lobe(self, device, rng, sky, roughness):
@@ -321,7 +294,7 @@ class TestResidues:
         points = Points(normals, *even_rays(normals, 4096), device)
         points.gather(True, np.ones((9, 3)))
         _, share = points.residues(sky(device), views, FRESNEL_HV)
-        fine = sphere_directions(40_000)
+        fine, _ = sphere_points(40_000)
         for v in range(len(self.COSINES)):
             for p, n in enumerate(normals):
                 up = fine[fine @ n > 0.0]
@@ -368,21 +341,12 @@ def scene_of_views(rng, count, views):
 
 
 def fitted(colors, weight, toward, share, specular, normals, arriving, device, *, robust=False, bounce=0.0):
-    found, light, surface, fit = Observations(), GatheredLight(), ShadedPoints(), ColorFit()
-    found.colors = wp.array(
-        np.concatenate([colors, weight[..., None]], -1).astype(np.float32), dtype=wp.vec4, device=device
-    )
-    found.directions = wp.array(toward.astype(np.float32), dtype=wp.vec3, device=device)
-    found.specular = wp.array(specular.astype(np.float32), dtype=wp.vec3, device=device)
-    found.diffuse_share = wp.array(share.astype(np.float32), dtype=float, device=device)
-    light.arriving = to_device(arriving, wp.vec3, device)
-    light.bounce = to_device(np.full_like(arriving, bounce), wp.vec3, device)
-    surface.normals = to_device(normals, wp.vec3, device)
-    count = len(normals)
-    for name in ("numerator", "denominator", "observed"):
-        setattr(fit, name, wp.zeros(count, dtype=wp.vec3, device=device))
-    for name in ("views", "facing"):
-        setattr(fit, name, wp.zeros(count, dtype=float, device=device))
+    colors = np.concatenate([colors, weight[..., None]], -1)
+    found = filled(Observations, device, colors=colors, directions=toward, specular=specular, diffuse_share=share)
+    light = filled(GatheredLight, device, arriving=arriving, bounce=np.full_like(arriving, bounce))
+    surface = filled(ShadedPoints, device, normals=normals)
+    black, zero = np.zeros(normals.shape), np.zeros(len(normals))
+    fit = filled(ColorFit, device, numerator=black, denominator=black, observed=black, views=zero, facing=zero)
     launch_fit_color(found, light, surface, robust, fit, device)
     return {name: getattr(fit, name).numpy().astype(np.float64) for name in ColorFit.vars}
 
@@ -465,13 +429,16 @@ class TestBounce:
 
     def gathered(self, points, cloud, radiance, device, seed=0):
         scene = Scene.from_gaussians(cloud, device)
-        batch = RayBatch()
-        batch.positions = to_device(points, wp.vec3, device)
-        batch.normals = to_device(np.tile([0.0, 0.0, 1.0], (len(points), 1)), wp.vec3, device)
-        batch.offsets = to_device(np.full(len(points), 1e-4), float, device)
-        batch.rows = wp.array(np.arange(len(points), dtype=np.int32), dtype=int, device=device)
-        batch.base = scene.occluders.origin
-        batch.sample_count = self.SAMPLES
+        batch = filled(
+            RayBatch,
+            device,
+            positions=points,
+            normals=np.tile([0.0, 0.0, 1.0], (len(points), 1)),
+            offsets=np.full(len(points), 1e-4),
+            rows=np.arange(len(points)),
+            base=scene.occluders.origin,
+            sample_count=self.SAMPLES,
+        )
         out = wp.zeros(len(points), dtype=wp.vec3, device=device)
         launch_trace_bounce(
             scene, EXACT.settings(scene), batch, to_device(radiance, wp.vec3, device), (seed, 0), self.SAMPLES, out

@@ -8,11 +8,10 @@ tiles, by the split sum and by the blending, and must say by how much.
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import cloud_of, disc_points, sphere_points, tiles
+from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
 
 from beam_warp import Scene
 from beam_warp.capture.views import CapturedView
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
@@ -23,7 +22,6 @@ from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
-from beam_warp.world.harmonics import SH_C0
 
 pytestmark = pytest.mark.slow  # test_color_errors.py and TestErrorBars of test_direct.py guard the parts
 
@@ -110,9 +108,7 @@ def decomposed():
     sent = model(points, normals, ball_count, truth, cameras)
     shown = (sent > 0.0).any(axis=-1).sum(axis=0)
     mean = sent.sum(axis=0) / np.maximum(shown, 1)[:, None]
-    cloud = cloud.with_arrays(
-        radiance=((mean - 0.5) / SH_C0)[:, None].astype(np.float32), radiance_color_space=LINEAR_REC709
-    )
+    cloud = colored(cloud, mean)
     views = []
     for k, camera in enumerate(cameras):
         image = rasterize_values(cloud, camera, sent[k].astype(np.float32), device="cpu")

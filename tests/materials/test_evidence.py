@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from support.shapes import cloud_of, disc_points, sphere_points, tiles
+from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
+from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
@@ -34,12 +34,6 @@ def around(count=8, distance=4.0, side=SIDE):
     ]
 
 
-def colored(cloud, colors, color_space=LINEAR_REC709):
-    return cloud.with_arrays(
-        radiance=((np.asarray(colors) - 0.5) / SH_C0)[:, None, :].astype(np.float32), radiance_color_space=color_space
-    )
-
-
 @pytest.fixture
 def ball(rng):
     """A unit sphere of tiles with colours at random."""
@@ -54,6 +48,12 @@ def captured(cloud, cameras, change=lambda color: color, device="cpu"):
         color = change(buffer.channels[RADIANCE] * buffer.alpha[..., None]).astype(np.float32)
         views.append(CapturedView(name=str(k), camera=camera, color=color, alpha=buffer.alpha))
     return views
+
+
+def shown_colors(*arguments, device):
+    """Colours of all Gaussians towards all cameras, ``(V, N, 4)``, and which of them are shown."""
+    colors = view_evidence(*arguments, device=device).colors.numpy()
+    return colors, colors[..., 3] > 0.1
 
 
 class TestSurface:
@@ -105,9 +105,7 @@ class TestSurface:
 class TestColors:
     def test_a_perfect_fit_shows_its_own_colour(self, ball, device):
         cameras = around()
-        found = view_evidence(ball, cameras, captured(ball, cameras, device=device), device=device)
-        colors = found.colors.numpy()
-        shown = colors[..., 3] > 0.1
+        colors, shown = shown_colors(ball, cameras, captured(ball, cameras, device=device), device=device)
         truth = np.broadcast_to(0.5 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
         # image and rendering are the same function of the same Gaussians: nothing is left to be spread back
         np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=2e-5)
@@ -115,20 +113,16 @@ class TestColors:
     def test_what_the_fit_does_not_explain_is_added(self, ball, device):
         cameras = around()
         brighter = captured(ball, cameras, lambda color: color + 0.125 * (color.sum(axis=-1, keepdims=True) > 0.0))
-        found = view_evidence(ball, cameras, brighter, device=device)
-        colors = found.colors.numpy()
-        shown = colors[..., 3] > 0.1
+        colors, shown = shown_colors(ball, cameras, brighter, device=device)
         truth = np.broadcast_to(0.625 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
         np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=1e-4)
 
     def test_display_colour_is_decoded(self, ball, device):
         cameras = around(4)
         linear = np.full((3000, 3), 0.3)
-        display = colored(ball, linear_to_srgb(linear), DISPLAY_SRGB)
+        display = colored(ball, linear, DISPLAY_SRGB)
         views = captured(colored(ball, linear), cameras)
-        found = view_evidence(display, cameras, views, device=device)
-        colors = found.colors.numpy()
-        shown = colors[..., 3] > 0.1
+        colors, shown = shown_colors(display, cameras, views, device=device)
         np.testing.assert_allclose(colors[shown][:, :3], 0.3, atol=2e-3)  # pixels of alpha .95 blend unlike light
 
     def test_pixels_at_the_ceiling_count_for_nothing_and_are_told(self, ball, device):

@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
 
 
 def quaternions_from_normals(normals):
@@ -26,6 +28,14 @@ def tiles(points, normals, spacing, *, flatness=0.1, opacity=0.95):
 
 def cloud_of(*parts, **fields):
     return GaussianCloud(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}, **fields)
+
+
+def colored(cloud, linear, color_space=LINEAR_REC709):
+    """The cloud with one captured colour for each Gaussian, ``(N, 3)`` scene-linear, whatever it is stored in."""
+    color = np.asarray(linear if color_space == LINEAR_REC709 else linear_to_srgb(linear))
+    return cloud.with_arrays(
+        radiance=((color - 0.5) / SH_C0)[:, None, :].astype(np.float32), radiance_color_space=color_space
+    )
 
 
 def sphere_points(count):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,32 +38,6 @@ class MeasuredFrame:
     from_shape: NDArray[np.bool_]
     report: NDArray[np.int64]
 
-    @classmethod
-    def from_arrays(
-        cls, number: int, key: str, radiance_color_space: str | None, arrays: Mapping[str, NDArray[Any]]
-    ) -> MeasuredFrame:
-        """Collect arrays by name: those of a cloud, ``from_shape``, ``report``, and evidence if there is any."""
-        told = {name: arrays[EVIDENCE + name] for name in ColorEvidence.ARRAYS if EVIDENCE + name in arrays}
-        return cls(
-            number=number,
-            key=key,
-            cloud=GaussianCloud(
-                **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
-                axes=WORLD_AXES,
-                radiance_color_space=radiance_color_space,
-            ),
-            evidence=ColorEvidence.from_arrays(told) if told else None,
-            from_shape=arrays["from_shape"],
-            report=arrays["report"],
-        )
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays that `from_arrays` takes."""
-        told = {}
-        if self.evidence is not None:
-            told = {EVIDENCE + name: getattr(self.evidence, name) for name in ColorEvidence.ARRAYS}
-        return {**self.cloud.arrays(), **told, "from_shape": self.from_shape, "report": self.report}
-
 
 class FrameArchive:
     """A folder of finished frames and their solutions.
@@ -85,7 +58,20 @@ class FrameArchive:
     def read(self, number: int) -> MeasuredFrame:
         """Return a frame that was found or kept."""
         path = self._frame(number)
-        return MeasuredFrame.from_arrays(number, frame_key(path) or "", self._color_space, read_frame(path))
+        arrays = read_frame(path)
+        told = {name: arrays[EVIDENCE + name] for name in ColorEvidence.ARRAYS if EVIDENCE + name in arrays}
+        return MeasuredFrame(
+            number=number,
+            key=frame_key(path) or "",
+            cloud=GaussianCloud(
+                **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
+                axes=WORLD_AXES,
+                radiance_color_space=self._color_space,
+            ),
+            evidence=ColorEvidence.from_arrays(told) if told else None,
+            from_shape=arrays["from_shape"],
+            report=arrays["report"],
+        )
 
     def keep(self, frame: MeasuredFrame) -> None:
         """Store a frame.
@@ -93,7 +79,10 @@ class FrameArchive:
         Raises:
             OutputError: The file cannot be written; nothing is left behind.
         """
-        write_frame(self._frame(frame.number), frame.key, frame.arrays())
+        arrays = {**frame.cloud.arrays(), "from_shape": frame.from_shape, "report": frame.report}
+        if frame.evidence is not None:
+            arrays |= {EVIDENCE + name: getattr(frame.evidence, name) for name in ColorEvidence.ARRAYS}
+        write_frame(self._frame(frame.number), frame.key, arrays)
 
     def keep_solution(self, number: int, key: str, solved: BaseColor) -> None:
         """Store the base colour of a frame.

@@ -12,7 +12,6 @@ import numpy as np
 
 from beam_warp.capture.findings import Finding
 from beam_warp.digests import array_digest
-from beam_warp.jobs.progress import JobLog
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import kept_frame
 from beam_warp.light.prepared import PreparedEnvironment
@@ -50,21 +49,17 @@ class CaptureLight:
     stops: float
 
 
-def prepare_light(
-    environment: EnvironmentMap, source: Source, options: RunOptions, described: str, folder: Path, log: JobLog
-) -> CaptureLight:
+def prepare_light(environment: EnvironmentMap, source: Source, described: str, folder: Path) -> CaptureLight:
     """Prepare an environment and find its exposure.
 
     Args:
         environment: The light as it was given.
-        source: What was captured.
-        options: Exposure, and what it is found with.
+        source: What was captured, and the exposure that is stated or to be found.
         described: The code and options that an automatic exposure depends on; it is kept under their key.
         folder: Where it is kept, so that a resumed job has it at once.
-        log: Told how long steps take.
     """
-    device = source.first.device
-    with log.timer("prepare light"):
+    device, options = source.device, source.options
+    with source.log.timer("prepare light"):
         given = PreparedEnvironment(environment, device)
     stops = 0.0
     if options.exposure != "auto":
@@ -74,27 +69,25 @@ def prepare_light(
         text = f"{described} {source.image_digest(0)}"
         key = array_digest(environment.radiance, *first.cloud.arrays().values(), text=text)
         found = kept_frame(
-            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(first, given, options, log)])}
+            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(first, given, options)])}
         )
         stops = float(found["stops"][0])
     return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops)
 
 
-def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOptions, log: JobLog) -> float:
+def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOptions) -> float:
     """Return the stops by which the light explains a frame best."""
     scene, points = frame.scene, frame.points
     # Highlights cannot be told from the light before its exposure is known.
     stated = EXPOSURE_ROUGHNESS if options.roughness == ESTIMATE else options.roughness
     roughness = stated_roughness(frame.original, stated)
-    with log.timer("exposure"):
+    with frame.log.timer("exposure"):
         return float(
             np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.materials))
         )
 
 
-def light_findings(
-    frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str, log: JobLog
-) -> list[dict[str, Any]]:
+def light_findings(frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str) -> list[dict[str, Any]]:
     """Look at the light and the images of a frame before anything is measured.
 
     Args:
@@ -102,7 +95,6 @@ def light_findings(
         environment: The light, exposure included.
         path: JSON file where findings are kept.
         key: What they depend on.
-        log: Told how long it takes.
 
     Returns:
         Findings as records.
@@ -115,7 +107,7 @@ def light_findings(
         known = json.loads(path.read_text(encoding="utf-8"))
         if known["key"] == key:
             return list(known["findings"])
-    with log.timer("check"):
+    with frame.log.timer("check"):
         findings = [vars(finding) for finding in _judge(frame, environment)]
     write_json(path, {"key": key, "findings": findings})
     return findings

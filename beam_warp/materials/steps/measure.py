@@ -47,18 +47,18 @@ class FrameMeasurement:
             measured = plan.archive.find(number, key)
             if measured is None:
                 measured = self._measure(frame, key, previous)
-                with plan.log.timer("store"):
+                with plan.source.log.timer("store"):
                     plan.archive.keep(measured)
                 frame.forget()
             else:
                 self.resumed += 1
-            plan.log.report("decompose", number + 1, total)
-            previous = measured if plan.persistent and plan.options.images is not None else None
+            plan.source.log.report("decompose", number + 1, total)
+            previous = measured if plan.persistent and plan.source.options.images is not None else None
             yield measured
 
     def _measure(self, frame: SeenFrame, key: str, previous: MeasuredFrame | None) -> MeasuredFrame:
         """Measure one frame."""
-        images, evidence = self._plan.options.images, None
+        images, evidence = self._plan.source.options.images, None
         if images is not None:
             arrays = self._by_images(frame, images, previous)
         else:
@@ -77,19 +77,19 @@ class FrameMeasurement:
         """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
         scene, points, views = frame.scene, frame.points, frame.views
         roughness = self._roughness.arrays(frame)
-        with self._plan.log.timer("materials"):
+        with frame.log.timer("materials"):
             measured = measure_materials(
                 frame.cloud,
                 scene,
                 points,
                 roughness["roughness"],
                 self._plan.light.prepared,
-                options=self._plan.options.materials,
+                options=self._plan.source.options.materials,
                 views=views,
                 frame=frame.number,
-                progress=self._plan.log.within("materials", frame.number),
+                progress=frame.log.within("materials", frame.number),
             )
-        with self._plan.log.timer("fill"):
+        with frame.log.timer("fill"):
             occlusion, error = frame.filled_occlusion(measured.ambient_occlusion, measured.ambient_occlusion_error)
         arrays = {"ambient_occlusion": occlusion, "ambient_occlusion_error": error, **roughness}
         return arrays, measured.evidence
@@ -101,7 +101,7 @@ class FrameMeasurement:
         assert frame.capture is not None
         scene, roughness = frame.scene, self._roughness.arrays(frame)
         views = frame.images()
-        with self._plan.log.timer("materials"):
+        with frame.log.timer("materials"):
             found = decompose_by_images(
                 frame.cloud,
                 scene,
@@ -112,7 +112,7 @@ class FrameMeasurement:
                 raster_options=frame.capture.raster,
                 previous=None if previous is None else previous.cloud.base_color,
                 frame=frame.number,
-                progress=self._plan.log.within("materials", frame.number),
+                progress=frame.log.within("materials", frame.number),
             )
         self.notes += [note for note in found.notes if note not in self.notes]
         return {

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from beam_warp._version import __version__
+from beam_warp.capture.findings import Finding
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.light.prepared import PreparedEnvironment
@@ -25,7 +26,7 @@ from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 def relightable_sequence(plan: JobPlan, solved: SolvedFrames) -> GaussianSequence:
     """Return the frames that were solved as a sequence, read lazily, in the world's axes."""
-    sequence, options = plan.source.sequence, plan.options
+    sequence, options = plan.source.sequence, plan.source.options
     shared = sequence.constant & set(ATTRIBUTES) - {"normals"}
     if not solved.is_varying:
         shared |= {"base_color", "base_color_error", "observability"}
@@ -89,16 +90,16 @@ def run_report(
         roughness: How an estimate of roughness came about.
         seconds: Duration of the whole job.
     """
-    sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.log.timer.seconds
+    sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.source.log.timer.seconds
     measured = len(sequence) - measurement.resumed
     traced = stages.get("materials", 0.0)
-    rays = measured * count * plan.options.materials.sample_count * 2
+    rays = measured * count * plan.source.options.materials.sample_count * 2
     notes = [*sequence.metadata.get("notes", "").splitlines(), *measurement.notes, *_lines(findings, "note")]
     return {
         "input": {"frames": len(sequence), "gaussians": count, "notes": notes},
         "device": device_facts(plan.light.prepared.device),
         "versions": versions(),
-        "options": plan.options.as_dict(),
+        "options": plan.source.options.as_dict(),
         "exposure_stops": plan.light.stops,
         "resumed_frames": measurement.resumed,
         "persistent": plan.persistent,
@@ -113,9 +114,5 @@ def run_report(
 
 def _lines(findings: list[dict[str, Any]], severity: str) -> list[str]:
     """Return the findings of a severity as lines for people."""
-    lines = []
-    for finding in findings:
-        place = f" ({finding['where']})" if finding["where"] else ""
-        if finding["severity"] == severity:
-            lines.append(f"{finding['what']}{place}. {finding['remedy']}".strip())
-    return lines
+    some = [Finding(**finding) for finding in findings if finding["severity"] == severity]
+    return [str(finding).removeprefix(f"{severity}: ") for finding in some]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -34,8 +36,8 @@ class RoughnessFinder:
 
     def arrays(self, frame: SeenFrame) -> dict[str, NDArray[np.float32]]:
         """Return ``roughness`` of a frame's Gaussians, ``(N,)``, and ``roughness_error`` where it is estimated."""
-        if self._plan.options.roughness != ESTIMATE:
-            return {"roughness": stated_roughness(frame.original, self._plan.options.roughness)}
+        if self._plan.source.options.roughness != ESTIMATE:
+            return {"roughness": stated_roughness(frame.original, self._plan.source.options.roughness)}
         if not self._plan.persistent:
             return self._estimated(frame, frame.number, [frame.number])
         if self._shared is None:
@@ -58,24 +60,23 @@ class RoughnessFinder:
 
     def _profile(self, frame: SeenFrame, asked: list[int]) -> RoughnessProfile:
         """Measure some frames of the same Gaussians and add them up."""
-        total = None
-        for number in asked:
+
+        def measure(number: int) -> RoughnessProfile:
             seen = self._frame(number, frame)
             scene, points, views = seen.scene, seen.points, seen.views
-            with self._plan.log.timer("roughness"):
-                found = measure_roughness_profile(
+            with seen.log.timer("roughness"):
+                return measure_roughness_profile(
                     seen.cloud,
                     scene,
                     points,
                     self._plan.light.prepared,
                     views,
-                    options=self._plan.options.materials,
+                    options=self._plan.source.options.materials,
                     frame=number,
-                    progress=self._plan.log.within("roughness", number),
+                    progress=seen.log.within("roughness", number),
                 )
-            total = found if total is None else total + found
-        assert total is not None
-        return total
+
+        return reduce(add, map(measure, asked))
 
     def _frame(self, number: int, known: SeenFrame) -> SeenFrame:
         """Return a frame, which need not be read if it is the one that is at hand."""

@@ -51,7 +51,7 @@ def solve_each(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
     """Solve every frame by itself: its Gaussians are those of no other. Solutions are stored."""
     tally = MaterialTally()
     for frame in frames:
-        with plan.log.timer("solve"):
+        with plan.source.log.timer("solve"):
             solved = _solve(plan, frame, _evidence(frame))
             plan.archive.keep_solution(frame.number, plan.key, solved)
             tally.add(frame, frame.cloud.with_arrays(**solved.arrays()), solved.clipped_part)
@@ -65,7 +65,7 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrame
     """
     first, joint, test, count = None, None, ChangeTest(), 0
     for frame in frames:
-        with plan.log.timer("solve"):
+        with plan.source.log.timer("solve"):
             evidence = _evidence(frame)
             first = first or frame
             joint = evidence if joint is None else joint + evidence
@@ -74,7 +74,7 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrame
     assert first is not None
     assert joint is not None
     tally = MaterialTally()
-    with plan.log.timer("solve"):
+    with plan.source.log.timer("solve"):
         change = test.result()
         constant = _solve(plan, first, joint, dispersion=change.dispersion)
         is_varying = bool(change.changing.any())

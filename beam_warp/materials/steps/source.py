@@ -10,7 +10,7 @@ from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.options import RunOptions
 from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.axes import change_axes
@@ -24,7 +24,7 @@ class Source:
     Attributes:
         sequence: Frames with captured radiance, in any axes.
         images: Images of the capture; None to do without.
-        options: Offset and seed, for what frames show.
+        options: How frames are measured.
         digests: Digests of image files.
         device: Warp device.
         log: Told how far and how long steps take.
@@ -32,7 +32,7 @@ class Source:
 
     sequence: GaussianSequence
     images: CaptureImages | None
-    options: MaterialOptions
+    options: RunOptions
     digests: CaptureDigests
     device: str
     log: JobLog
@@ -62,7 +62,7 @@ class Source:
                 "Import Gaussians with captured colour."
             )
         cloud = change_axes(original, WORLD_AXES)
-        return SeenFrame(number, original, cloud, self.images, self.options, self.device, self.log)
+        return SeenFrame(number, original, cloud, self.images, self.options.materials, self.device, self.log)
 
     def is_display_referred(self) -> bool:
         """Return whether the captured colour has no scale: that of the first frame's images, if there are any."""

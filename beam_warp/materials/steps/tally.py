@@ -74,7 +74,7 @@ class MaterialTally:
 
     def count_changes(self, change: ColorChange) -> None:
         """Keep what a test of frames against each other found."""
-        self._changes = {"changing_part": change.changing_part, "error_dispersion": change.dispersion}
+        self._changes = {"changing_part": float(change.changing.mean()), "error_dispersion": change.dispersion}
 
     def summary(self) -> dict[str, Any]:
         """Return parts, means and counts over all frames, JSON-able."""
