@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -54,19 +55,16 @@ def stability(args: Stability) -> int:
     others = [read_result(path) for path in args.beside]
     result = StabilityResult()
     with progress(args.quiet or args.json) as report:
-        if args.only in (None, "tracing"):
-            result = result.joined(_trace(args, report))
-        if args.only in (None, "reconstruction"):
-            result = result.joined(_reconstruct(args, report))
-        if args.only in (None, "materials"):
-            result = result.joined(_decompose(args, report))
-        if args.only in (None, "relighting"):
-            result = result.joined(_relight(args, report))
+        parts = {"tracing": _trace, "reconstruction": _reconstruct, "materials": _decompose, "relighting": _relight}
+        for part, run in parts.items():
+            if args.only in (None, part):
+                result = result.joined(run(args, report))
     if args.out is not None:
-        joined = result
-        for other in others:
-            joined = joined.joined(other)
-        write_page(args.out, joined, "beam stability --large" if args.large else "beam stability")
+        write_page(
+            args.out,
+            reduce(StabilityResult.joined, others, result),
+            "beam stability --large" if args.large else "beam stability",
+        )
     if args.json:
         print_json(result.as_dict())
     elif not args.quiet:
@@ -87,8 +85,8 @@ def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
 
     cases = [case for case in CASES if args.large or not case.large]
     return StabilityResult(
-        tuple(run_cases(cases, args.device, progress=lambda done, total: report("cases", done, total))),
-        tuple(measure_shapes(SHAPES, args.device, progress=lambda done, total: report("shapes", done, total))),
+        tuple(run_cases(cases, args.device, progress=partial(report, "cases"))),
+        tuple(measure_shapes(SHAPES, args.device, progress=partial(report, "shapes"))),
     )
 
 
@@ -106,7 +104,7 @@ def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
             reconstructing(effort.steps(args.device), place),
             effort.studio(place, args.device),
             CAPTURE_CASES,
-            progress=lambda done, total: report("captures", done, total),
+            progress=partial(report, "captures"),
         )
         return StabilityResult(captures=tuple(outcomes))
 
@@ -117,9 +115,7 @@ def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     from beam_warp.stability.materials import run_material_cases
     from beam_warp.stability.page import StabilityResult
 
-    outcomes = run_material_cases(
-        MaterialStudio(args.device), MATERIAL_CASES, progress=lambda done, total: report("materials", done, total)
-    )
+    outcomes = run_material_cases(MaterialStudio(args.device), MATERIAL_CASES, progress=partial(report, "materials"))
     return StabilityResult(materials=tuple(outcomes))
 
 
@@ -132,7 +128,7 @@ def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
     outcomes = run_relighting_cases(
         RelightingBench(device=args.device),
         [case for case in RELIGHTING_CASES if args.large or not case.large],
-        progress=lambda done, total: report("relighting", done, total),
+        progress=partial(report, "relighting"),
     )
     return StabilityResult(relighting=tuple(outcomes))
 

@@ -98,8 +98,6 @@ class FrameLoop:
         schedule: Schedule,
         deliver: Callable[[int, PagePicture], None],
         report: Callable[[int, Exception], None],
-        *,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start the thread.
 
@@ -108,13 +106,11 @@ class FrameLoop:
             schedule: Decides; used by this loop alone from now on.
             deliver: Takes a page's frame, in the loop's thread.
             report: Takes what failed for a page, in the loop's thread; once until something changes.
-            clock: Seconds.
         """
         self._painter = painter
         self._schedule = schedule
         self._deliver = deliver
         self._report = report
-        self._clock = clock
         self._changed = threading.Condition()
         self._is_closed = False
         self._exports: list[tuple[int, Callable[[Picture], None]]] = []
@@ -126,7 +122,7 @@ class FrameLoop:
     def look(self, client: int, viewpoint: Viewpoint) -> None:
         """Say where a page looks from."""
         with self._changed:
-            self._schedule.look(client, viewpoint, self._clock())
+            self._schedule.look(client, viewpoint, time.monotonic())
             self._changed.notify()
 
     def leave(self, client: int) -> None:
@@ -139,7 +135,7 @@ class FrameLoop:
     def change(self, **values: Any) -> ViewState:
         """Change what is looked at, and return it; see `ViewState.changed`."""
         with self._changed:
-            self._schedule.show(self._schedule.state.changed(**values), self._clock())
+            self._schedule.show(self._schedule.state.changed(**values), time.monotonic())
             self._changed.notify()
             return self._schedule.state
 
@@ -172,14 +168,14 @@ class FrameLoop:
         while True:
             with self._changed:
                 while not self._is_closed and not self._exports:
-                    wait = self._schedule.wait(self._clock())
+                    wait = self._schedule.wait(time.monotonic())
                     if wait == 0.0:
                         break
                     self._changed.wait(wait)
                 if self._is_closed:
                     return
                 export = self._exports.pop(0) if self._exports else None
-                order = None if export else self._schedule.next(self._clock())
+                order = None if export else self._schedule.next(time.monotonic())
             if export is not None:
                 self._guarded(export[0], lambda export=export: self._export(*export))
             elif order is not None and not self._guarded(order.client, lambda order=order: self._carry_out(order)):
@@ -202,7 +198,7 @@ class FrameLoop:
 
     def _carry_out(self, order: Order) -> None:
         """Draw, and deliver where somebody still waits for it."""
-        started = self._clock()
+        started = time.monotonic()
         samples = 0
         is_over = False
         key = (order.kind, self._painter.cost_key(order.state))
@@ -218,7 +214,7 @@ class FrameLoop:
         else:
             camera = order.viewpoint.camera(order.scale, self._schedule.longest)
             picture = self._painter.draw(order.state, camera, is_quick=order.kind == "moving")
-        drawn = 1000.0 * (self._clock() - started) / max(samples, 1)
+        drawn = 1000.0 * (time.monotonic() - started) / max(samples, 1)
         with self._changed:
             is_wanted = self._schedule.is_wanted(order)
             if not is_wanted or order.kind != "traced":
@@ -226,7 +222,7 @@ class FrameLoop:
         if is_wanted:
             is_last = order.is_last and (order.kind != "traced" or is_over)
             self._deliver(order.client, PagePicture(picture, drawn, is_last))
-        taken = 1000.0 * (self._clock() - started)
+        taken = 1000.0 * (time.monotonic() - started)
         with self._changed:
             is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find
             self._cost_key = key

@@ -106,7 +106,7 @@ def test_mistakes(words, says, tmp_path, capsys):
 
 def test_frame_device_and_folder_mistakes(scene, tmp_path, capsys):
     assert beam("chart", "tracing", scene, "--frame", 3, "--out", tmp_path / "out") == 2
-    assert "frame must be in [0, 0], got 3" in capsys.readouterr().err
+    assert "frame must be an integer in [0, 0], got 3" in capsys.readouterr().err
     assert beam("chart", "tracing", scene, "--device", "cuda:99", "--out", tmp_path / "out") == 2
     assert "device must be one of" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -260,7 +260,7 @@ def test_the_capture_brings_its_light(ball, white_light, tmp_path):
         (["--out", "x.png", "--fov", "nan"], "vertical_fov must be a number in"),
         (["--out", "x.png", "--device", "cuda:9"], "device must be one of cpu"),
         (["--out", "x.png", "--exposure", "nan"], "must be a number in"),
-        (["--out", "x.png", "--low-pass", "0"], "low_pass must be a number in [1e-06, 1e+06], got 0.0"),
+        (["--out", "x.png", "--low-pass", "0"], "low-pass must be a number in [1e-06, 1e+06], got 0.0"),
     ],
 )
 def test_refusals_are_one_line(ball, white_light, tmp_path, capsys, monkeypatch, words, message):

@@ -83,5 +83,5 @@ def test_what_decides_besides():
 
 
 def test_what_is_no_plain_data_is_refused():
-    with pytest.raises(TypeError, match="must be plain data to be digested, got object"):
+    with pytest.raises(TypeError, match="what is digested must be plain data, got object"):
         ShotDigests(object())

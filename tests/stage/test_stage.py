@@ -405,7 +405,8 @@ class TestFile:
     def test_a_stage_made_without_a_file_is_the_same(self, folder):
         content = {"assets": ["still.ply", "walk"], "environment": "sky.exr", "camera": "keys.json"}
         scene = read(folder, content)
-        made = Stage.of([folder / "still.ply", folder / "walk"], environment=folder / "sky.exr", camera=scene.camera)
+        light = StageEnvironment(map=EnvironmentMap.read(folder / "sky.exr"))
+        made = Stage.of([folder / "still.ply", folder / "walk"], environment=light, camera=scene.camera)
         assert made.digest() == scene.digest()
         assert made.digest(0.1) == scene.digest(0.1)
         assert isinstance(scene.camera, KeyframePath)
