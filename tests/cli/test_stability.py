@@ -63,7 +63,7 @@ def test_tables_and_a_page_of_two_devices(tmp_path, capsys):
     row = next(line for line in page.splitlines() if line.startswith("| broken rows |"))
     assert "60 not finite, 10 with a negative scale, 10 with a zero quaternion | left out |" in row
     assert row.endswith("| ok |")
-    assert f"| Some GPU, fast: {fault} |" in page
+    assert f"| Some GPU, quality: {fault} |" in page
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "page.md"]
 
 
