@@ -70,27 +70,15 @@ def progress(quiet: bool, *, compiles: bool = True) -> Iterator[ProgressCallback
     if quiet or not sys.stderr.isatty():
         yield lambda stage, done, total, note="": None
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        *("{task.description}", rich.BarColumn(), rich.MofNCompleteColumn(), "{task.fields[rate]}"),
+        *(rich.TimeElapsedColumn(), rich.TimeRemainingColumn(), "{task.fields[note]}"),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
+    with rich.Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
         tasks: dict[str, Any] = {}
 
         def update(stage: str, done: int, total: int | None, note: str = "") -> None:

@@ -7,11 +7,9 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from beam_warp.view.painter import CloudPainter, Picture, TracedPicture
 from beam_warp.view.schedule import Order, Schedule
 from beam_warp.view.state import Viewpoint, ViewState
 from beam_warp.world.camera import Camera
@@ -20,58 +18,6 @@ log = logging.getLogger(__name__)
 
 NOBODY = -1
 """Page number of errors before there is a page; nobody is told of them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What is to be seen of a state.
-
-    Attributes:
-        pixels: Display sRGB, ``(H, W, 3)`` uint8.
-        layers: The same as numbers, the layers of an image file: name to ``(H, W)``.
-        gaussian_count: Number of Gaussians.
-        samples: Paths a pixel; 0 where none were traced.
-        legend: Legend of its colours, ``(h, w, 3)`` uint8; None where they need none.
-    """
-
-    pixels: NDArray[np.uint8]
-    layers: Callable[[], dict[str, NDArray[np.float32]]]
-    gaussian_count: int
-    samples: int = 0
-    legend: NDArray[np.uint8] | None = None
-
-
-class Tracing(Protocol):
-    """A picture that gets better."""
-
-    @property
-    def sample_count(self) -> int:
-        """Paths a pixel so far."""
-        ...
-
-    def advance(self, samples: int) -> None:
-        """Add paths to every pixel."""
-        ...
-
-    def picture(self) -> Picture:
-        """Return what there is so far."""
-        ...
-
-
-class Painter(Protocol):
-    """Draws states; called from one thread."""
-
-    def draw(self, state: ViewState, camera: Camera, *, is_quick: bool = False) -> Picture:
-        """Draw a state at once; quickly, if something moves."""
-        ...
-
-    def trace(self, state: ViewState, camera: Camera) -> Tracing:
-        """Begin to trace paths."""
-        ...
-
-    def cost_key(self, state: ViewState) -> object:
-        """Return what must be the same for two pictures of a size to take about the same time."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +40,7 @@ class FrameLoop:
 
     def __init__(
         self,
-        painter: Painter,
+        painter: CloudPainter,
         schedule: Schedule,
         deliver: Callable[[int, PagePicture], None],
         report: Callable[[int, Exception], None],
@@ -114,7 +60,7 @@ class FrameLoop:
         self._changed = threading.Condition()
         self._is_closed = False
         self._exports: list[tuple[int, Callable[[Picture], None]]] = []
-        self._tracings: dict[int, tuple[int, float, Tracing]] = {}
+        self._tracings: dict[int, tuple[int, float, TracedPicture]] = {}
         self._cost_key: object = None
         self._thread = threading.Thread(target=self._run, name="beam-view-frames", daemon=True)
         self._thread.start()
@@ -228,7 +174,7 @@ class FrameLoop:
             self._cost_key = key
             self._schedule.done(order, milliseconds=taken if is_typical else None, samples=samples, is_over=is_over)
 
-    def _tracing(self, order: Order) -> Tracing:
+    def _tracing(self, order: Order) -> TracedPicture:
         """Return what is traced for a page: as it was left, or a new one."""
         version, scale, tracing = self._tracings.get(order.client, (-1, 0.0, None))
         if tracing is None or (version, scale) != (order.version, order.scale):

@@ -18,7 +18,6 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.channels import SeenChannel, channel_range, see_channel
 from beam_warp.render.path import PathOptions, PathProgress, PathRenderer
-from beam_warp.view.frames import Picture
 from beam_warp.view.renderers import DeferredPair, displayed
 from beam_warp.view.state import (
     ALPHA,
@@ -90,8 +89,27 @@ class FrameCache:
         return len(self._held)
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is to be seen of a state.
+
+    Attributes:
+        pixels: Display sRGB, ``(H, W, 3)`` uint8.
+        layers: The same as numbers, the layers of an image file: name to ``(H, W)``.
+        gaussian_count: Number of Gaussians.
+        samples: Paths a pixel; 0 where none were traced.
+        legend: Legend of its colours, ``(h, w, 3)`` uint8; None where they need none.
+    """
+
+    pixels: NDArray[np.uint8]
+    layers: Callable[[], dict[str, NDArray[np.float32]]]
+    gaussian_count: int
+    samples: int = 0
+    legend: NDArray[np.uint8] | None = None
+
+
 class CloudPainter:
-    """Draws a sequence: lit, or one of its channels; satisfies `beam_warp.view.frames.Painter`.
+    """Draws a sequence: lit, or one of its channels; called from one thread.
 
     Attributes:
         subject: The box that the first, the middle and the last frame are in.
@@ -224,7 +242,7 @@ class CloudPainter:
 
 @dataclass(frozen=True)
 class TracedPicture:
-    """What was traced so far of a state; satisfies `beam_warp.view.frames.Tracing`."""
+    """Picture of a state that gets better as paths are added."""
 
     progress: PathProgress
     state: ViewState

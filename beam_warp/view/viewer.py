@@ -20,9 +20,9 @@ from beam_warp.errors import BeamError
 from beam_warp.image.files import write_exr
 from beam_warp.image.tone import TRANSFORMS
 from beam_warp.raster.records import RasterOptions
-from beam_warp.view.frames import FrameLoop, PagePicture, Picture
+from beam_warp.view.frames import FrameLoop, PagePicture
 from beam_warp.view.lamps import Lamps
-from beam_warp.view.painter import CloudPainter
+from beam_warp.view.painter import CloudPainter, Picture
 from beam_warp.view.schedule import LONGEST_SIDE, Pace, Schedule
 from beam_warp.view.server import DEFAULT_HOST, DEFAULT_PORT, server_url, start_server, stop_server
 from beam_warp.view.state import (
