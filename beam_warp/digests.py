@@ -79,20 +79,28 @@ def fields_of(record: Any) -> list[tuple[str, Any]]:
     return [(field.name, getattr(record, field.name)) for field in dataclasses.fields(record)]
 
 
-def described(value: Any, describe_file: Callable[[Path], Any]) -> Any:
+def _whole(array: NDArray[Any]) -> list[Any]:
+    return [str(array.dtype), array.tolist()]
+
+
+def described(
+    value: Any, describe_file: Callable[[Path], Any], describe_array: Callable[[NDArray[Any]], Any] = _whole
+) -> Any:
     """Return a value as JSON-able data, exactly; a type that is not known here is an error, never left out."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, Path):
         return describe_file(value)
     if isinstance(value, np.ndarray):
-        return [str(value.dtype), value.tolist()]
+        return describe_array(value)
+    if isinstance(value, np.generic):
+        return value.item()
     if dataclasses.is_dataclass(value):
-        return {name: described(item, describe_file) for name, item in fields_of(value)}
+        value = dict(fields_of(value))
     if isinstance(value, Mapping):
-        return {str(name): described(item, describe_file) for name, item in value.items()}
+        return {str(name): described(item, describe_file, describe_array) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
-        return [described(item, describe_file) for item in value]
+        return [described(item, describe_file, describe_array) for item in value]
     raise TypeError(f"what is digested must be plain data, got {type(value).__name__}")
 
 

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_choice, require_count
 from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import (
-    Antialiased,
-    Device,
-    DropInvalid,
-    Json,
-    LowPass,
-    Quiet,
-    SourceAxes,
-    asset_in,
-    notes_of,
-    raster_options,
-)
+from beam_warp.cli.flags import Device, Json, Quiet, ReadingFlags, asset_in, notes_of
 from beam_warp.cli.render_checks import kind_of, require_capture_folder, require_one_camera, require_place
 from beam_warp.cli.render_flags import StillCameraFlags
 from beam_warp.cli.render_views import PlannedView, capture_views, still_camera
@@ -72,10 +60,7 @@ class DrawChannel:
     ] = None
     frame: Annotated[int | None, arg(metavar="N", help="Only this frame, counted from 0; all by default.")] = None
     camera: OmitArgPrefixes[StillCameraFlags] = field(default_factory=StillCameraFlags)
-    antialiased: Antialiased = None
-    low_pass: LowPass = None
-    source_axes: SourceAxes = None
-    drop_invalid: DropInvalid = False
+    reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     device: Device = None
     quiet: Quiet = False
     json: Json = False
@@ -86,8 +71,8 @@ def channel(args: DrawChannel) -> int:
     _require_consistent(args)
     started = time.perf_counter()
     capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
-    sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
-    options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
+    sequence = args.reading.read(asset_in(args.asset))
+    options = args.reading.raster(sequence)
     notes = notes_of(sequence)
     if capture is None:
         views = _numbered_views(args, sequence)
@@ -99,8 +84,10 @@ def channel(args: DrawChannel) -> int:
         notes += left_out
     device = str(resolve_device(args.device))
     drawing, gaussian_count = _ChannelDrawing(args, options), 0
+    cloud_of = lru_cache(1)(lambda frame: change_axes(sequence[frame], WORLD_AXES))  # each is read once, one is held
     with progress(args.quiet or args.json) as report:
-        for done, (view, cloud) in enumerate(_with_clouds(views, sequence), start=1):
+        for done, view in enumerate(views, start=1):
+            cloud = cloud_of(view.frame)
             drawing.draw(view, cloud)
             gaussian_count = max(gaussian_count, len(cloud))
             report("render", done, len(views))
@@ -156,15 +143,6 @@ def _numbered_views(args: DrawChannel, sequence: GaussianSequence) -> list[Plann
     assert isinstance(target, FramePattern)
     require_folder(target)
     return [PlannedView(frame, camera, target.path(frame)) for frame in frames]
-
-
-def _with_clouds(views: list[PlannedView], sequence: GaussianSequence) -> Iterator[tuple[PlannedView, GaussianCloud]]:
-    """Give each view its cloud, frame by frame, so that each is read once and one is held at a time."""
-    held, cloud = -1, None
-    for view in views:
-        if cloud is None or view.frame != held:
-            held, cloud = view.frame, change_axes(sequence[view.frame], WORLD_AXES)
-        yield view, cloud
 
 
 class _ChannelDrawing:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
-from beam_warp.checks import require_number, require_package
+from beam_warp.checks import require_count, require_number, require_package
 from beam_warp.cli.console import ProgressCallback, print_json, progress
-from beam_warp.cli.flags import Device, Json, Quiet, SourceAxes
+from beam_warp.cli.flags import Device, Json, Quiet, SourceAxes, make_folder
 from beam_warp.cli.pages import SECOND_PAGE
-from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.errors import InvalidOptionError
 from beam_warp.study.page import write_page
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import Settings, Study, Table, read_table, run_study, table_paths
@@ -33,6 +33,13 @@ LEAST_PART = 0.4
 
 FIGURE_CAMERAS, FIGURE_SIZE = 8, 96
 """Cameras of the built-in capture, and width and height of their images [pixel]."""
+
+Names = tuple[str, ...]
+
+
+def _names(choices: str) -> Any:
+    """Describe an option that lists some of these names."""
+    return arg(metavar="NAME ...", help=choices)
 
 
 @dataclass(frozen=True)
@@ -69,25 +76,14 @@ class TracingChart:
         float, arg(metavar="S", help="Time for references and measuring; what does not fit is skipped and counted.")
     ] = 120.0
     rays: Annotated[tuple[int, ...], arg(metavar="N ...", help="Rays per point.")] = (4, 16, 64, 256, 1024)
-    acceptances: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="product, bernoulli.")] = (
-        "product",
-        "bernoulli",
+    acceptances: Annotated[Names, _names("product, bernoulli.")] = ("product", "bernoulli")
+    samplers: Annotated[Names, _names("owen, stratified, iid.")] = ("owen", "stratified", "iid")
+    densities: Annotated[Names, _names("Of irradiance: product, environment, cosine, mis.")] = (
+        *("product", "environment", "cosine", "mis"),
     )
-    samplers: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="owen, stratified, iid.")] = (
-        "owen",
-        "stratified",
-        "iid",
-    )
-    densities: Annotated[
-        tuple[str, ...], arg(metavar="NAME ...", help="Of irradiance: product, environment, cosine, mis.")
-    ] = ("product", "environment", "cosine", "mis")
-    ratios: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="Of irradiance: ratio, plain.")] = (
-        "ratio",
-        "plain",
-    )
+    ratios: Annotated[Names, _names("Of irradiance: ratio, plain.")] = ("ratio", "plain")
     offsets: Annotated[
-        tuple[str, ...],
-        arg(metavar="OFFSET ...", help="Lifts of ray origins: auto, metres (0.02), or local thicknesses (2t)."),
+        Names, arg(metavar="OFFSET ...", help="Lifts of ray origins: auto, metres (0.02), or local thicknesses (2t).")
     ] = ("auto", "2t", "8t", "0.02")
     crossing: Annotated[
         Literal["star", "full"], arg(help="Vary one or two factors around the defaults, or cross all.")
@@ -137,43 +133,22 @@ class MaterialsChart:
         float, arg(metavar="S", help="Time for measuring; what does not fit is skipped and counted.")
     ] = 120.0
     rays: Annotated[tuple[int, ...], arg(metavar="N ...", help="Rays a Gaussian.")] = (8, 16, 32, 64, 128, 256)
-    paths: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="direct, images (the paper's).")] = (
-        "direct",
-        "images",
+    paths: Annotated[Names, _names("direct, images (the paper's).")] = ("direct", "images")
+    samplers: Annotated[Names, _names("owen, stratified, iid.")] = ("owen", "stratified", "iid")
+    offsets: Annotated[Names, arg(metavar="OFFSET ...", help="Lifts of ray origins: auto or metres.")] = (
+        *("auto", "0.02", "0", "0.1"),
     )
-    samplers: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="owen, stratified, iid.")] = (
-        "owen",
-        "stratified",
-        "iid",
+    densities: Annotated[Names, _names("product, mis, environment, cosine.")] = (
+        *("product", "mis", "environment", "cosine"),
     )
-    offsets: Annotated[tuple[str, ...], arg(metavar="OFFSET ...", help="Lifts of ray origins: auto or metres.")] = (
-        "auto",
-        "0.02",
-        "0",
-        "0.1",
+    ratios: Annotated[Names, _names("ratio, plain.")] = ("ratio", "plain")
+    bounces: Annotated[Names, _names("one, none.")] = ("one", "none")
+    weights: Annotated[Names, _names("albedo_scaling, fresnel_hv.")] = ("albedo_scaling", "fresnel_hv")
+    fits: Annotated[Names, _names("robust, plain.")] = ("robust", "plain")
+    observed: Annotated[Names, _names("difference, images."), SECOND_PAGE] = ("difference", "images")
+    denoisers: Annotated[Names, _names("Of the path by images: auto, oidn, bilateral, none."), SECOND_PAGE] = (
+        *("auto", "none"),
     )
-    densities: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="product, mis, environment, cosine.")] = (
-        "product",
-        "mis",
-        "environment",
-        "cosine",
-    )
-    ratios: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="ratio, plain.")] = ("ratio", "plain")
-    bounces: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="one, none.")] = ("one", "none")
-    weights: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="albedo_scaling, fresnel_hv.")] = (
-        "albedo_scaling",
-        "fresnel_hv",
-    )
-    fits: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="robust, plain.")] = ("robust", "plain")
-    observed: Annotated[tuple[str, ...], arg(metavar="NAME ...", help="difference, images."), SECOND_PAGE] = (
-        "difference",
-        "images",
-    )
-    denoisers: Annotated[
-        tuple[str, ...],
-        arg(metavar="NAME ...", help="Of the path by images: auto, oidn, bilateral, none."),
-        SECOND_PAGE,
-    ] = ("auto", "none")
     reference_rays: Annotated[
         int, arg(metavar="N", help="Rays of the reference, where there is no truth."), SECOND_PAGE
     ] = 4096
@@ -210,7 +185,7 @@ def chart(command: Chart) -> int:
     skipped: list[Settings] = []
     if args.from_csv is not None:
         table = read_table(args.from_csv)
-        _make_folder(args.out)
+        make_folder(args.out)
     else:
         with progress(args.quiet or args.json) as report:
             measure = _measure if isinstance(args, TracingChart) else _measure_materials
@@ -233,19 +208,7 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
     from beam_warp.study.tracing import tracing_study
     from beam_warp.study.tracing_plan import TracingPlan
 
-    plan = TracingPlan(
-        acceptances=args.acceptances,
-        samplers=args.samplers,
-        offsets=args.offsets,
-        densities=args.densities,
-        ratios=args.ratios,
-        rays=args.rays,
-        crossing=args.crossing,
-        points=args.points,
-        reference_rays=args.reference_rays,
-        repeats=args.repeats,
-        seed=args.seed,
-    )
+    plan = TracingPlan(**_options_of(args, TracingPlan))
     if args.environment is None:
         from beam_warp.demo.lights import sunset
 
@@ -256,10 +219,10 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
         cloud, name = still_life(), "the built-in still life"
     else:
         sequence = converters.read(args.scene, source_axes=args.source_axes)
-        _require_frame(args.frame, len(sequence))
+        require_count("frame", args.frame, 0, len(sequence) - 1)
         cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
     resolve_device(args.device)  # an unknown device is refused before a folder is made
-    _make_folder(args.out)
+    make_folder(args.out)
     started = time.perf_counter()
     study = tracing_study(
         cloud,
@@ -274,6 +237,11 @@ def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[
     )
     left = max(args.budget_seconds - (time.perf_counter() - started), LEAST_PART * args.budget_seconds)
     return _run(study, args.out, left, report)
+
+
+def _options_of(args: TracingChart | MaterialsChart, plan: type) -> dict[str, Any]:
+    """Return the options that a plan has by the same names."""
+    return {option.name: getattr(args, option.name) for option in fields(plan)}
 
 
 def _run(study: Study, out: Path, seconds: float, report: ProgressCallback) -> tuple[Table, list[Settings]]:
@@ -293,25 +261,11 @@ def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[
     from beam_warp.study.materials import materials_study
     from beam_warp.study.materials_plan import MaterialsPlan
 
-    plan = MaterialsPlan(
-        paths=args.paths,
-        samplers=args.samplers,
-        offsets=args.offsets,
-        densities=args.densities,
-        ratios=args.ratios,
-        bounces=args.bounces,
-        weights=args.weights,
-        fits=args.fits,
-        observed=args.observed,
-        denoisers=args.denoisers,
-        rays=args.rays,
-        reference_rays=args.reference_rays,
-        repeats=args.repeats,
-    )
+    plan = MaterialsPlan(**_options_of(args, MaterialsPlan))
     resolve_device(args.device)  # an unknown device is refused before a folder is made
     with tempfile.TemporaryDirectory() as folder:
         subject = _materials_subject(args, Path(folder), report)
-        _make_folder(args.out)
+        make_folder(args.out)
         study = materials_study(subject, plan, device=args.device)
         return _run(study, args.out, args.budget_seconds, report)
 
@@ -350,7 +304,7 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
             )
         return MaterialsSubject.on_true_surface(capture, environment, args.frame, name, args.device)
     sequence = converters.read(args.asset)
-    _require_frame(args.frame, len(sequence))
+    require_count("frame", args.frame, 0, len(sequence) - 1)
     images = CaptureImages(capture, sequence)
     views = images.views(args.frame)
     return MaterialsSubject(
@@ -363,18 +317,6 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallb
         args.asset.parent.name or args.asset.name,
         images.ceiling(args.frame, views),
     )
-
-
-def _require_frame(frame: int, count: int) -> None:
-    if not (0 <= frame < count):
-        raise InvalidOptionError(f"frame must be in [0, {count - 1}], got {frame}. Choose a frame that exists.")
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"out must be a folder, got {folder} ({error.strerror}). Choose another.") from error
 
 
 def _summary(table: Table, skipped: list[Settings], files: list[Path]) -> dict[str, Any]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, Protocol
+from contextlib import contextmanager
+from typing import Any, Protocol
 
 from beam_warp.errors import BeamError
-
-if TYPE_CHECKING:
-    from beam_warp.device.compilation import CompilationListener
 
 
 def run_command(command: Callable[[], int]) -> int:
@@ -73,27 +70,15 @@ def progress(quiet: bool, *, compiles: bool = True) -> Iterator[ProgressCallback
     if quiet or not sys.stderr.isatty():
         yield lambda stage, done, total, note="": None
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        *("{task.description}", rich.BarColumn(), rich.MofNCompleteColumn(), "{task.fields[rate]}"),
+        *(rich.TimeElapsedColumn(), rich.TimeRemainingColumn(), "{task.fields[note]}"),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
+    with rich.Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD) as bars:
         tasks: dict[str, Any] = {}
 
         def update(stage: str, done: int, total: int | None, note: str = "") -> None:
@@ -108,12 +93,10 @@ def progress(quiet: bool, *, compiles: bool = True) -> Iterator[ProgressCallback
             update(COMPILING, module_count, None, f"{module_count} module{'s'[: module_count > 1]}, {seconds:.0f} s")
             bars.update(tasks[COMPILING], visible=is_running)
 
-        with _kernels_heard(compiling) if compiles else nullcontext():
+        if not compiles:
             yield update
+            return
+        from beam_warp.device.compilation import compilation_heard
 
-
-def _kernels_heard(listener: CompilationListener) -> AbstractContextManager[None]:
-    """Tell a listener of kernels that are compiled."""
-    from beam_warp.device.compilation import compilation_heard
-
-    return compilation_heard(listener)
+        with compilation_heard(compiling):
+            yield update

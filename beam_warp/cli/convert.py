@@ -10,33 +10,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
 from beam_warp.cli.console import print_json, print_notes, progress, run_command
 from beam_warp.cli.flags import Json, Quiet, notes_of
+from beam_warp.cli.pages import parse
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
 
-_CONVERT_HELP = """Convert Gaussians between PLY and USD, axes, units and profiles.
-
-Example: beam-convert person.compressed.ply person.ply --target unity --sh-degree 3
-
-A folder of numbered PLY files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
-`beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the version.
-"""
-
-_INSPECT_HELP = """Say what a file or a folder of numbered PLY files holds, who wrote it and what it leaves open.
-
-Example: beam-convert inspect person.compressed.ply --json
-"""
-
 
 @dataclass(frozen=True)
 class ConvertCommand:
-    """What `beam-convert` was asked for."""
+    """Convert Gaussians between PLY and USD, axes, units and profiles.
+
+    Example: beam-convert person.compressed.ply person.ply --target unity --sh-degree 3
+
+    A folder of numbered PLY files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
+    `beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the version.
+    """
 
     input: Annotated[Positional[Path], arg(metavar="IN", help="PLY or USD file, or a folder of numbered PLY files.")]
     output: Annotated[Positional[Path], arg(metavar="OUT", help="File to write: .ply, .usd, .usda, .usdc or .usdz.")]
@@ -65,7 +58,10 @@ class ConvertCommand:
 
 @dataclass(frozen=True)
 class InspectCommand:
-    """What `beam-convert inspect` was asked for."""
+    """Say what a file or a folder of numbered PLY files holds, who wrote it and what it leaves open.
+
+    Example: beam-convert inspect person.compressed.ply --json
+    """
 
     input: Annotated[Positional[Path], arg(metavar="FILE", help="PLY or USD file, or a folder of numbered PLY files.")]
     json: Json = False
@@ -152,15 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"beam-convert {__version__}")
         return 0
     if words[:1] == ["inspect"]:
-        asked = tyro.cli(
-            InspectCommand,
-            prog="beam-convert inspect",
-            description=_INSPECT_HELP,
-            args=words[1:],
-            config=(FlagCreatePairsOff,),
-        )
+        asked = parse(InspectCommand, words[1:], "beam-convert inspect")
         return run_command(lambda: inspect(asked))
-    command = tyro.cli(
-        ConvertCommand, prog="beam-convert", description=_CONVERT_HELP, args=words, config=(FlagCreatePairsOff,)
-    )
+    command = parse(ConvertCommand, words, "beam-convert")
     return run_command(lambda: convert(command))

@@ -11,16 +11,13 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.checks import require_number
 from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in
+from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in, notes_of, raster_options
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.asset import Evaluation
-    from beam_warp.evaluate.scores import ImageScore, MaterialScores
+    from beam_warp.evaluate.scores import MaterialScores
     from beam_warp.evaluate.steadiness import Deviation
-    from beam_warp.raster.records import RasterOptions
-    from beam_warp.world.gaussians import GaussianSequence
 
 TITLES = {
     "ambient_occlusion": "ambient occlusion",
@@ -87,7 +84,7 @@ def evaluate(args: Evaluate) -> int:
     options = EvaluateOptions(
         frames=args.capture_frames or None,
         split=args.split,
-        raster=_raster(args, sequence),
+        raster=raster_options(sequence.metadata, "yes" if args.antialiased else None, args.low_pass),
         samples=args.samples,
         relighters=() if args.relight == ("none",) else args.relight,
         scaled_relighting=args.scaled_relighting,
@@ -95,7 +92,7 @@ def evaluate(args: Evaluate) -> int:
     )
     with progress(args.quiet or args.json) as report:
         found = evaluate_asset(sequence, capture, options, out=args.out, renders=args.renders, progress=report)
-    notes = [*sequence.metadata.get("notes", "").splitlines(), *found.scores.notes]
+    notes = [*notes_of(sequence), *found.scores.notes]
     if args.json:
         print_json({**found.report, "asset": str(args.asset), "asset_notes": notes})
     elif not args.quiet:
@@ -104,25 +101,14 @@ def evaluate(args: Evaluate) -> int:
     return 0
 
 
-def _raster(args: Evaluate, sequence: GaussianSequence) -> RasterOptions:
-    """Return how splats are drawn: as the asset states, unless it is overruled."""
-    from dataclasses import replace
-
-    from beam_warp.raster.records import RasterOptions
-
-    options = RasterOptions.from_metadata(sequence.metadata)
-    if args.low_pass is not None:
-        options = replace(options, low_pass=require_number("low-pass", args.low_pass, 1e-6, 1e6))
-    return replace(options, antialiased=True) if args.antialiased else options
-
-
 def _say(args: Evaluate, found: Evaluation) -> None:
     """Print a table for people."""
     from rich.console import Console
     from rich.table import Table
 
     scores = found.scores
-    rows = [(TITLES.get(name, name), score) for name, score in _ordered(scores)]
+    means = scores.mean_channels()
+    rows = [(title, means[name]) for name, title in TITLES.items() if name in means]
     for scaled, suffix in ((False, ""), (True, ", scaled")):
         for relighter, by_light in scores.mean_relit(scaled=scaled).items():
             rows += [(f"{light}, {relighter}{suffix}", score) for light, score in by_light.items()]
@@ -141,12 +127,6 @@ def _say(args: Evaluate, found: Evaluation) -> None:
         print(f"wrote {args.out / 'evaluation.json'} and {args.out / 'evaluation.png'}")
     if args.renders is not None:
         print(f"images: {args.renders}")
-
-
-def _ordered(scores: MaterialScores) -> list[tuple[str, ImageScore]]:
-    """Return the means over views in the order of `TITLES`."""
-    means = scores.mean_channels()
-    return [(name, means[name]) for name in TITLES if name in means]
 
 
 def _lines(scores: MaterialScores) -> list[str]:

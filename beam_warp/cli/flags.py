@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
+
+from beam_warp import converters
+from beam_warp.checks import require_number
+from beam_warp.errors import OutputError
+from beam_warp.world.metadata import LOW_PASS_RANGE
 
 if TYPE_CHECKING:
     from beam_warp.raster.records import RasterOptions
@@ -32,10 +37,40 @@ Quiet = Annotated[bool, arg(help="Print nothing but errors.")]
 Json = Annotated[bool, arg(help="Print the result as JSON.")]
 
 
+@dataclass(frozen=True)
+class ReadingFlags:
+    """How an asset is read, and how its splats are drawn."""
+
+    antialiased: Antialiased = None
+    low_pass: LowPass = None
+    source_axes: SourceAxes = None
+    drop_invalid: DropInvalid = False
+
+    def read(self, path: Path) -> GaussianSequence:
+        """Read an asset."""
+        return converters.read(path, source_axes=self.source_axes, drop_invalid=self.drop_invalid)
+
+    def raster(self, sequence: GaussianSequence) -> RasterOptions:
+        """Return how a sequence is drawn; see `raster_options`."""
+        return raster_options(sequence.metadata, self.antialiased, self.low_pass)
+
+
 def asset_in(path: Path) -> Path:
     """Return the asset in a folder that `beam run` wrote; any other path as it is."""
     inner = path / ASSET_NAME
     return inner if inner.is_file() else path
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results, and those above it.
+
+    Raises:
+        OutputError: It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"out must be a folder, got {folder} ({error.strerror}). Choose another.") from error
 
 
 def notes_of(sequence: GaussianSequence) -> list[str]:
@@ -56,5 +91,7 @@ def raster_options(metadata: Mapping[str, str], antialiased: str | None, low_pas
     """
     from beam_warp.raster.records import RasterOptions
 
+    if low_pass is not None:
+        require_number("low-pass", low_pass, *LOW_PASS_RANGE)
     given = stated(antialiased=None if antialiased is None else antialiased == "yes", low_pass=low_pass)
     return replace(RasterOptions.from_metadata(metadata), **given)

@@ -14,7 +14,7 @@ from beam_warp.capture.page import write_page
 from beam_warp.capture.picture import headline, verdict, write_picture
 from beam_warp.checks import require_package
 from beam_warp.cli.console import print_json, progress
-from beam_warp.errors import OutputError
+from beam_warp.cli.flags import make_folder
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,7 @@ def inspect(args: Inspect) -> int:
         report = inspect_capture(Capture.read(args.capture), max_images=args.max_images, progress=advance)
     files = []
     if args.out is not None:
-        try:
-            args.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"out must be a folder, got {args.out} ({error.strerror}). Choose another.") from error
+        make_folder(args.out)
         files = [args.out / "capture.png", args.out / "capture.html"]
         write_picture(report, files[0])
         write_page(report, files[1])

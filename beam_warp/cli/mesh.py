@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import (
-    Antialiased,
-    Device,
-    DropInvalid,
-    Json,
-    LowPass,
-    Quiet,
-    SourceAxes,
-    notes_of,
-    raster_options,
-)
-from beam_warp.digests import code_digest
+from beam_warp.cli.flags import Device, Json, Quiet, ReadingFlags, notes_of
+from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.files import replacing, write_png
 from beam_warp.jobs.store import make_folders
@@ -88,10 +77,7 @@ class Mesh:
         bool, arg(help="Also write canonical.glb and .obj: the first of the frames with texture coordinates.")
     ] = False
     preview: Annotated[bool, arg(help="Also draw every mesh, as .png.")] = False
-    antialiased: Antialiased = None
-    low_pass: LowPass = None
-    source_axes: SourceAxes = None
-    drop_invalid: DropInvalid = False
+    reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     device: Device = None
     quiet: Quiet = False
     json: Json = False
@@ -105,9 +91,9 @@ def mesh(args: Mesh) -> int:
 
         require_unwrapping()
     capture = None if args.capture is None else Capture.read(args.capture)
-    sequence = converters.read(args.sequence, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+    sequence = args.reading.read(args.sequence)
     frames = _frames(args, len(sequence))
-    options = raster_options(sequence.metadata, args.antialiased, args.low_pass)
+    options = args.reading.raster(sequence)
     notes = notes_of(sequence)
     numbers = numbers_of_frames(sequence.metadata, len(sequence))
     cameras_of = {} if capture is None else {n: _capture_cameras(args, capture, numbers[n]) for n in frames}
@@ -226,16 +212,10 @@ def _write_canonical(args: Mesh, images: DepthImages, surface: trimesh.Trimesh) 
 
 def _key(args: Mesh, options: RasterOptions, cloud: GaussianCloud, cameras: Sequence[Camera], canonical: bool) -> str:
     """Return what a frame's files are made of, as a digest."""
-    digest = hashlib.sha256()
     asked = (args.format, args.voxel, args.depth, args.color, args.confirmations, options, canonical)
-    digest.update(repr((code_digest(), asked)).encode())
-    for name, array in cloud.arrays().items():
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    for camera in cameras:
-        lens = (camera.width, camera.height, camera.focal_x, camera.focal_y, camera.center_x, camera.center_y)
-        digest.update(repr(lens).encode() + camera.camera_to_world.tobytes())
-    return digest.hexdigest()
+    lenses = [(c.width, c.height, c.focal_x, c.focal_y, c.center_x, c.center_y) for c in cameras]
+    arrays, poses = cloud.arrays(), [camera.camera_to_world for camera in cameras]
+    return array_digest(*arrays.values(), *poses, text=repr((code_digest(), asked, lenses, list(arrays))))
 
 
 def _read_report(path: Path) -> dict[str, Any]:

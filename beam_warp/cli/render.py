@@ -12,7 +12,7 @@ from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.flags import raster_options, stated
 from beam_warp.cli.render_checks import require_consistent
 from beam_warp.cli.render_flags import Render
-from beam_warp.cli.render_stage import Staged, staged
+from beam_warp.cli.render_stage import staged
 from beam_warp.cli.render_views import capture_views, image_size
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
@@ -62,15 +62,15 @@ def render(args: Render) -> int:
     require_consistent(args)
     started = time.perf_counter()
     capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
-    given = staged(args, capture)
+    stage, frame_count = staged(args, capture)
     device = str(resolve_device(args.device))
-    renderer = _renderer(args, given.stage)
+    renderer = _renderer(args, stage)
     picture, notes = _picture(args)
     with progress(args.quiet or args.json) as report:
-        plan = _plan(args, given) if capture is None else _plan_of_capture(args, given.stage, capture)
-        job = RenderJob(given.stage, renderer, PictureWriter(picture), report)
+        plan = _plan(args, stage, frame_count) if capture is None else _plan_of_capture(args, stage, capture)
+        job = RenderJob(stage, renderer, PictureWriter(picture), report)
         tally = _carry_out(plan, job, overwrite=args.output.overwrite)
-    said = list(dict.fromkeys((*given.stage.notes, *notes, *plan.notes)))
+    said = list(dict.fromkeys((*stage.notes, *notes, *plan.notes)))
     _say(args, plan, tally, said, device, time.perf_counter() - started)
     return 0
 
@@ -130,9 +130,9 @@ def _plan_of_capture(args: Render, stage: Stage, capture: Capture) -> RenderPlan
     return RenderPlan(requests, frames, [view.path for view in views], notes=tuple(notes))
 
 
-def _plan(args: Render, given: Staged) -> RenderPlan:
+def _plan(args: Render, stage: Stage, frame_count: int) -> RenderPlan:
     """Plan one image, numbered ones, or a film."""
-    times = _times(args, given)
+    times = _times(args, stage, frame_count)
     width, height = image_size(args.camera)
     frames = list(times.numbers)
     requests = [
@@ -154,13 +154,15 @@ def _plan(args: Render, given: Staged) -> RenderPlan:
     return RenderPlan(requests, frames, outputs, pattern, notes=tuple(notes))
 
 
-def _times(args: Render, given: Staged) -> FrameTimes:
+def _times(args: Render, stage: Stage, frame_count: int) -> FrameTimes:
     """Return which moments are rendered."""
-    count, rate, asked = given.frame_count, given.stage.rate, args.time
+    asked = args.time
     if asked.frame is not None:
-        number = require_count("frame", asked.frame, 0, count - 1)
-        return FrameTimes((number,), (given.stage.time_of(number),), rate)
-    return frame_times(count, rate, frames=asked.frames, seconds=asked.seconds, fps=asked.fps, speed=asked.speed)
+        number = require_count("frame", asked.frame, 0, frame_count - 1)
+        return FrameTimes((number,), (stage.time_of(number),), stage.rate)
+    return frame_times(
+        frame_count, stage.rate, frames=asked.frames, seconds=asked.seconds, fps=asked.fps, speed=asked.speed
+    )
 
 
 def _carry_out(plan: RenderPlan, job: RenderJob, *, overwrite: bool) -> RenderTally:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.render_flags import LightFlags, Render
@@ -47,21 +44,11 @@ class PacedPath:
         return self.path.camera_at(time / self.speed, width, height)
 
 
-@dataclass(frozen=True, eq=False)
-class Staged:
-    """A stage to render, and which frames it has.
-
-    Attributes:
-        stage: Assets, lights and camera over time.
-        frame_count: Frames of the stage without ``--seconds``.
-    """
-
-    stage: Stage
-    frame_count: int
-
-
-def staged(args: Render, capture: Capture | None) -> Staged:
+def staged(args: Render, capture: Capture | None) -> tuple[Stage, int]:
     """Read what is rendered; rates of the command line are by the film's seconds, whatever ``--speed`` says.
+
+    Returns:
+        The stage, and how many frames it has without ``--seconds``.
 
     Raises:
         BeamError: Something cannot be read or is no asset that can be lit, or there is no light.
@@ -103,7 +90,7 @@ def staged(args: Render, capture: Capture | None) -> Staged:
     frame_count = whole.frame_count
     if time.seconds is not None:
         whole = replace(whole, camera=camera, duration=time.seconds * pace)
-    return Staged(whole, frame_count)
+    return whole, frame_count
 
 
 def _environment(light: LightFlags, capture: Capture | None, stage: Stage, pace: float) -> StageEnvironment | None:
@@ -128,8 +115,12 @@ def _camera(args: Render, stage: Stage, pace: float) -> CameraPath | None:
         return path if pace == 1.0 else PacedPath(path, pace)
     azimuth, elevation = flags.orbit or (0.0, 0.0)
     if flags.turntable is not None or flags.turns is not None:
+        if not len(stage.subject):
+            raise InvalidOptionError(
+                "asset must hold Gaussians to go around, got none. Place the camera with --look-at."
+            )
         return OrbitPath(
-            subject=_subject(stage),
+            subject=stage.subject,
             azimuth=azimuth,
             elevation=elevation,
             degrees_per_second=(flags.turntable or 0.0) / pace,
@@ -145,10 +136,3 @@ def _camera(args: Render, stage: Stage, pace: float) -> CameraPath | None:
     else:
         frames = range(number, require_count("frame", number, 0, stage.frame_count - 1) + 1)
     return FixedCamera(still_camera(flags, frames, lambda frame: stage.cloud_at(stage.time_of(frame))))
-
-
-def _subject(stage: Stage) -> NDArray[np.float64]:
-    """Return what a camera goes around."""
-    if not len(stage.subject):
-        raise InvalidOptionError("asset must hold Gaussians to go around, got none. Place the camera with --look-at.")
-    return stage.subject

@@ -14,7 +14,7 @@ from beam_warp.cli.render_flags import StillCameraFlags
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.store import make_folders
 from beam_warp.world.camera import MAX_SIDE, Camera
-from beam_warp.world.framing import bulk
+from beam_warp.world.framing import bulk_of
 from beam_warp.world.gaussians import GaussianCloud
 
 DEFAULT_SIDE = 1024
@@ -101,8 +101,7 @@ def still_camera(flags: StillCameraFlags, frames: Sequence[int], cloud_of: Calla
         return Camera.look_at(flags.look_at[:3], flags.look_at[3:], **lens)
     azimuth, elevation = flags.orbit or (0.0, 0.0)
     picked = sorted({frames[round(i)] for i in np.linspace(0, len(frames) - 1, FRAMING_FRAMES)})
-    clouds = (cloud_of(frame) for frame in picked)
-    seen = [bulk(cloud.positions, cloud.opacities) for cloud in clouds if len(cloud)]
-    if not seen:
+    seen = bulk_of(cloud_of(frame) for frame in picked)
+    if not len(seen):
         raise InvalidOptionError("asset must hold Gaussians to be framed, got none. Place the camera with --look-at.")
-    return Camera.frame_points(np.concatenate(seen), azimuth=azimuth, elevation=elevation, **lens)
+    return Camera.frame_points(seen, azimuth=azimuth, elevation=elevation, **lens)

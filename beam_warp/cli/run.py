@@ -19,7 +19,6 @@ from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianSequence
 
 if TYPE_CHECKING:
     from beam_warp.reconstruction.job import Reconstruction
@@ -75,7 +74,10 @@ def run(args: Run) -> int:
     view = overview_options(args.measuring)
     with progress(args.quiet or args.json) as report:
         found = None if capture is None else _reconstruct(args, capture, report)
-        sequence = _read(args) if found is None else found.sequence
+        if found is None:
+            sequence = converters.read(args.input, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+        else:
+            sequence = found.sequence
         if args.fps is not None:
             sequence = replace(sequence, frames_per_second=args.fps)
         result = run_pipeline(sequence, environment, args.out, options, capture=capture, overview=view, progress=report)
@@ -115,10 +117,6 @@ def _check_words(args: Run, capture: Capture | None) -> None:
             "source-axes, drop-invalid and persistent must be left out for a capture, whose Gaussians are made here, "
             f"got {args.input}. Drop them."
         )
-
-
-def _read(args: Run) -> GaussianSequence:
-    return converters.read(args.input, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
 
 
 def _reconstruct(args: Run, capture: Capture, report: ProgressCallback) -> Reconstruction:

@@ -55,19 +55,16 @@ def stability(args: Stability) -> int:
     others = [read_result(path) for path in args.beside]
     result = StabilityResult()
     with progress(args.quiet or args.json) as report:
-        if args.only in (None, "tracing"):
-            result = result.joined(_trace(args, report))
-        if args.only in (None, "reconstruction"):
-            result = result.joined(_reconstruct(args, report))
-        if args.only in (None, "materials"):
-            result = result.joined(_decompose(args, report))
-        if args.only in (None, "relighting"):
-            result = result.joined(_relight(args, report))
+        parts = {"tracing": _trace, "reconstruction": _reconstruct, "materials": _decompose, "relighting": _relight}
+        for part, run in parts.items():
+            if args.only in (None, part):
+                result = result.joined(run(args, report))
     if args.out is not None:
-        joined = result
-        for other in others:
-            joined = joined.joined(other)
-        write_page(args.out, joined, "beam stability --large" if args.large else "beam stability")
+        write_page(
+            args.out,
+            reduce(StabilityResult.joined, others, result),
+            "beam stability --large" if args.large else "beam stability",
+        )
     if args.json:
         print_json(result.as_dict())
     elif not args.quiet:

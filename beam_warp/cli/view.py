@@ -6,27 +6,16 @@ import os
 import sys
 import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp import converters
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import (
-    Antialiased,
-    Device,
-    DropInvalid,
-    LowPass,
-    Quiet,
-    SourceAxes,
-    asset_in,
-    notes_of,
-    raster_options,
-)
+from beam_warp.cli.flags import Device, Quiet, ReadingFlags, asset_in, notes_of
 from beam_warp.demo.lights import stage, studio, sunset
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
@@ -65,10 +54,7 @@ class ViewCommand:
     no_open: Annotated[bool, arg(help="Open no browser.")] = False
     rate: Annotated[float, arg(metavar="FPS", help="Frames per second to hold while something moves.")] = 10.0
     longest: Annotated[int, arg(metavar="PX", help="No side of a picture is longer.")] = 2048
-    antialiased: Antialiased = None
-    low_pass: LowPass = None
-    source_axes: SourceAxes = None
-    drop_invalid: DropInvalid = False
+    reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     device: Device = None
     quiet: Quiet = False
     json: Annotated[bool, arg(help="Print the address as JSON once the page is there.")] = False
@@ -81,7 +67,7 @@ def view(args: ViewCommand) -> int:
     require_number("rate", args.rate, 0.1, 240.0)
     require_count("longest", args.longest, 64, 8192)
     lights = environments(args.environment)
-    sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+    sequence = args.reading.read(asset_in(args.asset))
 
     from beam_warp.view.viewer import Viewer, ViewOptions
 
@@ -91,7 +77,7 @@ def view(args: ViewCommand) -> int:
         rate=args.rate,
         longest=args.longest,
         device=args.device,
-        raster=raster_options(sequence.metadata, args.antialiased, args.low_pass),
+        raster=args.reading.raster(sequence),
     )
     viewer = Viewer(sequence, lights, title=args.asset.name or str(args.asset), options=options)
     try:

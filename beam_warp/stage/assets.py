@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from beam_warp.schema.placement import Placement
 from beam_warp.stage.camera_paths import outline
 from beam_warp.stage.time_sampling import Blend, Moment, TimeSampler
 from beam_warp.world.axes import axes_matrix, change_axes
-from beam_warp.world.framing import bulk
+from beam_warp.world.framing import bulk_of
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 
 BOUNDING_FRAMES = 3
@@ -115,13 +115,7 @@ class StageAsset:
             InvalidOptionError: A frame is not relightable.
             BeamError: A frame cannot be read.
         """
-        moment = self.moment(time)
-        held: tuple[Moment, GaussianCloud] | None = self.__dict__.get("_held")
-        if held is not None and held[0] == moment:
-            return held[1]
-        cloud = self._sampler.at_moment(moment)
-        self.__dict__["_held"] = (moment, cloud)
-        return cloud
+        return self._held_cloud(self.moment(time))
 
     def files_of(self, frame: int) -> tuple[Path, ...]:
         """Return the files that a frame is read from; none if it is in memory."""
@@ -130,23 +124,22 @@ class StageAsset:
     @cached_property
     def subject(self) -> NDArray[np.float64]:
         """Points that bound the asset's bulk in the world [m], ``(N, 3)``; none if the frames looked at are empty."""
-        return outline(_bulk_of([self._sampler.at(frame) for frame in self._bounding_frames]))
+        return outline(bulk_of([self._sampler.at(frame) for frame in self._bounding_frames]))
 
     @cached_property
     def placement(self) -> Placement:
         """Placement of the asset in the world."""
-        angles = (0.0, 0.0, self.rotate) if isinstance(self.rotate, float) else self.rotate
-        rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-        shift = np.asarray(self.translate, np.float64)
+        placement = placement_of(self.translate, self.rotate, self.scale)
+        shift = placement.translation
         if self.on_ground or self.centered:
-            turned = Placement(self.scale, rotation, np.zeros(3))
-            points = _bulk_of([placed(self._bare(frame), turned) for frame in self._bounding_frames])
+            turned = replace(placement, translation=np.zeros(3))
+            points = bulk_of([placed(self._bare(frame), turned) for frame in self._bounding_frames])
             if len(points):
                 low, high = points.min(axis=0), points.max(axis=0)
                 middle = -0.5 * (low + high)
                 aside = middle[:2] if self.centered else np.zeros(2)
                 shift = shift + np.array([*aside, -low[2] if self.on_ground else 0.0])
-        return Placement(self.scale, rotation, shift)
+        return replace(placement, translation=shift)
 
     @property
     def _bounding_frames(self) -> list[int]:
@@ -158,6 +151,11 @@ class StageAsset:
         placing = replace(self.sequence, read_frame=lambda frame: placed(self._bare(frame), self.placement))
         return TimeSampler(placing, ends="loop" if self.loop else "hold", blend=self.blend)
 
+    @cached_property
+    def _held_cloud(self) -> Callable[[Moment], GaussianCloud]:
+        """Reader of moments that keeps the latest one."""
+        return lru_cache(1)(self._sampler.at_moment)
+
     def _bare(self, frame: int) -> GaussianCloud:
         """Read a frame and drop its captured radiance, which light does not look at."""
         cloud = self.sequence[frame]
@@ -168,6 +166,19 @@ class StageAsset:
                 "Estimate its materials with beam run."
             )
         return cloud if cloud.radiance is None else cloud.with_arrays(radiance=None, radiance_color_space=None)
+
+
+def placement_of(translate: object = (0.0, 0.0, 0.0), rotate: object = 0.0, scale: float = 1.0) -> Placement:
+    """Return the placement that a `StageAsset` with these attributes has, after checking them.
+
+    Raises:
+        InvalidArrayError: The translation or rotation is not 3 finite numbers.
+        InvalidOptionError: A number is out of range.
+    """
+    angles = require_rotation("rotate", rotate)
+    turn = Rotation.from_euler("xyz", (0.0, 0.0, angles) if isinstance(angles, float) else angles, degrees=True)
+    shift = np.array(require_vector("translate", translate))
+    return Placement(require_number("scale", scale, 1e-6, 1e6), turn.as_matrix(), shift)
 
 
 def placed(cloud: GaussianCloud, placement: Placement) -> GaussianCloud:
@@ -226,9 +237,3 @@ def require_rotation(name: str, value: object) -> float | Vector:
         raise InvalidArrayError(
             f"{name} must be an angle about z, or three angles about x, y and z, got {value!r}. Write 90 or [0, 0, 90]."
         ) from error
-
-
-def _bulk_of(clouds: Sequence[GaussianCloud]) -> NDArray[np.float64]:
-    """Return the bulk of all clouds that are not empty."""
-    seen = [bulk(cloud.positions, cloud.opacities) for cloud in clouds if len(cloud)]
-    return np.concatenate(seen) if seen else np.zeros((0, 3))

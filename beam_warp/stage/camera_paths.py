@@ -41,6 +41,9 @@ AIM_STEPS = 32
 LEVEL_SINE = 0.05
 """Below this sine between the gaze and the vertical, a camera that is kept level would spin."""
 
+POSE_FIELDS = ("position", "target", "camera_to_world", "fov")
+"""Fields of a camera that stands somewhere: a position and a target, or a pose; and its angle of view."""
+
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Interpolation = Literal["smooth", "linear"]
@@ -100,7 +103,7 @@ class OrbitPath:
         center: Place that the camera looks at [m]; the middle of the subject if None.
         distance: Distance from the centre [m]; if None, the least one at which the subject fits the image. A camera
             that moves takes the least one that fits all the way round.
-        subject: Points to frame [m], ``(N, 3)``; needed without ``center`` or ``distance``. See `around`.
+        subject: Points to frame [m], ``(N, 3)``; needed without ``center`` or ``distance``.
         azimuth: Azimuth at time 0 [degree]; see `Camera.orbit`.
         elevation: Height above the horizon [degree].
         degrees_per_second: Counter-clockwise seen from above; 0 stays.
@@ -151,10 +154,6 @@ class OrbitPath:
     def frames_subject(self) -> bool:
         """Whether the path needs points to frame."""
         return self.center is None or self.distance is None
-
-    def around(self, subject: NDArray[np.float64]) -> OrbitPath:
-        """Return the same path around other points, ``(N, 3)`` [m]."""
-        return replace(self, subject=subject)
 
     def lasting(self, duration: float) -> OrbitPath:
         """Return the same path with its turns spread over a duration [s]."""
@@ -461,8 +460,17 @@ def nerfstudio_path(content: Any, name: str) -> KeyframePath:
 
 def _keyframe(record: Any, where: str) -> Keyframe:
     """Return one key frame of JSON."""
-    fields = Fields(record, where, ("time", "position", "target", "camera_to_world", "fov"))
-    time, fov = fields.number("time"), fields.number("fov") if "fov" in fields else DEFAULT_FOV
+    fields = Fields(record, where, ("time", *POSE_FIELDS))
+    return keyframe_of(fields, fields.number("time"))
+
+
+def keyframe_of(fields: Fields, time: float) -> Keyframe:
+    """Return the key frame that `POSE_FIELDS` of an object state, at a time [s].
+
+    Raises:
+        AssetFormatError: A field is malformed, or the pose is stated twice.
+    """
+    fov = fields.number("fov") if "fov" in fields else DEFAULT_FOV
     with fields.placed():
         if "camera_to_world" not in fields:
             return Keyframe.looking_at(time, fields.numbers("position", 3), fields.numbers("target", 3), fov)

@@ -68,6 +68,18 @@ class Fields:
         self._values: dict[str, Any] = value
         self._known = known
 
+    def given(self, **kinds: str | int) -> dict[str, Any]:
+        """Return the fields that are there.
+
+        Args:
+            kinds: How each field is read: ``number``, ``flag``, ``text``, or as so many numbers.
+        """
+        return {
+            name: self.numbers(name, kind) if isinstance(kind, int) else getattr(self, kind)(name)
+            for name, kind in kinds.items()
+            if name in self
+        }
+
     def __contains__(self, name: str) -> bool:
         """Say whether a field is there; null is none."""
         return self._values.get(name) is not None

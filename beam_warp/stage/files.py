@@ -6,28 +6,25 @@ from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from beam_warp import converters
 from beam_warp.checks import require_number
 from beam_warp.converters.numbering import numbered_files
 from beam_warp.errors import AssetFormatError, SchemaVersionError
-from beam_warp.schema.placement import Placement
-from beam_warp.stage.assets import StageAsset, require_rotation, require_vector
+from beam_warp.stage.assets import StageAsset, placement_of
 from beam_warp.stage.camera_paths import (
-    DEFAULT_FOV,
+    POSE_FIELDS,
     USD_SUFFIXES,
     CameraPath,
     FixedCamera,
+    KeyframePath,
     OrbitPath,
+    keyframe_of,
     keyframe_path,
     read_camera_path,
 )
 from beam_warp.stage.environments import StageEnvironment
 from beam_warp.stage.fields import Fields, placed, read_json, shown
 from beam_warp.stage.meshes import Ground, read_stage_mesh
-from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.lights import Light, lights_from_json, read_lights
 from beam_warp.world.shot import ShotMesh
@@ -58,7 +55,7 @@ GROUND_FIELDS = ("ground", *(field.name for field in fields_of(Ground)))
 
 ENVIRONMENT_FIELDS = ("path", "radiance", "rotate", "degrees_per_second", "exposure")
 
-FIXED_FIELDS = ("type", "position", "target", "camera_to_world", "fov")
+FIXED_FIELDS = ("type", *POSE_FIELDS)
 
 ORBIT_FIELDS = ("type", *(field.name for field in fields_of(OrbitPath) if field.name != "subject"))
 
@@ -66,24 +63,14 @@ FILE_FIELDS = ("type", "path", "prim")
 
 
 def read_stage_file(path: Path) -> dict[str, Any]:
-    """Read a file; see `stage_contents`, and `fields.read_json` for further errors."""
-    return stage_contents(read_json(path, "stage"), path.parent, path.name)
-
-
-def stage_contents(document: Any, folder: Path, name: str = "stage") -> dict[str, Any]:
-    """Return what a JSON object puts on a stage, by the names of `beam_warp.stage.stage.Stage`.
-
-    Args:
-        document: The object.
-        folder: Folder where relative paths start.
-        name: Name of the stage in messages.
+    """Return what a JSON file puts on a stage, by the names of `beam_warp.stage.stage.Stage`.
 
     Raises:
         AssetFormatError: A field is malformed or unknown; says which one and what to do.
         SchemaVersionError: The version is none that is read.
-        MissingFileError: A file is not there.
+        MissingFileError: The file, or one that it names, is not there.
     """
-    where = f"{name}:"
+    document, folder, where = read_json(path, "stage"), path.parent, f"{path.name}:"
     if isinstance(document, dict):
         version = document.get(KEY)
         if isinstance(version, int) and not isinstance(version, bool) and version > VERSION:
@@ -141,31 +128,19 @@ def _asset(record: Any, where: str, folder: Path) -> StageAsset:
     """Return one asset of JSON; a text alone is its path."""
     fields = Fields({"path": record} if isinstance(record, str) else record, where, ASSET_FIELDS)
     path = fields.path("path", folder, folders=True)
-    options: dict[str, Any] = _placing(fields)
-    for name in ("start", "speed"):
-        if name in fields:
-            options[name] = fields.number(name)
-    for name in ("on_ground", "centered", "loop", "drop_invalid"):
-        if name in fields:
-            options[name] = fields.flag(name)
-    for name in ("name", "blend", "source_axes"):
-        if name in fields:
-            options[name] = fields.text(name)
+    options = fields.given(
+        **dict.fromkeys(("start", "speed"), "number"),
+        **dict.fromkeys(("on_ground", "centered", "loop", "drop_invalid"), "flag"),
+        **dict.fromkeys(("name", "blend", "source_axes"), "text"),
+    )
+    place = _placing(fields)
     with fields.placed():
-        return read_stage_asset(path, **options)
+        return read_stage_asset(path, **place, **options)
 
 
 def _placing(fields: Fields) -> dict[str, Any]:
     """Return where something stands, as far as it is said."""
-    given: dict[str, Any] = {}
-    if "translate" in fields:
-        given["translate"] = fields.numbers("translate", 3)
-    if "rotate" in fields:
-        angles = fields.value("rotate")
-        given["rotate"] = fields.numbers("rotate", 3) if isinstance(angles, list) else fields.number("rotate")
-    if "scale" in fields:
-        given["scale"] = fields.number("scale")
-    return given
+    return fields.given(translate=3, rotate=3 if isinstance(fields.value("rotate"), list) else "number", scale="number")
 
 
 def _mesh(record: Any, where: str, folder: Path) -> tuple[ShotMesh | Ground, tuple[str, ...]]:
@@ -174,21 +149,10 @@ def _mesh(record: Any, where: str, folder: Path) -> tuple[ShotMesh | Ground, tup
         return _ground(record, where), ()
     fields = Fields({"path": record} if isinstance(record, str) else record, where, MESH_FIELDS)
     path = fields.path("path", folder)
-    options: dict[str, Any] = {}
-    if "base_color" in fields:
-        options["base_color"] = fields.numbers("base_color", 3)
-    if "roughness" in fields:
-        options["roughness"] = fields.number("roughness")
-    for name in ("catches_shadows", "smooth"):
-        if name in fields:
-            options[name] = fields.flag(name)
+    options = fields.given(base_color=3, roughness="number", catches_shadows="flag", smooth="flag")
     place = _placing(fields)
     with fields.placed():
-        angles = require_rotation("rotate", place.get("rotate", 0.0))
-        turn = Rotation.from_euler("xyz", (0.0, 0.0, angles) if isinstance(angles, float) else angles, degrees=True)
-        shift = np.array(require_vector("translate", place.get("translate", (0.0, 0.0, 0.0))))
-        scale = require_number("scale", place.get("scale", 1.0), 1e-6, 1e6)
-        return read_stage_mesh(path, placement=Placement(scale, turn.as_matrix(), shift), **options)
+        return read_stage_mesh(path, placement=placement_of(**place), **options)
 
 
 def _ground(record: dict[str, Any], where: str) -> Ground:
@@ -196,15 +160,9 @@ def _ground(record: dict[str, Any], where: str) -> Ground:
     fields = Fields(record, where, GROUND_FIELDS)
     if fields.flag("ground") is not True:
         raise fields.error("ground", "true", "Leave the whole object out for no ground.")
-    given: dict[str, Any] = {}
-    for name, count in (("base_color", 3), ("center", 2)):
-        if name in fields and fields.value(name) != "auto":
-            given[name] = fields.numbers(name, count)
-    for name in ("size", "roughness", "height"):
-        if name in fields and not (name == "height" and fields.value(name) == "auto"):
-            given[name] = fields.number(name)
-    if "catches_shadows" in fields:
-        given["catches_shadows"] = fields.flag("catches_shadows")
+    kinds = {"base_color": 3, "size": "number", "roughness": "number", "catches_shadows": "flag"}
+    kinds |= {name: kind for name, kind in (("center", 2), ("height", "number")) if fields.value(name) != "auto"}
+    given = fields.given(**kinds)
     with fields.placed():
         return Ground(**given)
 
@@ -228,7 +186,7 @@ def _environment(record: Any, where: str, folder: Path) -> StageEnvironment | No
         raise AssetFormatError(
             f"{where} must have a path or a radiance, got {'both' if 'path' in fields else 'neither'}. Give one."
         )
-    rates = {name: fields.number(name) for name in ("rotate", "degrees_per_second") if name in fields}
+    rates = fields.given(rotate="number", degrees_per_second="number")
     with fields.placed():
         if "path" in fields:
             light = EnvironmentMap.read(fields.path("path", folder))
@@ -253,28 +211,14 @@ def _camera(record: Any, where: str, folder: Path) -> CameraPath | None:
         return keyframe_path(record, where)
     if kind == "file":
         fields = Fields(record, where, FILE_FIELDS)
-        prim = fields.text("prim") if "prim" in fields else None
+        prim = fields.given(prim="text").get("prim")
         path = fields.path("path", folder)
         with fields.placed():
             return read_camera_path(path, prim_path=prim)
     if kind == "orbit":
         fields = Fields(record, where, ORBIT_FIELDS)
-        given: dict[str, Any] = {"center": fields.numbers("center", 3)} if "center" in fields else {}
-        given |= {
-            name: fields.number(name) for name in ORBIT_FIELDS if name not in ("type", "center") and name in fields
-        }
+        given = fields.given(**dict.fromkeys(ORBIT_FIELDS[1:], "number") | {"center": 3})
         with fields.placed():
             return OrbitPath(**given)
     fields = Fields(record, where, FIXED_FIELDS)
-    keyframe = {name: fields.value(name) for name in ("position", "target", "camera_to_world") if name in fields}
-    fov = fields.number("fov") if "fov" in fields else DEFAULT_FOV
-    with fields.placed():
-        if "camera_to_world" in keyframe:
-            for name in ("position", "target"):
-                if name in keyframe:
-                    raise fields.error(name, "left out beside camera_to_world", "Leave one of them out.")
-            pose = keyframe["camera_to_world"]
-            aimed = Camera.look_at((0, 0, 0), (0, 1, 0), width=2, height=2, vertical_fov=fov)
-            return FixedCamera(Camera(2, 2, aimed.focal_x, aimed.focal_y, 1.0, 1.0, pose))
-        position, target = fields.numbers("position", 3), fields.numbers("target", 3)
-        return FixedCamera(Camera.look_at(position, target, width=2, height=2, vertical_fov=fov))
+    return FixedCamera(KeyframePath((keyframe_of(fields, 0.0),)).camera_at(0.0, 2, 2))

@@ -19,6 +19,7 @@ from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
 from beam_warp.stage.output import Film, FrameLog, FramePattern, require_folder
 from beam_warp.stage.pictures import PictureWriter
 from beam_warp.stage.shot_digests import ShotDigests
+from beam_warp.stage.stage import Stage
 from beam_warp.world.camera import Camera
 from beam_warp.world.shot import RenderedImage, Shot
 
@@ -28,14 +29,6 @@ class RenderProgress(Protocol):
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
-
-
-class ShotSource(Protocol):
-    """Source of shots over time: a `beam_warp.stage.stage.Stage`."""
-
-    def shot(self, time: float, width: int, height: int) -> Shot:
-        """Return what is to be rendered at a time [s], for an image of a size [pixel]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -107,9 +100,7 @@ class RenderInterruptedError(KeyboardInterrupt):
 class RenderJob:
     """Renders frames of a stage with one renderer into files of one kind."""
 
-    def __init__(
-        self, stage: ShotSource, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress
-    ) -> None:
+    def __init__(self, stage: Stage, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress) -> None:
         """Take the stage, the renderer, the writer of images, and a callback for progress."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
         self._digests = ShotDigests(code_digest(), renderer.decisive, writer.options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from beam_warp.stage.camera_paths import CameraPath, OrbitPath
 from beam_warp.stage.environments import StageEnvironment
 from beam_warp.stage.files import DURATIONS, RATES, read_stage_asset, read_stage_file
 from beam_warp.stage.meshes import Ground, joined_meshes
-from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import Light, lights_to_json
 from beam_warp.world.metadata import RASTER_ANTIALIASED, RASTER_LOW_PASS
@@ -76,7 +75,7 @@ class Stage:
         if isinstance(camera, OrbitPath):
             camera = camera.lasting(self.seconds)
             if camera.frames_subject and camera.subject is None:
-                camera = camera.around(self.subject)
+                camera = replace(camera, subject=self.subject)
         object.__setattr__(self, "camera", camera)
 
     @classmethod
@@ -94,50 +93,31 @@ class Stage:
         cls,
         paths: Sequence[str | Path],
         *,
-        environment: EnvironmentMap | str | Path | None = None,
-        rotate: float = 0.0,
-        rotate_per_second: float = 0.0,
-        exposure: float = 0.0,
-        lights: Sequence[Light] = (),
-        meshes: Sequence[ShotMesh | Ground] = (),
-        camera: CameraPath | None = None,
-        fps: float | None = None,
-        duration: float | None = None,
+        spacing: float | None = None,
+        centered: bool = False,
         source_axes: str | None = None,
         drop_invalid: bool = False,
         on_ground: bool = False,
-        centered: bool = False,
-        spacing: float | None = None,
         loop: bool = False,
+        **contents: Any,
     ) -> Stage:
         """Put assets on a stage without a file.
 
         Args:
             paths: PLY or USD files, or folders of numbered PLY files.
-            environment: Distant light, or its .exr or .hdr file.
-            rotate: How far the environment is turned at time 0 [degree].
-            rotate_per_second: How fast it turns [degree/s].
-            exposure: Gain of the environment [stops].
-            lights: Other lights.
-            meshes: Triangles in the world, and grounds.
-            camera: Camera path; if None, a camera that frames the assets from the front.
-            fps: Images a second.
-            duration: Length of the whole [s].
+            spacing: Put the assets in a row along x, this far apart [m], each centred.
+            centered: Put the middle of every asset over the origin.
             source_axes: Axes of PLY files that do not state them.
             drop_invalid: Leave out rows that are no Gaussians.
             on_ground: Put the lowest point of every asset at height 0.
-            centered: Put the middle of every asset over the origin.
-            spacing: Put the assets in a row along x, this far apart [m], each centred.
             loop: Whether assets start again after their last frame.
+            contents: Further attributes of the stage.
 
         Raises:
             BeamError: Something cannot be read, or an option is out of range.
         """
         if spacing is not None:
             require_number("spacing", spacing, 0.0, 1e6)
-        light = environment
-        if isinstance(environment, str | Path):
-            light = EnvironmentMap.read(environment)
         assets = [
             read_stage_asset(
                 Path(path),
@@ -150,17 +130,7 @@ class Stage:
             )
             for index, path in enumerate(paths)
         ]
-        return cls(
-            assets=tuple(assets),
-            meshes=tuple(meshes),
-            lights=tuple(lights),
-            environment=None
-            if not isinstance(light, EnvironmentMap)
-            else StageEnvironment(map=light.exposed(exposure), rotate=rotate, degrees_per_second=rotate_per_second),
-            camera=camera,
-            fps=fps,
-            duration=duration,
-        )
+        return cls(assets=tuple(assets), **contents)
 
     @property
     def seconds(self) -> float:

@@ -7,11 +7,9 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from beam_warp.view.painter import CloudPainter, Picture, TracedPicture
 from beam_warp.view.schedule import Order, Schedule
 from beam_warp.view.state import Viewpoint, ViewState
 from beam_warp.world.camera import Camera
@@ -20,58 +18,6 @@ log = logging.getLogger(__name__)
 
 NOBODY = -1
 """Page number of errors before there is a page; nobody is told of them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What is to be seen of a state.
-
-    Attributes:
-        pixels: Display sRGB, ``(H, W, 3)`` uint8.
-        layers: The same as numbers, the layers of an image file: name to ``(H, W)``.
-        gaussian_count: Number of Gaussians.
-        samples: Paths a pixel; 0 where none were traced.
-        legend: Legend of its colours, ``(h, w, 3)`` uint8; None where they need none.
-    """
-
-    pixels: NDArray[np.uint8]
-    layers: Callable[[], dict[str, NDArray[np.float32]]]
-    gaussian_count: int
-    samples: int = 0
-    legend: NDArray[np.uint8] | None = None
-
-
-class Tracing(Protocol):
-    """A picture that gets better."""
-
-    @property
-    def sample_count(self) -> int:
-        """Paths a pixel so far."""
-        ...
-
-    def advance(self, samples: int) -> None:
-        """Add paths to every pixel."""
-        ...
-
-    def picture(self) -> Picture:
-        """Return what there is so far."""
-        ...
-
-
-class Painter(Protocol):
-    """Draws states; called from one thread."""
-
-    def draw(self, state: ViewState, camera: Camera, *, is_quick: bool = False) -> Picture:
-        """Draw a state at once; quickly, if something moves."""
-        ...
-
-    def trace(self, state: ViewState, camera: Camera) -> Tracing:
-        """Begin to trace paths."""
-        ...
-
-    def cost_key(self, state: ViewState) -> object:
-        """Return what must be the same for two pictures of a size to take about the same time."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +40,10 @@ class FrameLoop:
 
     def __init__(
         self,
-        painter: Painter,
+        painter: CloudPainter,
         schedule: Schedule,
         deliver: Callable[[int, PagePicture], None],
         report: Callable[[int, Exception], None],
-        *,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start the thread.
 
@@ -108,17 +52,15 @@ class FrameLoop:
             schedule: Decides; used by this loop alone from now on.
             deliver: Takes a page's frame, in the loop's thread.
             report: Takes what failed for a page, in the loop's thread; once until something changes.
-            clock: Seconds.
         """
         self._painter = painter
         self._schedule = schedule
         self._deliver = deliver
         self._report = report
-        self._clock = clock
         self._changed = threading.Condition()
         self._is_closed = False
         self._exports: list[tuple[int, Callable[[Picture], None]]] = []
-        self._tracings: dict[int, tuple[int, float, Tracing]] = {}
+        self._tracings: dict[int, tuple[int, float, TracedPicture]] = {}
         self._cost_key: object = None
         self._thread = threading.Thread(target=self._run, name="beam-view-frames", daemon=True)
         self._thread.start()
@@ -126,7 +68,7 @@ class FrameLoop:
     def look(self, client: int, viewpoint: Viewpoint) -> None:
         """Say where a page looks from."""
         with self._changed:
-            self._schedule.look(client, viewpoint, self._clock())
+            self._schedule.look(client, viewpoint, time.monotonic())
             self._changed.notify()
 
     def leave(self, client: int) -> None:
@@ -139,7 +81,7 @@ class FrameLoop:
     def change(self, **values: Any) -> ViewState:
         """Change what is looked at, and return it; see `ViewState.changed`."""
         with self._changed:
-            self._schedule.show(self._schedule.state.changed(**values), self._clock())
+            self._schedule.show(self._schedule.state.changed(**values), time.monotonic())
             self._changed.notify()
             return self._schedule.state
 
@@ -172,14 +114,14 @@ class FrameLoop:
         while True:
             with self._changed:
                 while not self._is_closed and not self._exports:
-                    wait = self._schedule.wait(self._clock())
+                    wait = self._schedule.wait(time.monotonic())
                     if wait == 0.0:
                         break
                     self._changed.wait(wait)
                 if self._is_closed:
                     return
                 export = self._exports.pop(0) if self._exports else None
-                order = None if export else self._schedule.next(self._clock())
+                order = None if export else self._schedule.next(time.monotonic())
             if export is not None:
                 self._guarded(export[0], lambda export=export: self._export(*export))
             elif order is not None and not self._guarded(order.client, lambda order=order: self._carry_out(order)):
@@ -202,7 +144,7 @@ class FrameLoop:
 
     def _carry_out(self, order: Order) -> None:
         """Draw, and deliver where somebody still waits for it."""
-        started = self._clock()
+        started = time.monotonic()
         samples = 0
         is_over = False
         key = (order.kind, self._painter.cost_key(order.state))
@@ -218,7 +160,7 @@ class FrameLoop:
         else:
             camera = order.viewpoint.camera(order.scale, self._schedule.longest)
             picture = self._painter.draw(order.state, camera, is_quick=order.kind == "moving")
-        drawn = 1000.0 * (self._clock() - started) / max(samples, 1)
+        drawn = 1000.0 * (time.monotonic() - started) / max(samples, 1)
         with self._changed:
             is_wanted = self._schedule.is_wanted(order)
             if not is_wanted or order.kind != "traced":
@@ -226,13 +168,13 @@ class FrameLoop:
         if is_wanted:
             is_last = order.is_last and (order.kind != "traced" or is_over)
             self._deliver(order.client, PagePicture(picture, drawn, is_last))
-        taken = 1000.0 * (self._clock() - started)
+        taken = 1000.0 * (time.monotonic() - started)
         with self._changed:
             is_typical = key == self._cost_key  # the first one of a kind makes ready what the next ones find
             self._cost_key = key
             self._schedule.done(order, milliseconds=taken if is_typical else None, samples=samples, is_over=is_over)
 
-    def _tracing(self, order: Order) -> Tracing:
+    def _tracing(self, order: Order) -> TracedPicture:
         """Return what is traced for a page: as it was left, or a new one."""
         version, scale, tracing = self._tracings.get(order.client, (-1, 0.0, None))
         if tracing is None or (version, scale) != (order.version, order.scale):

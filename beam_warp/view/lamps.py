@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beam_warp.view.state import LightKind, PlacedLight, SubjectBox
+from beam_warp.view.state import LightKind, SubjectBox
 from beam_warp.world.lights import Light
 
 if TYPE_CHECKING:
@@ -77,12 +77,6 @@ class Lamps:
         with self._lock:
             self._add.disabled = len(self._lamps) >= MOST_LAMPS
             self._changed(tuple(lamp.placed.light() for lamp in self._lamps.values()))
-
-    @property
-    def lights(self) -> tuple[PlacedLight, ...]:
-        """The lights as they are placed."""
-        with self._lock:
-            return tuple(lamp.placed for lamp in self._lamps.values())
 
 
 class _Lamp:

@@ -17,9 +17,8 @@ from beam_warp.errors import BeamError, InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.channels import SeenChannel, channel_range, see_channel
-from beam_warp.render.path import PathProgress
-from beam_warp.view.frames import Picture
-from beam_warp.view.renderers import DeferredPair, displayed, path_tracer
+from beam_warp.render.path import PathOptions, PathProgress, PathRenderer
+from beam_warp.view.renderers import DeferredPair, displayed
 from beam_warp.view.state import (
     ALPHA,
     DEPTH,
@@ -35,7 +34,7 @@ from beam_warp.view.state import (
 from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.framing import bulk
+from beam_warp.world.framing import bulk_of
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.shot import RenderedImage, Shot, ShotMesh
@@ -48,6 +47,9 @@ CACHED_LIGHTS = 4
 
 LEGEND_WIDTH = 300
 """Width of legends beside a picture [pixel]."""
+
+MOST_PATHS = 2**20
+"""Paths of a pixel beyond which none are added."""
 
 GROUND_REACH = 6.0
 """Half the side of the ground over the subject's diagonal."""
@@ -87,8 +89,27 @@ class FrameCache:
         return len(self._held)
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is to be seen of a state.
+
+    Attributes:
+        pixels: Display sRGB, ``(H, W, 3)`` uint8.
+        layers: The same as numbers, the layers of an image file: name to ``(H, W)``.
+        gaussian_count: Number of Gaussians.
+        samples: Paths a pixel; 0 where none were traced.
+        legend: Legend of its colours, ``(h, w, 3)`` uint8; None where they need none.
+    """
+
+    pixels: NDArray[np.uint8]
+    layers: Callable[[], dict[str, NDArray[np.float32]]]
+    gaussian_count: int
+    samples: int = 0
+    legend: NDArray[np.uint8] | None = None
+
+
 class CloudPainter:
-    """Draws a sequence: lit, or one of its channels; satisfies `beam_warp.view.frames.Painter`.
+    """Draws a sequence: lit, or one of its channels; called from one thread.
 
     Attributes:
         subject: The box that the first, the middle and the last frame are in.
@@ -127,9 +148,11 @@ class CloudPainter:
         self._raster = RasterOptions.from_metadata(sequence.metadata) if raster is None else raster
         self._deferred = DeferredPair(self._raster, self._target)
         clouds = self._looked_at()
-        self.subject = SubjectBox.of(np.concatenate([_bulk(cloud) for cloud in clouds]))
+        self.subject = SubjectBox.of(bulk_of(clouds))
         self.channels = channels_of(next(filter(len, clouds), clouds[0]))
-        self._tracer = path_tracer(self._target) if LIT in self.channels else None
+        self._tracer = (
+            PathRenderer(PathOptions(samples=MOST_PATHS), device=self._target) if LIT in self.channels else None
+        )
         self.can_trace = self._tracer is not None
         self._ground: tuple[str, ShotMesh] | None = None
 
@@ -219,7 +242,7 @@ class CloudPainter:
 
 @dataclass(frozen=True)
 class TracedPicture:
-    """What was traced so far of a state; satisfies `beam_warp.view.frames.Tracing`."""
+    """Picture of a state that gets better as paths are added."""
 
     progress: PathProgress
     state: ViewState
@@ -281,11 +304,6 @@ def _depth_range(seen: SeenChannel) -> tuple[float, float]:
     step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6)))  # ends that people can read
     first, last = math.floor(low / step) * step, math.ceil(high / step) * step
     return first, last if last > first else first + step
-
-
-def _bulk(cloud: GaussianCloud) -> NDArray[np.float64]:
-    """Return the positions that belong to the subject; none of an empty frame."""
-    return bulk(cloud.positions, cloud.opacities) if len(cloud) else np.zeros((0, 3))
 
 
 def _size(cloud: GaussianCloud) -> int:

@@ -1,4 +1,4 @@
-"""Renderers of a viewer: one that shades at once, one that traces paths; and their images for a display."""
+"""The renderer of a viewer that shades at once, and images as a display shows them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,8 @@ from beam_warp.image.tone import ViewTransform, display_over
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions
-from beam_warp.render.path import PathOptions, PathRenderer
 from beam_warp.view.state import Color
 from beam_warp.world.shot import RenderedImage, Shot
-
-MOST_PATHS = 2**20
-"""Paths of a pixel beyond which none are added."""
 
 QUICK_MAP_SIZE = 256
 """Side of shadow maps of lamps while something moves, where there is no GPU [texel]."""
@@ -50,11 +46,6 @@ class DeferredPair:
         image = self._thorough.draw(shot)
         self._lit = lighting
         return image
-
-
-def path_tracer(device: str | None) -> PathRenderer:
-    """Return what traces paths, to be stopped when there are enough."""
-    return PathRenderer(PathOptions(samples=MOST_PATHS), device=device)
 
 
 def displayed(image: RenderedImage, transform: ViewTransform, stops: float, background: Color) -> NDArray[np.uint8]:

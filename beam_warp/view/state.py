@@ -16,6 +16,7 @@ from beam_warp.image.tone import ViewTransform
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, unknown_light
+from beam_warp.world.quaternions import matrix_of
 
 LIT = "lit"
 """The channel that shows the asset under light."""
@@ -168,14 +169,7 @@ class Viewpoint:
 
 def rotation_of(wxyz: Sequence[float]) -> NDArray[np.float64]:
     """Return the rotation matrix of a quaternion of any length but 0."""
-    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return matrix_of(np.roll(np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz), -1))
 
 
 def turn_to(direction: Sequence[float]) -> tuple[float, float, float, float]:
@@ -232,7 +226,7 @@ class PlacedLight:
 
     def light(self) -> Light:
         """Return it as renderers take it."""
-        linear = srgb_of(self.color)
+        linear = srgb_to_linear(np.asarray(self.color, np.float64) / 255.0).tolist()
         red, green, blue = (self.power * channel for channel in linear)
         power = (red, green, blue)
         ahead = -rotation_of(self.wxyz)[:, 2]
@@ -256,12 +250,6 @@ class PlacedLight:
                 position=self.position, intensity=power, radius=self.size, casts_shadows=self.casts_shadows
             )
         raise unknown_light(self.kind)
-
-
-def srgb_of(color: Color) -> tuple[float, float, float]:
-    """Return the scene-linear value of a display colour."""
-    red, green, blue = srgb_to_linear(np.asarray(color, np.float64) / 255.0).tolist()
-    return red, green, blue
 
 
 @dataclass(frozen=True)

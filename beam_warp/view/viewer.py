@@ -20,9 +20,9 @@ from beam_warp.errors import BeamError
 from beam_warp.image.files import write_exr
 from beam_warp.image.tone import TRANSFORMS
 from beam_warp.raster.records import RasterOptions
-from beam_warp.view.frames import FrameLoop, PagePicture, Picture
+from beam_warp.view.frames import FrameLoop, PagePicture
 from beam_warp.view.lamps import Lamps
-from beam_warp.view.painter import CloudPainter
+from beam_warp.view.painter import CloudPainter, Picture
 from beam_warp.view.schedule import LONGEST_SIDE, Pace, Schedule
 from beam_warp.view.server import DEFAULT_HOST, DEFAULT_PORT, server_url, start_server, stop_server
 from beam_warp.view.state import (
@@ -107,16 +107,15 @@ class Viewer:
         environments: Mapping[str, Callable[[], EnvironmentMap]],
         *,
         title: str = "beam view",
-        state: ViewState | None = None,
         options: ViewOptions | None = None,
     ) -> None:
         """Start serving.
 
         Args:
             sequence: Gaussians to show; frames are read when they are wanted.
-            environments: Functions that read or make a light, by its name; the first one shines at first.
+            environments: Functions that read or make a light, by its name; the first one shines at first, and casts
+                shadows only on a GPU.
             title: Above the controls.
-            state: First state, as far as it can be shown; environments cast shadows at first only on a GPU.
             options: See `ViewOptions`.
 
         Raises:
@@ -130,7 +129,11 @@ class Viewer:
         self._server = start_server(options.host, options.port, title)
         try:
             self._painter = CloudPainter(sequence, environments, raster=options.raster, device=options.device)
-            first = _possible(state or ViewState(environment=next(iter(environments), NO_ENVIRONMENT)), self._painter)
+            first = ViewState(
+                environment=next(iter(environments), NO_ENVIRONMENT),
+                environment_shadows=self._painter.is_cuda,
+                channel=self._painter.channels[0],
+            )
             traced = Pace(500.0, first_pixels=2.0**22 if self._painter.is_cuda else 2.0**15)
             schedule = Schedule(first, moving=Pace(1000.0 / options.rate), traced=traced, longest=options.longest)
             self._pages: dict[int, _Page] = {}
@@ -420,18 +423,6 @@ class _Controls:
         async def _(event: Any) -> None:
             if event.client is not None:  # a hand, and not `follow`
                 self._loop.change(**{name: meant(event.target.value)})
-
-
-def _possible(state: ViewState, painter: CloudPainter) -> ViewState:
-    """Return a state that can be shown."""
-    channel = state.channel if state.channel in painter.channels else painter.channels[0]
-    mode = state.mode if painter.can_trace else DEFERRED
-    return state.changed(
-        environment_shadows=state.environment_shadows and painter.is_cuda,
-        channel=channel,
-        mode=mode,
-        transform=state.transform if state.transform in TRANSFORMS else TRANSFORMS[0],
-    )
 
 
 def _framing(subject: SubjectBox) -> Camera:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_finite, require_number, require_range
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+
+if TYPE_CHECKING:
+    from beam_warp.world.gaussians import GaussianCloud
 
 PARALLEL_SINE = 1e-6
 """Below this sine between the viewing direction and up, the roll of a camera is undefined in double precision."""
@@ -87,6 +93,12 @@ def bulk(positions: ArrayLike, opacities: ArrayLike | None = None) -> NDArray[np
         grown = 0.25 * (high - low)
         inside &= (points[:, axis] >= low - grown) & (points[:, axis] <= high + grown)
     return points[inside] if inside.any() else points
+
+
+def bulk_of(clouds: Iterable[GaussianCloud]) -> NDArray[np.float64]:
+    """Return the `bulk` of each cloud that is not empty, together: ``(N, 3)`` [m], where N may be 0."""
+    found = [bulk(cloud.positions, cloud.opacities) for cloud in clouds if len(cloud)]
+    return np.concatenate(found) if found else np.zeros((0, 3))
 
 
 def require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:

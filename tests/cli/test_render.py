@@ -245,34 +245,6 @@ def test_the_capture_brings_its_light(ball, white_light, tmp_path):
     assert read_image(tmp_path / "out" / "b_0000.exr").channels["G"].max() > 0.3
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--out", "x.jpg"], "out must end in .png, .exr or .mp4, got x.jpg. Rename it."),
-        (["--out", "x.png", "--aov"], "out must end in .exr to hold the layers of --aov, got x.png"),
-        (["--out", "nowhere/x.png"], "out must be in a folder that exists, got nowhere"),
-        (["--out", "x.png", "--orbit", "0", "0", "--capture", "c"], "got --orbit and --capture. Leave one out."),
-        (["--out", "o", "--capture", "c", "--width", "9"], "width must be left out with --capture, got 9"),
-        (["--out", "x.png", "--background", "0", "0", "2"], "background must lie in [0, 1], got 2"),
-        (["--out", "x.png", "--frame", "3"], "frame must be an integer in [0, 0], got 3"),
-        (["--out", "x.png", "--width", "0"], "width must be an integer in [1, 65536], got 0"),
-        (["--out", "x.png", "--orbit", "0", "100"], "elevation must be a number in [-90, 90], got 100.0"),
-        (["--out", "x.png", "--fov", "nan"], "vertical_fov must be a number in"),
-        (["--out", "x.png", "--device", "cuda:9"], "device must be one of cpu"),
-        (["--out", "x.png", "--exposure", "nan"], "must be a number in"),
-        (["--out", "x.png", "--low-pass", "0"], "low_pass must be a number in [1e-06, 1e+06], got 0.0"),
-    ],
-)
-def test_refusals_are_one_line(ball, white_light, tmp_path, capsys, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
-    assert run(ball, "--environment", white_light, *words) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before
-
-
 def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
     out = tmp_path / "x.png"
     assert run(ball, "--out", out) == 2

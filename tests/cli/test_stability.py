@@ -104,6 +104,7 @@ def one_capture(monkeypatch, tiny_capture):
     monkeypatch.setattr(stress_captures, "CAPTURE_CASES", [black_camera])
 
 
+@pytest.mark.slow
 def test_captures_alone_of_two_devices(one_capture, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text(

@@ -6,25 +6,16 @@ import sys
 
 import pytest
 from pxr import Sdf
+from support.drawn_ball import relightable
 
 from beam_warp.cli.validate import main
 from beam_warp.schema.writer import write_asset
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 
 
 @pytest.fixture
 def asset(tmp_path):
-    cloud = GaussianCloud(
-        positions=[[0.0, 0.0, 0.0]],
-        orientations=[[0.0, 0.0, 0.0, 1.0]],
-        scales=[[0.1, 0.1, 0.1]],
-        opacities=[0.5],
-        base_color=[[0.5, 0.5, 0.5]],
-        roughness=[0.5],
-        ambient_occlusion=[1.0],
-        normals=[[0.0, 0.0, 1.0]],
-    )
-    write_asset(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usdc")
+    write_asset(GaussianSequence.from_clouds([relightable([[0.0, 0.0, 0.0]])]), tmp_path / "a.usdc")
     return tmp_path / "a.usdc"
 
 

@@ -3,8 +3,7 @@
 import json
 import signal
 import socket
-import subprocess
-import sys
+import threading
 import urllib.request
 
 import numpy as np
@@ -39,30 +38,28 @@ def lights(tmp_path):
     return folder
 
 
-def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights):
+def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights, capsys, monkeypatch):
     pytest.importorskip("viser")
-    words = ["view", str(asset), "--environment", str(lights), "--port", "0", "--json", "--device", "cpu"]
-    code = "import sys; from beam_warp.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # a suite that runs in the background of a shell hands down that SIGINT is ignored
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        said = ""
-        while not said.endswith("}\n"):
-            line = process.stdout.readline()
-            assert line, process.stderr.read()
-            said += line
-        report = json.loads(said)
-        assert report["frames"] == 2
-        with urllib.request.urlopen(report["url"], timeout=20) as page:
+    from beam_warp.view.viewer import Viewer
+
+    wait, reports = Viewer.wait, []
+
+    def wait_for_ctrl_c(viewer):
+        reports.append(json.loads(capsys.readouterr().out))
+        with urllib.request.urlopen(reports[0]["url"], timeout=20) as page:
             assert page.status == 200
-        process.send_signal(signal.SIGINT)
-        rest, errors = process.communicate(timeout=60)
-    assert (process.returncode, rest, errors) == (0, "", "")
+        threading.Timer(0.2, signal.raise_signal, (signal.SIGINT,)).start()
+        wait(viewer)
+
+    monkeypatch.setattr(Viewer, "wait", wait_for_ctrl_c)
+    # a suite that runs in the background of a shell is handed down that SIGINT is ignored
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert beam("view", asset, "--environment", lights, "--port", 0, "--json", "--device", "cpu") == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert reports[0]["frames"] == 2
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_taken_port_is_one_clear_line(asset, capsys):

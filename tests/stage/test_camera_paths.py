@@ -265,50 +265,40 @@ class TestOurFile:
         camera = read_camera_path(written(tmp_path, frames)).camera_at(9.0, 8, 8)
         assert np.array_equal(camera.position, [1.0, 2.0, 3.0])
 
+    EYE = np.eye(4).tolist()
+
     @pytest.mark.parametrize(
         ("content", "message"),
         [
             ("[", "camera path must be JSON in UTF-8, got Expecting value"),
-            ([], "path.json: keyframes must be a list of 1 to 1000000 key frames, got []. Give at least one."),
-            (7, "path.json: must be an object, got 7."),
-            ({"keyframe": []}, "path.json: must have no field but type, keyframes, interpolation, got 'keyframe'."),
-            ([3], "path.json: keyframes[0] must be an object, got 3."),
-            ([{"time": 0}], "path.json: keyframes[0].position must be 3 finite numbers, got nothing."),
-            (
-                [{"time": "0", "position": [0, 0, 0], "target": [0, 1, 0]}],
-                "path.json: keyframes[0].time must be a finite number, got '0'.",
-            ),
-            (
-                [{"time": 0, "position": [0, 0, 0], "target": [0, 0, 0]}],
-                "path.json: keyframes[0].target must differ from eye",
-            ),
-            (
-                [{"time": 0, "position": [0, 0, 0], "target": [0, 0, 1]}],
-                "path.json: keyframes[0]: up must not be parallel",
-            ),
-            (
-                '[{"time": 0, "position": [0, NaN, 0], "target": [0, 1, 0]}]',
-                "path.json: keyframes[0].position must be 3 finite numbers, got [0, NaN, 0].",
-            ),
+            ([], "keyframes must be a list of 1 to 1000000 key frames, got []. Give at least one."),
+            (7, "must be an object, got 7."),
+            ({"keyframe": []}, "must have no field but type, keyframes, interpolation, got 'keyframe'."),
+            ([3], "keyframes[0] must be an object, got 3."),
+            ([{"time": 0}], "keyframes[0].position must be 3 finite numbers, got nothing."),
+            ([{"time": "0"}], "keyframes[0].time must be a finite number, got '0'."),
+            ([{"time": 0, "position": [0, 0, 0], "target": [0, 0, 0]}], "keyframes[0].target must differ from eye"),
+            ([{"time": 0, "position": [0, 0, 0], "target": [0, 0, 1]}], "keyframes[0]: up must not be parallel"),
+            ('[{"time": 0, "position": [0, NaN, 0]}]', "keyframes[0].position must be 3 finite numbers, got [0, NaN,"),
             (
                 [{"time": 0, "camera_to_world": [[1, 0], [0, 1]]}],
-                "path.json: keyframes[0].camera_to_world must have shape (4, 4), got (2, 2).",
+                "keyframes[0].camera_to_world must have shape (4, 4), got (2, 2).",
             ),
             (
                 [{"time": 0, "camera_to_world": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}],
-                "path.json: keyframes[0].camera_to_world must hold a rotation",
+                "keyframes[0].camera_to_world must hold a rotation",
             ),
             (
-                [{"time": 0, "camera_to_world": np.eye(4).tolist(), "target": [0, 0, 1]}],
-                "path.json: keyframes[0].target must be left out beside camera_to_world",
+                [{"time": 0, "camera_to_world": EYE, "target": [0, 0, 1]}],
+                "keyframes[0].target must be left out beside camera_to_world",
             ),
             (
-                [{"time": 0, "camera_to_world": np.eye(4).tolist(), "fov": 181}],
-                "path.json: keyframes[0].fov must be a number in [0.01, 179], got 181.0.",
+                [{"time": 0, "camera_to_world": EYE, "fov": 181}],
+                "keyframes[0].fov must be a number in [0.01, 179], got 181.0.",
             ),
             (
-                [{"time": t, "camera_to_world": np.eye(4).tolist()} for t in (0, 2, 1)],
-                "path.json: keyframes[2].time must be after the one before (2), got 1. Sort the key frames by time.",
+                [{"time": t, "position": [0, -1, 0], "target": [0, 0, 0]} for t in (0, 2, 1)],
+                "keyframes[2].time must be after the one before (2), got 1. Sort the key frames by time.",
             ),
         ],
     )
@@ -353,15 +343,15 @@ class TestNerfstudio:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"camera_type": "fisheye"}, "path.json: camera_type must be perspective, got 'fisheye'."),
-            ({"camera_path": []}, "path.json: camera_path must be a list of 1 to 1000000 cameras, got []."),
-            ({"camera_path": [1]}, "path.json: camera_path[0] must be an object, got 1."),
+            ({"camera_type": "fisheye"}, "camera_type must be perspective, got 'fisheye'."),
+            ({"camera_path": []}, "camera_path must be a list of 1 to 1000000 cameras, got []."),
+            ({"camera_path": [1]}, "camera_path[0] must be an object, got 1."),
             (
                 {"camera_path": [{"camera_to_world": [1, 2]}]},
-                "path.json: camera_path[0].camera_to_world must have shape (4, 4), got (2,).",
+                "camera_path[0].camera_to_world must have shape (4, 4), got (2,).",
             ),
-            ({"camera_path": [{"fov": 1}]}, "path.json: camera_path[0].camera_to_world must"),
-            ({"fps": 0}, "path.json: fps must be a number in [0.001, 1e+06], got 0."),
+            ({"camera_path": [{"fov": 1}]}, "camera_path[0].camera_to_world must"),
+            ({"fps": 0}, "fps must be a number in [0.001, 1e+06], got 0."),
         ],
     )
     def test_mistakes(self, tmp_path, changes, message):

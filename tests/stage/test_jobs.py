@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.changed_code import changed_code
+from support.drawn_ball import relightable
 
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
@@ -13,7 +14,6 @@ from beam_warp.stage.jobs import FrameRequest, RenderInterruptedError, RenderJob
 from beam_warp.stage.output import Film, FramePattern
 from beam_warp.stage.pictures import PictureOptions, PictureWriter
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage, Shot
 
 FFMPEG = find_ffmpeg()
@@ -30,16 +30,7 @@ class MadeUpStage:
     def shot(self, time, width, height):
         self.asked.append(time)
         count = 1 + round(time)
-        cloud = GaussianCloud(
-            positions=np.tile([self.pace * time, 0.0, 0.0], (count, 1)),
-            orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-            scales=np.ones((count, 3)),
-            opacities=np.ones(count),
-            base_color=np.ones((count, 3)),
-            roughness=np.ones(count),
-            ambient_occlusion=np.ones(count),
-            normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        )
+        cloud = relightable(np.tile([self.pace * time, 0.0, 0.0], (count, 1)))
         camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=width, height=height, vertical_fov=30)
         return Shot(cloud=cloud, camera=camera)
 

@@ -89,38 +89,18 @@ def pattern(tmp_path):
     return FramePattern(tmp_path, "f", 3, ".png")
 
 
-def render(pattern, digests, *, overwrite=False, fail_at=None):
+def render(pattern, digests, *, overwrite=False):
     """Fill a sequence; returns the frames that were rendered."""
     log, done = FrameLog(pattern), []
 
-    def write(path):
-        if len(done) == fail_at:
-            raise KeyboardInterrupt
-        path.write_text(f"image {len(done)}")
-
     for number in log.missing(digests, digests.__getitem__, overwrite=overwrite):
-        log.write(number, digests[number], write)
+        log.write(number, digests[number], lambda path: path.write_text(f"image {len(done)}"))
         done.append(number)
     return done
 
 
 class TestResume:
     JOB = {number: f"digest {number}" for number in range(5)}  # noqa: RUF012
-
-    def test_whole_frames_are_kept(self, pattern):
-        assert render(pattern, self.JOB) == [0, 1, 2, 3, 4]
-        assert render(pattern, self.JOB) == []
-
-    def test_an_interrupted_run_goes_on(self, pattern):
-        with pytest.raises(KeyboardInterrupt):
-            render(pattern, self.JOB, fail_at=2)
-        assert sorted(path.name for path in pattern.folder.glob("f*")) == ["f000.png", "f001.png"]
-        assert render(pattern, self.JOB) == [2, 3, 4]
-
-    def test_missing_frames_are_filled(self, pattern):
-        render(pattern, self.JOB)
-        pattern.path(1).unlink()
-        assert render(pattern, self.JOB) == [1]
 
     def test_a_frame_of_another_size_is_not_ours(self, pattern):
         render(pattern, self.JOB)
@@ -146,10 +126,6 @@ class TestResume:
             render(pattern, self.JOB)
         assert pattern.path(2).read_text() == "mine"
         assert render(pattern, {5: "x"}) == [5]  # but others beside them are no matter
-
-    def test_more_frames_join(self, pattern):
-        render(pattern, {n: self.JOB[n] for n in (0, 2)})
-        assert render(pattern, self.JOB) == [1, 3, 4]
 
     def test_killed_between_image_and_log(self, pattern):
         log = FrameLog(pattern)

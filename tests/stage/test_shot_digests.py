@@ -4,28 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.drawn_ball import relightable
 
 from beam_warp.stage.shot_digests import ShotDigests
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import PointLight
 from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.shot import Shot, ShotMesh
 
 
 def cloud(**changes):
-    arrays = {
-        "positions": np.zeros((2, 3)),
-        "orientations": np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
-        "scales": np.ones((2, 3)),
-        "opacities": np.ones(2),
-        "base_color": np.full((2, 3), 0.5),
-        "roughness": np.full(2, 0.5),
-        "ambient_occlusion": np.ones(2),
-        "normals": np.tile([0.0, 0.0, 1.0], (2, 1)),
-    }
-    return GaussianCloud(**(arrays | changes))
+    return relightable(np.zeros((2, 3)), **changes)
 
 
 def mesh(catches=False):
@@ -83,5 +73,5 @@ def test_what_decides_besides():
 
 
 def test_what_is_no_plain_data_is_refused():
-    with pytest.raises(TypeError, match="must be plain data to be digested, got object"):
+    with pytest.raises(TypeError, match="what is digested must be plain data, got object"):
         ShotDigests(object())

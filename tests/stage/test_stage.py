@@ -405,7 +405,8 @@ class TestFile:
     def test_a_stage_made_without_a_file_is_the_same(self, folder):
         content = {"assets": ["still.ply", "walk"], "environment": "sky.exr", "camera": "keys.json"}
         scene = read(folder, content)
-        made = Stage.of([folder / "still.ply", folder / "walk"], environment=folder / "sky.exr", camera=scene.camera)
+        light = StageEnvironment(map=EnvironmentMap.read(folder / "sky.exr"))
+        made = Stage.of([folder / "still.ply", folder / "walk"], environment=light, camera=scene.camera)
         assert made.digest() == scene.digest()
         assert made.digest(0.1) == scene.digest(0.1)
         assert isinstance(scene.camera, KeyframePath)
@@ -525,103 +526,63 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("place", "value", "message"),
         [
-            (("beam-stage",), ..., "stage.json: beam-stage must be 1, got nothing. State the version"),
-            (("beam-stage",), True, "stage.json: beam-stage must be 1, got true."),
-            (("asets",), [], "stage.json: must have no field but beam-stage, fps, duration, assets,"),
-            (("fps",), "30", "stage.json: fps must be a finite number, got '30'. Write one."),
-            (("fps",), -3, "stage.json: fps must be a number in [0.001, 1e+06], got -3.0."),
-            (("duration",), 0, "stage.json: duration must be a number in [1e-06, 1e+09], got 0.0."),
-            (("assets",), {}, "stage.json: assets must be a list, got {}. Put it in [ ]."),
-            (("assets", 1), 5, "stage.json: assets[1] must be an object, got 5. Write it in { }."),
-            (("assets", 1, "path"), 3, "stage.json: assets[1].path must be a text, got 3. Write it in quotes."),
-            (("assets", 1, "translat"), 3, "stage.json: assets[1] must have no field but path, name,"),
-            (
-                ("assets", 1, "translate"),
-                [1, 2, "3"],
-                "stage.json: assets[1].translate must be 3 finite numbers, got [1,",
-            ),
-            (("assets", 1, "rotate"), [1, 2], "stage.json: assets[1].rotate must be 3 finite numbers, got [1, 2]."),
-            (("assets", 1, "rotate"), "90", "stage.json: assets[1].rotate must be a finite number, got '90'."),
-            (("assets", 1, "scale"), -1, "stage.json: assets[1].scale must be a number in [1e-06, 1e+06], got -1.0."),
-            (("assets", 1, "speed"), 0, "stage.json: assets[1].speed must be a number in [0.001, 1000], got 0.0."),
-            (("assets", 1, "loop"), "yes", "stage.json: assets[1].loop must be true or false, got 'yes'."),
-            (
-                ("assets", 1, "blend"),
-                "x",
-                "stage.json: assets[1].blend must be one of identified, rows, nearest, got 'x'.",
-            ),
-            (
-                ("assets", 0, "source_axes"),
-                "xyz",
-                "stage.json: assets[0].source_axes must be three letters, one each of",
-            ),
-            (("assets", 0, "path"), "box.ply", "stage.json: assets[0]: "),
-            (("assets", 0, "path"), "sky.exr", "stage.json: assets[0]: file name must end in one of .ply, .usd,"),
-            (("meshes", 1, "path"), "sky.exr", "stage.json: meshes[1]: mesh must be readable, got"),
-            (("meshes", 1, "base_color"), [1, 2, 3], "stage.json: meshes[1].base_color must lie in [0, 1], got 2"),
-            (("meshes", 1, "roughness"), 2, "stage.json: meshes[1].roughness must be a number in [0, 1], got 2.0."),
-            (("meshes", 1, "scale"), 0, "stage.json: meshes[1].scale must be a number in [1e-06, 1e+06], got 0.0."),
-            (("meshes", 1, "smooth"), 1, "stage.json: meshes[1].smooth must be true or false, got 1."),
-            (("meshes", 0, "ground"), False, "stage.json: meshes[0].ground must be true, got false."),
-            (("meshes", 0, "height"), "low", "stage.json: meshes[0].height must be a finite number, got 'low'."),
-            (("meshes", 0, "size"), 0, "stage.json: meshes[0].size must be a number in [0.001, 1e+06], got 0.0."),
-            (("meshes", 0, "center"), [1], "stage.json: meshes[0].center must be 2 finite numbers, got [1]."),
-            (
-                ("meshes", 0, "path"),
-                "a.ply",
-                "stage.json: meshes[0] must have no field but ground, size, height, center,",
-            ),
-            (("lights", 0, "type"), "lamp", "stage.json: lights[0].type must be one of directional, point, spot,"),
-            (("lights", 0, "radius"), -1, "stage.json: lights[0]: radius must be a number in"),
-            (("lights",), 3, "stage.json: lights must be a list of lights, got int."),
-            (("lights",), "keys.json", "stage.json: lights: keys.json: lights must be a list of lights, got dict."),
-            (("environment", "path"), ..., "stage.json: environment must have a path or a radiance, got neither."),
-            (
-                ("environment", "radiance"),
-                [1, 1, 1],
-                "stage.json: environment must have a path or a radiance, got both.",
-            ),
-            (("environment", "path"), "box.ply", "stage.json: environment: environment must be an .exr or .hdr file"),
+            (("beam-stage",), ..., "beam-stage must be 1, got nothing. State the version"),
+            (("beam-stage",), True, "beam-stage must be 1, got true."),
+            (("asets",), [], "must have no field but beam-stage, fps, duration, assets,"),
+            (("fps",), "30", "fps must be a finite number, got '30'. Write one."),
+            (("fps",), -3, "fps must be a number in [0.001, 1e+06], got -3.0."),
+            (("duration",), 0, "duration must be a number in [1e-06, 1e+09], got 0.0."),
+            (("assets",), {}, "assets must be a list, got {}. Put it in [ ]."),
+            (("assets", 1), 5, "assets[1] must be an object, got 5. Write it in { }."),
+            (("assets", 1, "path"), 3, "assets[1].path must be a text, got 3. Write it in quotes."),
+            (("assets", 1, "translat"), 3, "assets[1] must have no field but path, name,"),
+            (("assets", 1, "translate"), [1, 2, "3"], "assets[1].translate must be 3 finite numbers, got [1,"),
+            (("assets", 1, "rotate"), [1, 2], "assets[1].rotate must be 3 finite numbers, got [1, 2]."),
+            (("assets", 1, "rotate"), "90", "assets[1].rotate must be a finite number, got '90'."),
+            (("assets", 1, "scale"), -1, "assets[1].scale must be a number in [1e-06, 1e+06], got -1.0."),
+            (("assets", 1, "speed"), 0, "assets[1].speed must be a number in [0.001, 1000], got 0.0."),
+            (("assets", 1, "loop"), "yes", "assets[1].loop must be true or false, got 'yes'."),
+            (("assets", 1, "blend"), "x", "assets[1].blend must be one of identified, rows, nearest, got 'x'."),
+            (("assets", 0, "source_axes"), "xyz", "assets[0].source_axes must be three letters, one each of"),
+            (("assets", 0, "path"), "box.ply", "assets[0]: "),
+            (("assets", 0, "path"), "sky.exr", "assets[0]: file name must end in one of .ply, .usd,"),
+            (("meshes", 1, "path"), "sky.exr", "meshes[1]: mesh must be readable, got"),
+            (("meshes", 1, "base_color"), [1, 2, 3], "meshes[1].base_color must lie in [0, 1], got 2"),
+            (("meshes", 1, "roughness"), 2, "meshes[1].roughness must be a number in [0, 1], got 2.0."),
+            (("meshes", 1, "scale"), 0, "meshes[1].scale must be a number in [1e-06, 1e+06], got 0.0."),
+            (("meshes", 1, "smooth"), 1, "meshes[1].smooth must be true or false, got 1."),
+            (("meshes", 0, "ground"), False, "meshes[0].ground must be true, got false."),
+            (("meshes", 0, "height"), "low", "meshes[0].height must be a finite number, got 'low'."),
+            (("meshes", 0, "size"), 0, "meshes[0].size must be a number in [0.001, 1e+06], got 0.0."),
+            (("meshes", 0, "center"), [1], "meshes[0].center must be 2 finite numbers, got [1]."),
+            (("meshes", 0, "path"), "a.ply", "meshes[0] must have no field but ground, size, height, center,"),
+            (("lights", 0, "type"), "lamp", "lights[0].type must be one of directional, point, spot,"),
+            (("lights", 0, "radius"), -1, "lights[0]: radius must be a number in"),
+            (("lights",), 3, "lights must be a list of lights, got int."),
+            (("lights",), "keys.json", "lights: keys.json: lights must be a list of lights, got dict."),
+            (("environment", "path"), ..., "environment must have a path or a radiance, got neither."),
+            (("environment", "radiance"), [1, 1, 1], "environment must have a path or a radiance, got both."),
+            (("environment", "path"), "box.ply", "environment: environment must be an .exr or .hdr file"),
             (("environment", "rotate"), None, ""),
-            (
-                ("environment", "exposure"),
-                99,
-                "stage.json: environment.exposure must be a number in [-64, 64], got 99.0.",
-            ),
-            (
-                ("camera", "type"),
-                ...,
-                "stage.json: camera.type must be one of fixed, orbit, keyframes, file, got null.",
-            ),
-            (("camera",), 3, "stage.json: camera must be an object, got 3."),
-            (("camera", "fov"), 0, "stage.json: camera.fov must be a number in [0.01, 179], got 0.0."),
-            (("camera", "subject"), [], "stage.json: camera must have no field but type, center, distance, azimuth,"),
-            (
-                ("camera", "degrees_per_second"),
-                3,
-                "stage.json: camera.turns must be left out beside degrees_per_second",
-            ),
-            (
-                ("camera",),
-                {"type": "keyframes"},
-                "stage.json: camera.keyframes must be a list of 1 to 1000000 key frames,",
-            ),
+            (("environment", "exposure"), 99, "environment.exposure must be a number in [-64, 64], got 99.0."),
+            (("camera", "type"), ..., "camera.type must be one of fixed, orbit, keyframes, file, got null."),
+            (("camera",), 3, "camera must be an object, got 3."),
+            (("camera", "fov"), 0, "camera.fov must be a number in [0.01, 179], got 0.0."),
+            (("camera", "subject"), [], "camera must have no field but type, center, distance, azimuth,"),
+            (("camera", "degrees_per_second"), 3, "camera.turns must be left out beside degrees_per_second"),
+            (("camera",), {"type": "keyframes"}, "camera.keyframes must be a list of 1 to 1000000 key frames,"),
             (
                 ("camera",),
                 {"type": "keyframes", "keyframes": [{"time": 0, "position": [0, 0], "target": [0, 1, 0]}]},
-                "stage.json: camera.keyframes[0].position must be 3 finite numbers, got [0, 0].",
+                "camera.keyframes[0].position must be 3 finite numbers, got [0, 0].",
             ),
             (
                 ("camera",),
                 {"type": "fixed", "position": [0, 0, 0], "target": [0, 0, 0]},
-                "stage.json: camera.target must differ from eye, got [0.0, 0.0, 0.0] for both.",
+                "camera.target must differ from eye, got [0.0, 0.0, 0.0] for both.",
             ),
-            (("camera",), "lights.json", "stage.json: camera: lights.json: keyframes[0] must have no field but time,"),
-            (
-                ("camera",),
-                {"type": "file", "path": "keys.json", "prim": "/C"},
-                "stage.json: camera.prim must be left out",
-            ),
+            (("camera",), "lights.json", "camera: lights.json: keyframes[0] must have no field but time,"),
+            (("camera",), {"type": "file", "path": "keys.json", "prim": "/C"}, "camera.prim must be left out"),
         ],
     )
     def test_one_clear_error(self, folder, place, value, message):
@@ -630,25 +591,25 @@ class TestMistakes:
             return
         with pytest.raises(AssetFormatError) as caught:
             read(folder, changed(place, value), version=False)
-        assert str(caught.value).startswith(message)
+        assert str(caught.value).startswith(f"stage.json: {message}")
         assert str(caught.value).endswith(".")
 
     @pytest.mark.parametrize(
         ("place", "what"),
         [
-            (("assets", 0, "path"), "stage.json: assets[0].path must be an existing file or folder"),
-            (("meshes", 1, "path"), "stage.json: meshes[1].path must be an existing file"),
-            (("environment", "path"), "stage.json: environment.path must be an existing file"),
-            (("lights",), "stage.json: lights must be an existing file"),
-            (("camera",), "stage.json: camera.path must be an existing file"),
+            (("assets", 0, "path"), "assets[0].path must be an existing file or folder"),
+            (("meshes", 1, "path"), "meshes[1].path must be an existing file"),
+            (("environment", "path"), "environment.path must be an existing file"),
+            (("lights",), "lights must be an existing file"),
+            (("camera",), "camera.path must be an existing file"),
         ],
     )
     def test_missing_files(self, folder, place, what):
         with pytest.raises(MissingFileError) as caught:
             read(folder, changed(place, "none.json"))
         assert str(caught.value) == (
-            f"{what}, got 'none.json' (looked for {folder / 'none.json'}). Correct the name; relative ones start where "
-            "this file is."
+            f"stage.json: {what}, got 'none.json' (looked for {folder / 'none.json'}). Correct the name; relative "
+            "ones start where this file is."
         )
 
     def test_a_later_version(self, folder):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.drawn_ball import relightable
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
@@ -22,17 +23,13 @@ def sphere(turn=0.0, count=300, **changes):
     frames = Rotation.from_euler("zyx", np.stack([azimuth, polar, 0.0 * k], axis=1))
     whole = Rotation.from_rotvec([0.0, 0.0, turn])
     arrays = {
-        "positions": whole.apply(normals),
         "orientations": (whole * frames).as_quat(),
         "scales": np.tile([0.1, 0.2, 0.0], (count, 1)),
         "opacities": np.full(count, 0.9),
         "normals": whole.apply(normals),
-        "base_color": np.full((count, 3), 0.5),
-        "roughness": np.full(count, 0.5),
-        "ambient_occlusion": np.full(count, 1.0),
         "ids": np.arange(count),
     }
-    return GaussianCloud(**(arrays | changes))
+    return relightable(whole.apply(normals), **(arrays | changes))
 
 
 def one(**changes):

@@ -9,6 +9,22 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
+def relightable(positions, **changes):
+    """Round, opaque Gaussians at places, with all arrays that light needs."""
+    count = len(positions)
+    arrays = {
+        "positions": positions,
+        "orientations": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        "scales": np.ones((count, 3)),
+        "opacities": np.ones(count),
+        "base_color": np.full((count, 3), 0.5),
+        "roughness": np.full(count, 0.5),
+        "ambient_occlusion": np.ones(count),
+        "normals": np.tile([0.0, 0.0, 1.0], (count, 1)),
+    }
+    return GaussianCloud(**(arrays | changes))
+
+
 def drawn_ball(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
     """Opaque flat discs on a ball of radius 0.5 m."""
     index = np.arange(count) + 0.5
@@ -16,16 +32,14 @@ def drawn_ball(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
     phi = np.pi * (1.0 + np.sqrt(5.0)) * index
     normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
     turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    return GaussianCloud(
-        positions=0.5 * normals + center,
+    return relightable(
+        0.5 * normals + center,
         orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
         scales=np.tile([0.015, 0.015, 1e-4], (count, 1)),
         opacities=np.full(count, 0.99),
         radiance=np.zeros((count, 1, 3)),
         radiance_color_space="lin_rec709_scene",
         base_color=np.tile(color, (count, 1)),
-        roughness=np.full(count, 0.5),
-        ambient_occlusion=np.ones(count),
         normals=normals,
     )
 

@@ -6,7 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from beam_warp.view.frames import NOBODY, FrameLoop, Picture
+from beam_warp.view.frames import NOBODY, FrameLoop
+from beam_warp.view.painter import Picture
 from beam_warp.view.schedule import Pace, Schedule
 from beam_warp.view.state import TRACED, Viewpoint, ViewState
 
