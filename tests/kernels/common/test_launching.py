@@ -36,7 +36,7 @@ def test_kernels_with_atomics_are_launched_in_order(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     racing = kernels_with_atomics(tree)
     for call in ast.walk(tree):
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "launch":
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") in ("launch", "launcher"):
             kernel = getattr(call.args[0], "id", "")
             if kernel in racing:
                 assert any(word.arg == "in_order" for word in call.keywords), kernel
