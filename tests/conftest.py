@@ -5,9 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Programs that tests start must not take the checkout in the working folder for the installed package.
 os.environ.setdefault("PYTHONSAFEPATH", "1")
+
+# A busy machine is no failure of a test.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 def _devices() -> list[str]:
