@@ -3,9 +3,9 @@ from ._version import __version__ as __version__
 from .capture.capture import Capture as Capture
 from .converters import read as read  # pyright: ignore[reportMissingImports]  (mapped folder)
 from .converters import write as write  # pyright: ignore[reportMissingImports]  (mapped folder)
+from .decomposition.job import run as run
+from .decomposition.options import RunOptions as RunOptions
 from .errors import BeamError as BeamError
-from .materials.job import RunOptions as RunOptions
-from .materials.job import run as run
 from .raster.gbuffer import rasterize as rasterize
 from .reconstruction.job import ReconstructOptions as ReconstructOptions
 from .reconstruction.job import reconstruct as reconstruct

@@ -23,9 +23,9 @@ import warp as wp
 from timing import commit
 
 from beam_warp import Scene, ambient_occlusion, converters, visibility
+from beam_warp.decomposition.job import RunOptions, run
 from beam_warp.device.arrays import resolve_device
 from beam_warp.materials.direct import MaterialOptions
-from beam_warp.materials.job import RunOptions, run
 from beam_warp.materials.normals import estimate_normals
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference

@@ -29,7 +29,7 @@ from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
 
 ROUGHNESS = 0.5
-"""Of every Gaussian, in every row alike."""
+"""Roughness of every Gaussian, alike in every row."""
 
 
 @dataclass(frozen=True, eq=False)

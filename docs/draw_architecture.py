@@ -43,7 +43,7 @@ COLORS = {
     "#e4e7eb": ("errors", "checks", "digests", "kernels", "device", "jobs"),
     "#d3e8d3": ("image", "world", "schema", "converters", "capture", "mesh", "stage"),
     "#fdebc8": ("light", "trace", "raster", "render", "interop"),
-    "#d2e3f7": ("materials", "reconstruction"),
+    "#d2e3f7": ("materials", "reconstruction", "decomposition"),
     "#ecdcf2": ("evaluate", "demo", "study", "stability", "view", "cli"),
 }
 """What packages are about: foundations, data, light transport, solving for an asset, and using one."""
@@ -57,7 +57,7 @@ WAY: Sequence[tuple[str, str, str, float, float]] = (
     ("reconstruct", "reconstruct\nfit the first frame,\ntrack the others", "reconstruction", 2.0, 3.0),
     ("read", "read\nPLY or USD files", "converters", 1.0, 1.0),
     ("sequence", "Gaussians\na cloud a frame,\nwith radiance", "world", 2.0, 1.0),
-    ("decompose", "decompose\nread, see, light,\nsolve, write", "materials", 3.0, 2.0),
+    ("decompose", "decompose\nread, see, light,\nsolve, write", "decomposition", 3.0, 2.0),
     ("asset", "relightable asset\nbase colour, normals,\nroughness, occlusion", "schema", 4.0, 2.0),
     ("convert", "convert\nPLY and USD files", "converters", 5.1, 4.0),
     ("validate", "validate\nagainst the contract", "schema", 5.1, 3.0),

@@ -119,7 +119,7 @@ def _observability(frame: FrameArrays) -> Iterator[Fault]:
 
 @entering(FRAME_RULES, "BEAM-SEQ-005", "error")
 def _constant_count(frame: FrameArrays) -> Iterator[Fault]:
-    """With constant topology, the number of Gaussians does not change."""
+    """The number of Gaussians does not change under constant topology."""
     if frame.constant_topology and frame.previous is not None and len(frame.previous["positions"]) != frame.count:
         before = len(frame.previous["positions"])
         yield Fault(f"the count must be constant, got {frame.count} after {before}. Say perFrame.", "positions")
@@ -135,7 +135,7 @@ def _unique_ids(frame: FrameArrays) -> Iterator[Fault]:
 
 @entering(FRAME_RULES, "BEAM-SEQ-007", "error")
 def _constant_ids(frame: FrameArrays) -> Iterator[Fault]:
-    """With constant topology, the identity of each row does not change."""
+    """The identity of each row does not change under constant topology."""
     if frame.constant_topology and frame.previous is not None and "ids" in frame.changed:
         ids, before = frame.arrays.get("ids"), frame.previous.get("ids")
         if ids is not None and before is not None and len(ids) == len(before) and not np.array_equal(ids, before):
@@ -144,7 +144,7 @@ def _constant_ids(frame: FrameArrays) -> Iterator[Fault]:
 
 @entering(FRAME_RULES, "BEAM-SEQ-008", "warning")
 def _continuous_quaternions(frame: FrameArrays) -> Iterator[Fault]:
-    """With constant topology, quaternions keep their sign; engines that blend components would spin the Gaussians."""
+    """Quaternions keep their sign under constant topology; engines that blend components would spin the Gaussians."""
     if not frame.constant_topology or frame.previous is None or "orientations" not in frame.changed:
         return
     now, before = frame.arrays.get("orientations"), frame.previous.get("orientations")

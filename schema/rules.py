@@ -376,7 +376,7 @@ def _clip_manifest(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-CLIP-003", "error")
 def _clips_cover(prim: Usd.Prim) -> Iterator[Fault]:
-    """At every time code of the range the active clip has a sample of every declared attribute."""
+    """The active clip has a sample of every declared attribute at every time code of the range."""
     stage = prim.GetStage()
     for clips in clip_sets(prim):
         if not clips.active or not stage.HasAuthoredTimeCodeRange():

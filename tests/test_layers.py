@@ -17,6 +17,7 @@ trace converters
 raster capture
 mesh render interop
 materials reconstruction stage view
+decomposition
 evaluate demo study
 stability
 cli

@@ -273,8 +273,8 @@ def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[
 def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallback) -> Any:
     """Return what is decomposed; a built-in capture is written to the folder."""
     from beam_warp.capture.capture import Capture
+    from beam_warp.decomposition.capture_images import CaptureImages
     from beam_warp.demo.capture import write_demo_capture
-    from beam_warp.materials.steps.capture_images import CaptureImages
     from beam_warp.study.materials import MaterialsSubject
 
     if args.capture is None:

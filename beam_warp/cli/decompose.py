@@ -18,7 +18,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
-    from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult
+    from beam_warp.decomposition.job import OverviewOptions, RunOptions, RunResult
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def decompose(args: Decompose) -> int:
     environment = EnvironmentMap.read(light_of(args.measuring, capture, args.sequence)).rotated(args.measuring.rotate)
     sequence = converters.read(args.sequence)
 
-    from beam_warp.materials.job import run as run_pipeline
+    from beam_warp.decomposition.job import run as run_pipeline
 
     with progress(args.quiet or args.json) as report:
         result = run_pipeline(
@@ -156,9 +156,9 @@ def run_options(
     Raises:
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
+    from beam_warp.decomposition.job import RunOptions
     from beam_warp.materials.direct import MaterialOptions
     from beam_warp.materials.images import ImagePathOptions
-    from beam_warp.materials.job import RunOptions
     from beam_warp.materials.roughness_source import RoughnessTexture
 
     stated = measuring.roughness
@@ -186,7 +186,7 @@ def run_options(
 
 def overview_options(measuring: Measuring) -> OverviewOptions:
     """Return what the contact sheet shows."""
-    from beam_warp.materials.job import OverviewOptions
+    from beam_warp.decomposition.job import OverviewOptions
     from beam_warp.render.sheet import Relighting
 
     light = measuring.relight

@@ -66,7 +66,7 @@ def run(args: Run) -> int:
     if args.fps is not None:
         require_number("frames_per_second", args.fps, 1e-3, 1e6)
 
-    from beam_warp.materials.job import run as run_pipeline
+    from beam_warp.decomposition.job import run as run_pipeline
 
     options = run_options(
         args.measuring, capture, preset="direct", seed=args.seed, device=args.device, persistent=args.persistent

@@ -14,6 +14,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.decomposition.job import OverviewOptions, RunOptions, RunResult, run
+from beam_warp.decomposition.options import ESTIMATE
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, require_free, write_demo_capture
 from beam_warp.demo.truth import DemoTruth, display_color, relit_views, score_views
 from beam_warp.device.arrays import resolve_device
@@ -22,8 +24,6 @@ from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
 from beam_warp.jobs.progress import Progress, StageTimer
 from beam_warp.jobs.report import write_json
-from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult, run
-from beam_warp.materials.options import ESTIMATE
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
 from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from beam_warp.decomposition.job import OverviewOptions, RunOptions, RunResult, run
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.from_images import FromImagesOptions, demo_from_images
 from beam_warp.demo.lights import demo_environments
@@ -17,7 +18,6 @@ from beam_warp.demo.truth import DemoTruth, comparison, relit_views, score_views
 from beam_warp.image.files import write_exr, write_png
 from beam_warp.jobs.progress import Progress, no_progress
 from beam_warp.jobs.report import write_report
-from beam_warp.materials.job import OverviewOptions, RunOptions, RunResult, run
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED

@@ -15,7 +15,7 @@ INTRINSICS = {"w": 8, "h": 6, "fl_x": 10.0, "fl_y": 11.0, "cx": 4.0, "cy": 3.0}
 
 
 def opengl_pose(eye):
-    """At ``eye``, looking along +y with z up: right +x, up +z, back -y."""
+    """Pose at ``eye``, looking along +y with z up: right +x, up +z, back -y."""
     pose = np.eye(4)
     pose[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], float).T
     pose[:3, 3] = eye

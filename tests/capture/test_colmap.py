@@ -74,7 +74,7 @@ def write_binary(folder):
 
 
 def rotation_of(q):
-    """By the quaternion's action on the axes: v + 2 w (u x v) + 2 u x (u x v)."""
+    """Rotate by the quaternion's action on the axes: v + 2 w (u x v) + 2 u x (u x v)."""
     w, u = q[0], q[1:]
     axes = np.eye(3)
     return (axes + 2 * w * np.cross(u, axes) + 2 * np.cross(u, np.cross(u, axes))).T

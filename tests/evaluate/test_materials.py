@@ -278,7 +278,7 @@ class TestWhatIsThere:
         }
 
     def test_a_frame_without_true_base_colour_has_no_scale(self, asset, mirror, tmp_path):
-        """Its other channels are scored; base colour and its scale are those of the other frame."""
+        """The other channels of that frame are scored; base colour and its scale are those of the other frame."""
         folder = tmp_path / "capture"
         shutil.copytree(mirror.folder, folder)
         for record in mirror.select(split="test", frames={1}):
@@ -302,7 +302,7 @@ class TestWhatIsThere:
         }  # fmt: skip
 
     def test_relighters_are_told_how_to_draw(self, asset, mirror):
-        """As the asset states, with the samples asked for; then each view once under each of its lights."""
+        """Renderers draw as the asset states, with the samples asked for; then each view once under each of its lights."""
         told, drawn = [], []
 
         class Black:

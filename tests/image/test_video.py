@@ -52,7 +52,7 @@ class TestFilm:
         assert np.abs(found.astype(int) - np.array(frames).astype(int)).max() <= 3
 
     def test_colours_are_bt709(self, tmp_path):
-        """With the matrix of BT.601, green would come back 30 levels off."""
+        """Green would come back 30 levels off with the matrix of BT.601."""
         colors = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 30]], np.uint8)
         image = colors[None].repeat(16, axis=1).repeat(32, axis=0)
         write_mp4(tmp_path / "x.mp4", [image] * 2, VideoOptions(crf=1), ffmpeg=FFMPEG)

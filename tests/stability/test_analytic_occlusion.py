@@ -106,7 +106,7 @@ class TestEstimator:
         assert outcome.chi_square <= np.quantile(np.square(t).mean(axis=1), 0.9973)
 
     def test_a_bias_is_noticed(self, monkeypatch):
-        """Of 0.02, half a stated standard error of a single estimate."""
+        """A bias of 0.02 is half a stated standard error of a single estimate."""
         real = analytic_occlusion.ambient_occlusion
 
         def biased(*args, **options):

@@ -144,7 +144,7 @@ class TestReferences:
 
 
 def test_error_is_the_estimators_own(device):
-    """With Bernoulli acceptance every independent ray is 0 or 1 with mean A: the error is sqrt(A (1 - A) / n)."""
+    """Under Bernoulli acceptance, every independent ray is 0 or 1 with mean A: the error is sqrt(A (1 - A) / n)."""
     plan = TracingPlan(
         acceptances=("bernoulli",),
         samplers=("iid",),

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.decomposition.options import ESTIMATE
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.digests import array_digest
 from beam_warp.jobs.store import kept_frame
-from beam_warp.materials.options import ESTIMATE
 from beam_warp.materials.roughness import RoughnessProfile, measure_roughness_profile, solve_roughness
 from beam_warp.materials.roughness_source import stated_roughness
-from beam_warp.materials.steps.plan import JobPlan
-from beam_warp.materials.steps.seen import SeenFrame
 
 ROUGHNESS_FRAMES = 8
 """Frames of persistent Gaussians that roughness is found from, evenly spread: more add little that is new."""

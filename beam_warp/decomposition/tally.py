@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from beam_warp.decomposition.archive import MeasuredFrame
 from beam_warp.materials.changes import ColorChange
-from beam_warp.materials.steps.archive import MeasuredFrame
 from beam_warp.world.gaussians import GaussianCloud, Observability
 
 CLIPPED_WARNING = 0.05

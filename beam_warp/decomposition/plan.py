@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from beam_warp.materials.steps.archive import FrameArchive
-from beam_warp.materials.steps.capture_light import CaptureLight
-from beam_warp.materials.steps.source import Source
+from beam_warp.decomposition.archive import FrameArchive
+from beam_warp.decomposition.capture_light import CaptureLight
+from beam_warp.decomposition.source import Source
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.base_color import fill_from_neighbors
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints, estimate_normals
-from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.decomposition.capture_images import CaptureImages
+from beam_warp.decomposition.options import RunOptions
+from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.options import RunOptions
-from beam_warp.materials.steps.capture_images import CaptureImages
-from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import WORLD_AXES, GaussianSequence
 

@@ -1,14 +1,14 @@
 """The main job: Gaussians with captured radiance in, a relightable asset out, frame by frame and resumable.
 
-    read      `beam_warp.materials.steps.source`          frames and their images
-    see       `beam_warp.materials.steps.seen`            what views show, and where light is gathered
-    light     `beam_warp.materials.steps.capture_light`   the light's exposure, and whether it fits
-    measure   `beam_warp.materials.steps.measure`         occlusion and evidence of each frame
-    solve     `beam_warp.materials.steps.solve`           base colour from the evidence
-    write     `beam_warp.materials.steps.result`          asset, contact sheet and report
+    read      `beam_warp.decomposition.source`          frames and their images
+    see       `beam_warp.decomposition.seen`            what views show, and where light is gathered
+    light     `beam_warp.decomposition.capture_light`   the light's exposure, and whether it fits
+    measure   `beam_warp.decomposition.measure`         occlusion and evidence of each frame
+    solve     `beam_warp.decomposition.solve`           base colour from the evidence
+    write     `beam_warp.decomposition.result`          asset, contact sheet and report
 
 Records go from each step to the next. What is finished is also kept in a folder
-(`beam_warp.materials.steps.archive`), with which a stopped job continues.
+(`beam_warp.decomposition.archive`), with which a stopped job continues.
 """
 
 from __future__ import annotations
@@ -23,6 +23,16 @@ from typing import Any
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.decomposition.archive import FrameArchive
+from beam_warp.decomposition.capture_images import CaptureImages
+from beam_warp.decomposition.capture_light import light_findings, prepare_light
+from beam_warp.decomposition.measure import FrameMeasurement
+from beam_warp.decomposition.options import OverviewOptions, RunOptions
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.result import draw_overview, relightable_sequence, run_report
+from beam_warp.decomposition.roughness_finder import RoughnessFinder
+from beam_warp.decomposition.solve import solve_each, solve_jointly, take
+from beam_warp.decomposition.source import Source
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
@@ -30,17 +40,7 @@ from beam_warp.jobs.progress import JobLog, Progress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
 from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.options import OverviewOptions, RunOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.materials.steps.archive import FrameArchive
-from beam_warp.materials.steps.capture_images import CaptureImages
-from beam_warp.materials.steps.capture_light import light_findings, prepare_light
-from beam_warp.materials.steps.measure import FrameMeasurement
-from beam_warp.materials.steps.plan import JobPlan
-from beam_warp.materials.steps.result import draw_overview, relightable_sequence, run_report
-from beam_warp.materials.steps.roughness_finder import RoughnessFinder
-from beam_warp.materials.steps.solve import solve_each, solve_jointly, take
-from beam_warp.materials.steps.source import Source
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 

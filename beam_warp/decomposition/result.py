@@ -9,14 +9,14 @@ import numpy as np
 
 from beam_warp._version import __version__
 from beam_warp.capture.findings import Finding
+from beam_warp.decomposition.measure import FrameMeasurement
+from beam_warp.decomposition.options import ESTIMATE, OverviewOptions
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.solve import SolvedFrames
+from beam_warp.decomposition.tally import warnings_about
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.options import ESTIMATE, OverviewOptions
-from beam_warp.materials.steps.measure import FrameMeasurement
-from beam_warp.materials.steps.plan import JobPlan
-from beam_warp.materials.steps.solve import SolvedFrames
-from beam_warp.materials.steps.tally import warnings_about
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from beam_warp.decomposition.archive import FrameArchive, MeasuredFrame
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.tally import MaterialTally
 from beam_warp.materials.base_color import BaseColor, solve_base_color
 from beam_warp.materials.changes import ChangeTest, with_changes
 from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.steps.archive import FrameArchive, MeasuredFrame
-from beam_warp.materials.steps.plan import JobPlan
-from beam_warp.materials.steps.tally import MaterialTally
 from beam_warp.world.gaussians import GaussianCloud
 
 
@@ -23,7 +23,7 @@ class SolvedFrames:
         archive: Where their measurements and solutions are.
         has_solutions: Whether base colour was solved; on the image path it was measured with everything else.
         is_varying: Whether frames have base colours of their own.
-        statistics: See `beam_warp.materials.steps.tally.MaterialTally.summary`.
+        statistics: See `beam_warp.decomposition.tally.MaterialTally.summary`.
     """
 
     archive: FrameArchive

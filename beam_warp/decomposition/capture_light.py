@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from beam_warp.capture.findings import Finding
+from beam_warp.decomposition.options import ESTIMATE, RunOptions
+from beam_warp.decomposition.seen import SeenFrame
+from beam_warp.decomposition.source import Source
 from beam_warp.digests import array_digest
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import kept_frame
@@ -18,10 +21,7 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.agreement import judge_clipping, judge_environment, match_silhouettes, require_match
 from beam_warp.materials.exposure import estimate_exposure
 from beam_warp.materials.light import check_light
-from beam_warp.materials.options import ESTIMATE, RunOptions
 from beam_warp.materials.roughness_source import stated_roughness
-from beam_warp.materials.steps.seen import SeenFrame
-from beam_warp.materials.steps.source import Source
 from beam_warp.world.environment import EnvironmentMap
 
 EXPOSURE_ROUGHNESS = 0.5

@@ -12,15 +12,15 @@ from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, RunOptions, read, run, validate
 from beam_warp.capture.capture import Capture
+from beam_warp.decomposition.capture_images import CaptureImages
+from beam_warp.decomposition.job import OverviewOptions
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
-from beam_warp.materials.job import OverviewOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.materials.steps.capture_images import CaptureImages
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
 from beam_warp.world.camera import Camera

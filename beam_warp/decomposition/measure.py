@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.decomposition.archive import MeasuredFrame
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.roughness_finder import RoughnessFinder
+from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.digests import array_digest
 from beam_warp.materials.direct import ColorEvidence, measure_materials
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
-from beam_warp.materials.steps.archive import MeasuredFrame
-from beam_warp.materials.steps.plan import JobPlan
-from beam_warp.materials.steps.roughness_finder import RoughnessFinder
-from beam_warp.materials.steps.seen import SeenFrame
 from beam_warp.world.gaussians import Observability
 
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
