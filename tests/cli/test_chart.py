@@ -127,7 +127,8 @@ MATERIALS = (
 
 def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 500})
-    assert beam("chart", "materials", "--capture", tiny_capture.folder, "--out", tmp_path, *MATERIALS, "--json") == 0
+    words = ("--capture", tiny_capture.folder, "--out", tmp_path, "--budget-seconds", 3600)
+    assert beam("chart", "materials", *words, *MATERIALS, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["measured"] == report["planned"] == 6  # auto and 0.02 m directly, 0.02 m by images
     assert set(report["frontier"]) == {"occlusion_error", "color_error"}
