@@ -302,7 +302,7 @@ class TestWhatIsThere:
         }  # fmt: skip
 
     def test_relighters_are_told_how_to_draw(self, asset, mirror):
-        """Renderers draw as the asset states, with the samples asked for; then each view once under each of its lights."""
+        """Renderers draw as the asset states, with the samples asked for: each view once under each of its lights."""
         told, drawn = [], []
 
         class Black:
