@@ -34,7 +34,7 @@ HIERARCHIES = ("quality", "fast", "refitted")
 """The tree by either build, and one that was built for other places and refitted."""
 
 SCALE_FOR_ZERO = 1e-7
-"""In the truth of an unraised cloud a scale of 0 stands for this part of the smallest one traced."""
+"""Part of the smallest traced scale that stands for a scale of 0 in the truth of an unraised cloud."""
 
 REFERENCE_TOLERANCE = 1e-12
 """The reference against closed forms: both are float64, of products of up to some hundred factors."""
