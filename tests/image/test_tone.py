@@ -111,7 +111,7 @@ class TestNeutral:
         np.testing.assert_allclose(display_linear(row(below), "neutral")[0, 0], expected, atol=FLOAT32)
 
     def test_the_specification_by_hand(self):
-        """Colour (2, 1, 0.5): peak 1.96 becomes p = 1 - 0.0576 / 1.44 = 0.96, and g = 1 - 1 / 1.15 of white is mixed in."""
+        """(2, 1, 0.5) has the peak 1.96, so p = 1 - 0.0576 / 1.44 = 0.96, and g = 1 - 1 / 1.15 of white is mixed in."""
         scaled = np.array([1.96, 0.96, 0.46]) * 0.96 / 1.96
         white = 1.0 - 1.0 / (0.15 * (1.96 - 0.96) + 1.0)
         shown = display_linear(row((2.0, 1.0, 0.5)), "neutral")[0, 0]
