@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -156,7 +157,7 @@ def mean_scores(scores: Mapping[str, list[Score]]) -> dict[str, dict[str, float]
     }
 
 
-def block_means(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+def block_means(image: NDArray[Any], side: int) -> NDArray[np.floating]:
     """Return the means of blocks of ``side`` x ``side`` samples, ``(H side, W side, ...)`` to ``(H, W, ...)``."""
     height, width = image.shape[0] // side, image.shape[1] // side
     return image.reshape(height, side, width, side, *image.shape[2:]).mean(axis=(1, 3)) if side > 1 else image

@@ -356,7 +356,7 @@ def _cut(changes: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(changes, -LARGEST_CHANGE, LARGEST_CHANGE)
 
 
-def _spreads(observed: NDArray[np.float32], irradiance: NDArray[np.float32]) -> NDArray[np.float64]:
+def _spreads(observed: NDArray[np.float32], irradiance: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the spread of the logarithm of base colour under each light, ``(lights,)``."""
     least = np.maximum(LEAST_LIGHT * np.median(irradiance, axis=0), 1e-12)
     base = np.log(observed.astype(np.float64))[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))

@@ -106,9 +106,10 @@ def depth_consistency(images: DepthImages, *, tolerance: float = TOLERANCE) -> D
     found = [wp.empty(total, dtype=dtype, device=images.device) for dtype in (int, int, float)]
     for index, camera in enumerate(images.cameras):
         pixel_count = camera.width * camera.height
-        launch_compare_depths(index, pixel_count, images.views, images.pixels, tolerance, *found, images.device)
+        launch_compare_depths(index, pixel_count, images.views, images.pixels, tolerance, *found, device=images.device)
     parts = itertools.starmap(slice, itertools.pairwise(images.first_pixels))
-    return DepthConsistency(*found, tuple(_summary(*(array[part].numpy() for array in found)) for part in parts))
+    views = tuple(_summary(*(array[part].numpy() for array in found)) for part in parts)
+    return DepthConsistency(*found, views=views)
 
 
 def _summary(

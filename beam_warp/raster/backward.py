@@ -39,7 +39,7 @@ class BackwardBuffers:
             self._splats = zero_splats(splat_count)
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
             geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
-            self.gaussians = GaussianGradients(*geometry, self._blocks.values if drawn.channels.values else None)
+            self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
         self._tracked = _with_gradients(drawn.splats, self._splats)
 
     def begin(self, gaussians: GaussianArrays) -> None:

@@ -105,4 +105,4 @@ def host_images(view: ViewImages, channel_count: int) -> ValueImages:
     passes = [image.numpy() for image in view.channels]
     values = passes[0] if len(passes) == 1 else np.concatenate(passes, axis=-1)
     flat = (view.alpha, view.depth, view.median_depth, view.gaussian_ids)
-    return ValueImages(*(image.numpy() for image in flat), values[..., :channel_count])
+    return ValueImages(*(image.numpy() for image in flat), values=values[..., :channel_count])

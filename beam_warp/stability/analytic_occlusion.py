@@ -232,10 +232,10 @@ def tile(points: ArrayLike, normals: ArrayLike, spacing: float) -> GaussianCloud
     half[n[:, 2] < -1.0 + 1e-9] = (1.0, 0.0, 0.0, 0.0)
     width = OVERLAP * spacing
     return GaussianCloud(
-        positions=at,
+        positions=at.astype(np.float32),
         orientations=half / np.linalg.norm(half, axis=1, keepdims=True),
         scales=np.tile([width, width, width * FLATNESS], (len(at), 1)),
-        opacities=np.ones(len(at)),
+        opacities=np.ones(len(at), np.float32),
     )
 
 

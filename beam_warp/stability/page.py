@@ -191,7 +191,8 @@ def read_result(path: Path) -> StabilityResult:
     """
     try:
         record = {"captures": [], "materials": [], "relighting": [], **json.loads(path.read_text(encoding="utf-8"))}
-        return StabilityResult(**{name: tuple(map(kind.from_dict, record[name])) for name, kind in KINDS.items()})
+        parts: dict[str, Any] = {name: tuple(map(kind.from_dict, record[name])) for name, kind in KINDS.items()}
+        return StabilityResult(**parts)
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
     except (ValueError, KeyError, TypeError) as error:
