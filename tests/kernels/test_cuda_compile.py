@@ -37,7 +37,6 @@ TRACING = {
 COMPOSITES = ((4, False), (16, True))
 
 RASTER = {
-    "raster.composite": ("composite_kernel", COMPOSITES),
     "raster.composite_cuda": ("composite_cuda_kernel", COMPOSITES),
     "raster.composite_adjoint_cuda": ("composite_adjoint_cuda_kernel", COMPOSITES),
     "raster.back_projection_cuda": ("back_project_cuda_kernel", ((4,), (8,), (12,), (16,))),
