@@ -260,7 +260,7 @@ def made():
 
 BAD_OPTIONS = {
     "occlusion_samples": 0, "light_samples": 3, "offset": np.nan, "denoiser": "blur", "diffuse_weight": "half",
-    "surface_depth": "nearest", "solver": "lu", "temporal": -1.0,
+    "surface_depth": "nearest", "solver": "lu", "temporal": -1.0, "seed": -1,
 }  # fmt: skip
 
 
