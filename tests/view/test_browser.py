@@ -4,6 +4,7 @@ import os
 import shutil
 import time
 from io import BytesIO
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -94,9 +95,10 @@ def screen(page):
 
 
 def ours(viewer, client):
-    """What the page of a client is to show, drawn here and now."""
-    viewpoint, _ = viewer._loop._schedule.seen(client)
-    return viewer._painter.draw(viewer.state, viewpoint.camera(1.0, 4096)).pixels[:, SEEN].astype(int)
+    """What the page of a client is to show, drawn now, in the one thread that may draw."""
+    drawn = SimpleQueue()
+    viewer._loop.export(client, drawn.put)
+    return drawn.get(timeout=PATIENCE).pixels[:, SEEN].astype(int)
 
 
 def newest(viewer):

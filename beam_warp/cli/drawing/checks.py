@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from beam_warp.checks import require_range
-from beam_warp.cli.render_flags import Render, StillCameraFlags
+from beam_warp.cli.drawing.flags import Render, StillCameraFlags
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.stage.output import IMAGE_SUFFIXES, Film, FramePattern, Target, parse_target, require_folder
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
-from beam_warp.cli.render_flags import StillCameraFlags
+from beam_warp.cli.drawing.flags import StillCameraFlags
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.store import make_folders
 from beam_warp.world.camera import MAX_SIDE, Camera

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count, require_number
-from beam_warp.cli.render_flags import LightFlags, Render
-from beam_warp.cli.render_views import DEFAULT_FOV, still_camera
+from beam_warp.cli.drawing.flags import LightFlags, Render
+from beam_warp.cli.drawing.views import DEFAULT_FOV, still_camera
 from beam_warp.errors import InvalidOptionError
 from beam_warp.stage.camera_paths import CameraPath, FixedCamera, OrbitPath, read_camera_path
 from beam_warp.stage.environments import StageEnvironment
