@@ -101,5 +101,6 @@ def _with_gradients(splats: Splats, gradients: Splats) -> Splats:
     for name in ("centers", "shapes", "slopes", "bends", "normals"):
         array = getattr(splats, name)
         array.grad = getattr(gradients, name)
+        array.retain_grad = True  # the next frame begins it anew: the adjoint need not clear it
         setattr(tracked, name, array)
     return tracked
