@@ -37,7 +37,7 @@ def figures(result: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, flo
 
 
 def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the rows that both have: each tree's medians and whole range, the ratio of medians, and if ranges are apart."""
+    """Return the figures of both trees, run by run and their whole range, with the ratio of medians."""
     trees = []
     for results in (before, after):
         found = defaultdict(list)

@@ -309,7 +309,7 @@ class _BlendedImages:
         ends = pairwise(group.rasterizer.first_pixels)
         for (start, end), target, weights in zip(ends, targets, group.weights, strict=True):
             part = pixels[start:end]
-            launch_weigh_pixels(part, target, weights, part, self.device)
+            launch_weigh_pixels(part.size, part, target, weights, part, self.device)
         group.rasterizer.back_project(pixels, group.rows)
         group.rasterizer.sum_views(group.rows, self._summed)
         launch_add_rows(self._summed, out, self.device)
@@ -318,7 +318,7 @@ class _BlendedImages:
         """Write A values to ``out``, A = W' M W + ridge + temporal."""
         out.zero_()
         self.apply_pixels(values, out)
-        launch_add_pull(values, self._nothing, self.strength, 1.0, out, self.device)
+        launch_add_pull(values.size, values, self._nothing, self.strength, 1.0, out, self.device)
 
     def add_gradient(self, group: _Group, values: wp.array, out: wp.array) -> None:
         """Add what the pixels of a group say to half of the objective's gradient."""
@@ -326,7 +326,7 @@ class _BlendedImages:
 
     def add_pulls(self, values: wp.array, scale: float, out: wp.array) -> None:
         """Add ``scale`` times what the pulls are to half of the objective's gradient."""
-        launch_add_pull(values, self._anchors, self.strength, scale, out, self.device)
+        launch_add_pull(values.size, values, self._anchors, self.strength, scale, out, self.device)
 
 
 def _groups(cameras: Sequence[Camera], gaussian_count: int, alone: bool) -> list[range]:
@@ -402,5 +402,5 @@ def _solve_by_adam(images: _BlendedImages, values: wp.array) -> tuple[float, NDA
         images.add_gradient(images.groups[place], values, gradients)
         images.add_pulls(values, share, gradients)
         adam.step()
-        launch_clamp_rows(options.low, options.high, values, device)
+        launch_clamp_rows(values.size, options.low, options.high, values, device)
     return options.steps * share, np.zeros((0, images.width), np.float32)

@@ -79,7 +79,7 @@ def reduced_target(target: BakeTarget, factor: int, device: Any) -> BakeTarget:
     width, height = -(-camera.width // factor), -(-camera.height // factor)
     columns = target.targets.shape[2]
     means, sums = (wp.empty((height, width, columns), dtype=float, device=device) for _ in range(2))
-    launch_reduce_targets(target.targets, target.weights, factor, means, sums, device)
+    launch_reduce_targets(means.size, target.targets, target.weights, factor, means, sums, device)
     whole = camera.cropped(0, 0, width * factor, height * factor)
     return BakeTarget(whole.reduced(factor), means, sums)
 

@@ -301,6 +301,7 @@ def lit_points(
         observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
         observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
         launch_sample_radiance(
+            len(at),
             upload(radiance, wp.vec3, device),
             at,
             int(cloud.radiance_color_space == DISPLAY_SRGB),
@@ -388,7 +389,7 @@ def light_batches(
                 max(options.sample_count // BOUNCE_PART, 2),
                 measured.light.bounce,
             )
-        launch_gather_light(batch, found, options.ratio, measured.light, device)
+        launch_gather_light(len(batch.rows), batch, found, int(options.ratio), measured.light, device)
         launch_view_residues(
             batch,
             found,

@@ -149,11 +149,12 @@ def view_evidence(
         views = ViewLayout.of(rasterizer.cameras).views
         for view, image_shown in zip(views, shown, strict=True):
             captured = _captured(image_shown, ceiling, target)
-            launch_write_pixels(view, drawn, captured, wp.vec3(*origin), pixels, target)
+            launch_write_pixels(view.width * view.height, view, drawn, captured, wp.vec3(*origin), pixels, target)
         rasterizer.back_project(pixels, rows)
         launch_add_rows(rows, len(part), SURFACE_CHANNELS, sums, target)
         if images is not None:
             launch_observe(
+                len(views) * len(gaussians.positions),
                 rows,
                 gaussians.positions,
                 gaussians.radiance,
@@ -173,6 +174,7 @@ def view_evidence(
     positions, normals = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
     agreement = wp.empty(count, dtype=float, device=target)
     launch_finish_surface(
+        len(gaussians.positions),
         sums,
         gaussians.positions,
         wp.vec3(*origin),

@@ -326,7 +326,7 @@ def _bake_target(
     guards.least_alpha = WHOLE_ALPHA
     guards.least_diffuse = max(UNLIT_PART * light.mean_irradiance / np.pi, float(np.finfo(np.float32).tiny))
     targets, weights = (wp.empty((count, 4), dtype=float, device=device) for _ in range(2))
-    launch_write_bake_targets(pixels, guards, targets, weights, device)
+    launch_write_bake_targets(len(pixels.alpha), pixels, guards, targets, weights, device)
     shape = (view.camera.height, view.camera.width, 4)
     return BakeTarget(view.camera, targets.reshape(shape), weights.reshape(shape))
 

@@ -171,6 +171,7 @@ def estimate_normals(
     direction = wp.empty(count, dtype=wp.vec3, device=device)
     planarity = wp.empty(count, dtype=float, device=device)
     launch_thinnest_direction(
+        len(cloud),
         upload(cloud.positions, wp.vec3, device),
         upload(cloud.orientations, wp.quat, device),
         upload(cloud.scales, wp.vec3, device),
@@ -193,7 +194,7 @@ def estimate_normals(
     agreement = wp.empty(count, dtype=float, device=device)
     weight, sides = upload(certainty * cloud.opacities, float, device), upload(openness, float, device)
     for _ in range(SMOOTHING_PASSES):
-        launch_consult_neighbors(current, weight, sides, neighbors, following, agreement, device)
+        launch_consult_neighbors(len(current), current, weight, sides, neighbors, following, agreement, device)
         current, following = following, current
     confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement.numpy(), 0.0, 1.0)
     return SurfaceNormals(current.numpy(), confidence.astype(np.float32), from_shape)

@@ -108,7 +108,7 @@ def view_surfaces(
     images.channels = drawn.channels[0]
     pixel_count = len(images.alpha)
     marks, ends = (wp.empty(pixel_count, dtype=int, device=device) for _ in range(2))
-    launch_mark_surfaces(images, LEAST_ALPHA, marks, device)
+    launch_mark_surfaces(len(images.alpha), images, LEAST_ALPHA, marks, device)
     wp.utils.array_scan(marks, ends, inclusive=True)
     found = int(ends[-1:].numpy()[0])
     rows = PixelSurfaces()
@@ -116,7 +116,7 @@ def view_surfaces(
     rows.roughness = wp.empty(found, dtype=float, device=device)
     for name in ("positions", "normals", "to_camera"):
         setattr(rows, name, wp.empty(found, dtype=wp.vec3, device=device))
-    launch_gather_surfaces(images, ViewLayout.of([camera]).views[0], marks, ends, rows, device)
+    launch_gather_surfaces(len(marks), images, ViewLayout.of([camera]).views[0], marks, ends, rows, device)
     return ViewSurfaces(camera, images.alpha, images.depth, rows)
 
 
@@ -178,5 +178,7 @@ def surface_residues(
         visibility = wp.empty(len(rays.origins), dtype=float, device=device)
         trace_rays(scene, EXACT, rays, visibility)
         weighting = DIFFUSE_WEIGHTS[diffuse_weight]
-        launch_reduce_residues(batch, rows, rays.directions, weights, visibility, table, weighting, residues, device)
+        launch_reduce_residues(
+            len(batch.rows), batch, rows, rays.directions, weights, visibility, table, int(weighting), residues, device
+        )
     return residues

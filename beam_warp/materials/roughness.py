@@ -213,8 +213,9 @@ def measure_roughness_profile(
     bounced = mean_radiance(cloud, views) if options.bounce else None
     for batch, rays in light_batches(scene, points, light, measured, options, bounced, frame, report):
         shares = wp.empty((len(batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
-        launch_lobe_shares(batch, rays, measured.light, normals, observed, shares, device)
-        launch_profile(batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
+        launch_lobe_shares(shares.size, batch, rays, measured.light, normals, observed, shares, device)
+        items = len(batch.rows) * int(PARTS) * len(CANDIDATES)
+        launch_profile(items, batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
     misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
     counted = np.zeros(count, np.float32)
     misfit[:, shown], counted[shown] = fit.misfit.numpy(), fit.views.numpy()

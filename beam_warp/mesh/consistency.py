@@ -62,7 +62,7 @@ class DepthConsistency:
         """
         require_count("confirmations", confirmations, 0)
         flags = wp.empty(len(self.confirmed), dtype=int, device=self.confirmed.device)
-        launch_flag_agreed(self.confirmed, self.contradicted, confirmations, flags, flags.device)
+        launch_flag_agreed(len(flags), self.confirmed, self.contradicted, confirmations, flags, flags.device)
         return flags
 
     def as_dict(self) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class DepthImages:
         launch_write_depth_pixels(depth, alpha, normals, self._views[index], MINIMUM_ALPHA, self.pixels, self.device)
         if len(self.colors):
             rows = _rows("color", view.color, shape, self.device)
-            launch_write_pixel_colors(rows, alpha, self.first_pixels[index], self.colors, self.device)
+            launch_write_pixel_colors(len(alpha), rows, alpha, self.first_pixels[index], self.colors, self.device)
 
     @property
     def first_pixels(self) -> tuple[int, ...]:
@@ -164,7 +164,7 @@ class DepthImages:
                 f"mask must be a warp array of {len(self.pixels)} int32 on {self.device}, got "
                 f"{type(mask).__name__} of shape {mask.shape}. Pass one number a pixel, of all views."
             )
-        launch_drop_pixels(mask, self.pixels, self.device)
+        launch_drop_pixels(len(self.pixels), mask, self.pixels, self.device)
 
     def footprint(self) -> float:
         """Return the median width of a pixel at the surface that it shows [m].

@@ -115,7 +115,7 @@ class SurfaceTree:
         require_finite("points", given)
         faces = wp.zeros(len(given), dtype=int, device=self.device)
         weights = wp.zeros(len(given), dtype=wp.vec3, device=self.device)
-        launch_find_closest_points(self._mesh.id, self._local(given), faces, weights)
+        launch_find_closest_points(len(given), self._mesh.id, self._local(given), faces, weights, self.device)
         found, shares = faces.numpy(), weights.numpy().astype(np.float64)
         at = self.at(found, shares)
         return ClosestPoints(at, found, shares, np.linalg.norm(at - given, axis=1))
@@ -163,9 +163,8 @@ class SurfaceTree:
             setattr(struct, name, upload(np.asarray(rows, np.float32), dtype, self.device))
         seen = wp.zeros(len(faces), dtype=wp.uint8, device=self.device)
         normals = upload(self.normals(faces).astype(np.float32), wp.vec3, self.device)
-        launch_find_seen_points(
-            self._mesh.id, struct, least_cosine, self._local(self.at(faces, weights)), normals, seen
-        )
+        points = self._local(self.at(faces, weights))
+        launch_find_seen_points(len(seen), self._mesh.id, struct, least_cosine, points, normals, seen, self.device)
         return seen.numpy().astype(bool)
 
     def _local(self, points: NDArray[np.float64]) -> wp.array:

@@ -121,7 +121,7 @@ def _find_blocks(images: DepthImages, voxel: float) -> wp.array:
             "Choose a larger one, or mask far depths."
         )
     spread = wp.empty(8 * len(lowest), dtype=wp.int64)
-    launch_spread_keys(lowest, spread, images.device)
+    launch_spread_keys(8 * len(lowest), lowest, spread, images.device)
     return _unique(spread)
 
 
@@ -166,9 +166,9 @@ def _extract(images: DepthImages, keys: wp.array, voxel: float) -> tuple[NDArray
     launch_integrate(keys, images.views, images.pixels, voxel, distances, weights, device)
     del weights
     neighbors = wp.empty(8 * len(keys), dtype=int)
-    launch_find_neighbors(keys, neighbors, device)
+    launch_find_neighbors(8 * len(keys), keys, neighbors, device)
     flags, ends = wp.empty(voxel_count, dtype=int), wp.empty(voxel_count, dtype=int)
-    launch_flag_cells(neighbors, distances, flags, device)
+    launch_flag_cells(len(flags), neighbors, distances, flags, device)
     wp.utils.array_scan(flags, ends, inclusive=True)
     cell_count = int(ends[-1:].numpy()[0])
     if not cell_count:

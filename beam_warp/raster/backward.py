@@ -68,7 +68,7 @@ class BackwardBuffers:
             arguments = (drawn.frame, rows.vectors, drawn.exact, drawn.drawn, adjoint.vectors, upstream)
             differentiate(*arguments, pairs.vectors, drawn.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
-            launch_sum_pairs(pairs.matrix, drawn.order, sums, drawn.device)
+            launch_sum_pairs(sums.size, pairs.matrix, drawn.order, sums, drawn.device)
 
     def resolve(self, gaussians: GaussianArrays) -> GaussianGradients:
         """Turn sums over pairs into the gradients of Gaussians."""
@@ -92,7 +92,7 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
     back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu
     pairs = drawn.pair_rows(pixels.shape[1])
     back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)
-    launch_sum_pairs(pairs.matrix, drawn.order, out, drawn.device)
+    launch_sum_pairs(out.size, pairs.matrix, drawn.order, out, drawn.device)
 
 
 def _with_gradients(splats: Splats, gradients: Splats) -> Splats:

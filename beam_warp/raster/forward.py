@@ -45,7 +45,7 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
     if buffers.channels.values:
         buffers.blocks.values = gaussians.values
     gather_channels(buffers)
-    launch_key_splats(buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
+    launch_key_splats(len(buffers.splats.centers), buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
     if buffers.splat_count:
         wp.utils.radix_sort_pairs(buffers.keys, buffers.order.splats, buffers.splat_count)
 

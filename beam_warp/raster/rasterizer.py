@@ -259,7 +259,7 @@ class Rasterizer:
         """
         require_matrix("rows", rows, self._buffers.splat_count, (), self.device)
         require_matrix("out", out, self._count, (rows.shape[1],), self.device)
-        launch_sum_views(rows, out, self.device)
+        launch_sum_views(out.shape[0] * out.shape[1], rows, out, self.device)
 
     def _composite(self) -> None:
         """Draw the band that was listed last."""

@@ -252,7 +252,7 @@ class _Cones:
     def judge(self, lower: NDArray[np.float64], size: float, count: NDArray[Any]) -> NDArray[np.int32]:
         """Return the states of a grid of blocks."""
         states = wp.empty(int(np.prod(count)), dtype=int, device=self.device)
-        launch_judge_blocks(_grid(lower, size, count), self.silhouettes, states, self.device)
+        launch_judge_blocks(len(states), _grid(lower, size, count), self.silhouettes, states, self.device)
         return states.numpy().reshape(count)
 
     def carve(self, lower: NDArray[np.float64], voxel: float, count: NDArray[Any]) -> trimesh.Trimesh:
@@ -270,14 +270,14 @@ class _Cones:
         grid = _grid(lower, voxel, count)
         launch_fill_blocks(subscripts, grid, self.silhouettes, depths, device)
         crossed = wp.empty(len(blocks) * BLOCK_CELLS, dtype=int, device=device)
-        launch_find_cells(depths, crossed, device)
+        launch_find_cells(len(crossed), depths, crossed, device)
         wp.utils.array_scan(crossed, crossed, inclusive=True)
         cell_count = int(crossed[-1:].numpy()[0])
         if cell_count == 0:
             return trimesh.Trimesh()
         cells = wp.empty(cell_count, dtype=wp.vec3i, device=device)
         corners = wp.empty((cell_count, 8), dtype=float, device=device)
-        launch_gather_cells(subscripts, depths, crossed, cells, corners, device)
+        launch_gather_cells(len(crossed), subscripts, depths, crossed, cells, corners, device)
         vertices, faces = sparse_marching_cubes_from_cells(cells, corners, grid.origin, voxel, device=device)
         # Depth grows inwards, so Warp's faces, which turn towards larger values, turn in.
         return trimesh.Trimesh(vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1], process=False)

@@ -237,7 +237,7 @@ def seen_colors(
     samples = view_samples(views, cloud, normals, device=device)
     colors = wp.empty(count, dtype=wp.vec3, device=target)
     seen = wp.empty(count, dtype=int, device=target)
-    launch_agree_colors(samples, colors, seen, target)
+    launch_agree_colors(len(colors), samples, colors, seen, target)
     result, known = colors.numpy(), seen.numpy() > 0
     if not known.any():
         return np.full((count, 3), 0.5, np.float32)

@@ -100,7 +100,7 @@ class GaussianParameters:
 
     def activate(self) -> None:
         """Bring the drawn scales and opacities up to date."""
-        launch_activate(self._shapes, self.drawn.scales, self.drawn.opacities, self.device)
+        launch_activate(self.drawn.scales.size, self._shapes, self.drawn.scales, self.drawn.opacities, self.device)
 
     def zero_gradients(self) -> None:
         """Begin a new sum of gradients."""

@@ -228,7 +228,7 @@ class ViewTargets:
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
         launch_average(self._color, self._samples, True, self._encoded, self.device)
-        launch_square_error(self._encoded, self._colors[index], self._errors, self.device)
+        launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
         return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
 

@@ -202,7 +202,13 @@ class ArrivingLight:
         launch_light_gaussians(gaussians, self.scene_light(), self._arriving, self._lit, self._device)
         radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
-            gaussians.positions, self._arriving, self._clusters, radiosity, gaussians.values, self._device
+            len(gaussians.positions),
+            gaussians.positions,
+            self._arriving,
+            self._clusters,
+            radiosity,
+            gaussians.values,
+            self._device,
         )
 
     def _bounced(self, gaussians: GaussianArrays) -> wp.array:

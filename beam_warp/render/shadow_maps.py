@@ -288,7 +288,9 @@ class ShadowDrawer:
     def _cast(self) -> None:
         """Find the triangles that maps see."""
         if self._mesh is not None:
-            launch_cast_mesh(self._mesh, self.maps.views, self._texels_of_view, self._mesh_depth, self._device)
+            launch_cast_mesh(
+                len(self._mesh_depth), self._mesh, self.maps.views, self._texels_of_view, self._mesh_depth, self._device
+            )
 
     def _gather(self, rasterizer: Rasterizer, group: range) -> None:
         """Make texels of what was drawn."""

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.checks import require_choice
 from beam_warp.device.arrays import device_label, resolve_device
 from beam_warp.errors import BeamError, InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize
@@ -212,10 +213,7 @@ class CloudPainter:
         """Return a light: the same object as long as it is kept, so that renderers know it again."""
         if name == NO_ENVIRONMENT:
             return None
-        if name not in self._environments:
-            raise InvalidOptionError(
-                f"environment must be one of {', '.join(self._environments)}, got {name!r}. Choose one of them."
-            )
+        require_choice("environment", name, tuple(self._environments))
         if name not in self._lights:
             self._lights[name] = self._environments[name]()
             if len(self._lights) > CACHED_LIGHTS:

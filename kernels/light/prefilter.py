@@ -86,10 +86,5 @@ def launch_prefilter_environment(
     width = 2.0 * alpha
     largest = 0.04 / alpha
     smallest = min((opening * width) ** 2, largest)
-    launch(
-        prefilter_environment_kernel,
-        2 * height * height,
-        inputs=[tree, alpha, opening * opening / width, smallest, largest, height, offset],
-        outputs=[out_texels],
-        device=device,
-    )
+    inputs = [tree, alpha, opening * opening / width, smallest, largest, height, offset]
+    launch(prefilter_environment_kernel, 2 * height * height, inputs=inputs, outputs=[out_texels], device=device)

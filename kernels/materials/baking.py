@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,14 +65,12 @@ def clamp_rows_kernel(first: int, low: float, high: float, out_rows: wp.array2d[
     out_rows[row, c] = wp.clamp(out_rows[row, c], low, high)
 
 
-def launch_weigh_pixels(drawn, targets, weights, out_pixels, device):
-    """Multiply the differences of images and their targets by weights."""
-    launch(weigh_pixels_kernel, drawn.size, inputs=[drawn, targets, weights], outputs=[out_pixels], device=device)
+launch_weigh_pixels = launcher(weigh_pixels_kernel)
+"""Multiply the differences of images and their targets by weights."""
 
 
-def launch_add_pull(values, anchors, strength, scale, out_sums, device):
-    """Add the gradient of half of strength times the squared distance from the anchors."""
-    launch(add_pull_kernel, values.size, inputs=[values, anchors, strength, scale], outputs=[out_sums], device=device)
+launch_add_pull = launcher(add_pull_kernel)
+"""Add the gradient of half of strength times the squared distance from the anchors."""
 
 
 def launch_add_rows(rows, out_sums, device):
@@ -80,6 +78,5 @@ def launch_add_rows(rows, out_sums, device):
     launch(add_rows_kernel, rows.size, inputs=[rows], outputs=[out_sums], device=device)
 
 
-def launch_clamp_rows(low, high, out_rows, device):
-    """Cut rows to bounds."""
-    launch(clamp_rows_kernel, out_rows.size, inputs=[low, high], outputs=[out_rows], device=device)
+launch_clamp_rows = launcher(clamp_rows_kernel)
+"""Cut rows to bounds."""

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,12 +53,5 @@ def write_bake_targets_kernel(
     out_weights[pixel, 3] = wp.where(drawn, 1.0, 0.0)
 
 
-def launch_write_bake_targets(pixels, guards, out_targets, out_weights, device):
-    """Write every pixel's targets and weights, ``(P, 4)`` each."""
-    launch(
-        write_bake_targets_kernel,
-        len(pixels.alpha),
-        inputs=[pixels, guards],
-        outputs=[out_targets, out_weights],
-        device=device,
-    )
+launch_write_bake_targets = launcher(write_bake_targets_kernel)
+"""Write every pixel's targets and weights, ``(P, 4)`` each."""

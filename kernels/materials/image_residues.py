@@ -8,7 +8,7 @@ that none alone can make a sample weigh much.
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.sampling import (
     SampleSet,
     draw_square,
@@ -180,15 +180,5 @@ def launch_draw_residue_rays(
     )
 
 
-def launch_reduce_residues(
-    batch, surfaces, directions, weights, visibility, albedo_table, diffuse_weight, out_residues, device
-):
-    """Add up each point's samples, in its own row."""
-    launch(
-        reduce_residues_kernel,
-        len(batch.rows),
-        inputs=[batch, surfaces, directions, weights, visibility, albedo_table, int(diffuse_weight)],
-        outputs=[out_residues],
-        device=device,
-        block_dim=64,
-    )
+launch_reduce_residues = launcher(reduce_residues_kernel, block_dim=64)
+"""Add up each point's samples, in its own row."""

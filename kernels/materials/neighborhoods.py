@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -135,36 +135,15 @@ def reach_above_kernel(
     out_reach[i] = reach
 
 
-def launch_thinnest_direction(
-    positions, orientations, scales, opacities, neighbors, out_direction, out_planarity, device
-):
-    """Analyse every Gaussian's neighbourhood: in ``neighbors``, column 0 is the Gaussian itself."""
-    launch(
-        thinnest_direction_kernel,
-        len(positions),
-        inputs=[positions, orientations, scales, opacities, neighbors],
-        outputs=[out_direction, out_planarity],
-        device=device,
-    )
+launch_thinnest_direction = launcher(thinnest_direction_kernel)
+"""Analyse every Gaussian's neighbourhood: in ``neighbors``, column 0 is the Gaussian itself."""
 
 
-def launch_consult_neighbors(normals, certainty, openness, neighbors, out_normals, out_agreement, device):
-    """Do one pass of smoothing."""
-    launch(
-        consult_neighbors_kernel,
-        len(normals),
-        inputs=[normals, certainty, openness, neighbors],
-        outputs=[out_normals, out_agreement],
-        device=device,
-    )
+launch_consult_neighbors = launcher(consult_neighbors_kernel)
+"""Do one pass of smoothing."""
 
 
 def launch_reach_above(points, normals, gaussians, weights, neighbors, out_reach, device):
     """Measure how far neighbours reach above points; ``gaussians`` are centres, orientations and scales."""
-    launch(
-        reach_above_kernel,
-        len(points),
-        inputs=[points, normals, *gaussians, weights, neighbors],
-        outputs=[out_reach],
-        device=device,
-    )
+    inputs = [points, normals, *gaussians, weights, neighbors]
+    launch(reach_above_kernel, len(points), inputs=inputs, outputs=[out_reach], device=device)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
@@ -98,16 +98,12 @@ def scatter_vectors_kernel(first: int, pixels: wp.array[int], values: wp.array[w
     out_image[pixels[row]] = values[row]
 
 
-def launch_mark_surfaces(images, least_alpha, out_marks, device):
-    """Find the pixels that show a surface."""
-    launch(mark_surfaces_kernel, len(images.alpha), inputs=[images, least_alpha], outputs=[out_marks], device=device)
+launch_mark_surfaces = launcher(mark_surfaces_kernel)
+"""Find the pixels that show a surface."""
 
 
-def launch_gather_surfaces(images, view, marks, ends, out_surfaces, device):
-    """Write the point of every marked pixel to its row; ``ends`` are the inclusive sums of ``marks``."""
-    launch(
-        gather_surfaces_kernel, len(marks), inputs=[images, view, marks, ends], outputs=[out_surfaces], device=device
-    )
+launch_gather_surfaces = launcher(gather_surfaces_kernel)
+"""Write the point of every marked pixel to its row; ``ends`` are the inclusive sums of ``marks``."""
 
 
 def launch_scatter(pixels, values, out_image, device):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,12 +37,5 @@ def reduce_targets_kernel(
     out_weights[y, x, column] = weight_sum
 
 
-def launch_reduce_targets(targets, weights, factor, out_targets, out_weights, device):
-    """Reduce ``(H, W, K)`` targets and weights to ``(ceil(H / factor), ceil(W / factor), K)``."""
-    launch(
-        reduce_targets_kernel,
-        out_targets.size,
-        inputs=[targets, weights, factor],
-        outputs=[out_targets, out_weights],
-        device=device,
-    )
+launch_reduce_targets = launcher(reduce_targets_kernel)
+"""Reduce ``(H, W, K)`` targets and weights to ``(ceil(H / factor), ceil(W / factor), K)``."""

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.sampling import (
     hash_combine,
     owen_sobol_x,
@@ -351,16 +351,8 @@ def launch_trace_bounce(scene, settings, batch, gaussian_radiance, stream, sampl
     )
 
 
-def launch_gather_light(batch, rays, ratio, out_light, device):
-    """Add up the light of a batch's rays."""
-    launch(
-        gather_light_kernel,
-        len(batch.rows),
-        inputs=[batch, rays, int(ratio)],
-        outputs=[out_light],
-        device=device,
-        block_dim=64,
-    )
+launch_gather_light = launcher(gather_light_kernel, block_dim=64)
+"""Add up the light of a batch's rays."""
 
 
 def launch_view_residues(batch, rays, light, lobes, surface, diffuse_weight, out_views, device):
@@ -377,23 +369,9 @@ def launch_view_residues(batch, rays, light, lobes, surface, diffuse_weight, out
 
 def launch_fit_color(views, light, surface, robust, out_fit, device):
     """Accumulate the least-squares sums of every point."""
-    launch(
-        fit_color_kernel,
-        len(surface.normals),
-        inputs=[views, light, surface, ROUNDS if robust else 0],
-        outputs=[out_fit],
-        device=device,
-        block_dim=64,
-    )
+    inputs = [views, light, surface, ROUNDS if robust else 0]
+    launch(fit_color_kernel, len(surface.normals), inputs=inputs, outputs=[out_fit], device=device, block_dim=64)
 
 
-def launch_sample_radiance(radiance, gaussians, display_srgb, normals, views, out_colors, out_directions, device):
-    """Take captured spherical harmonics for what views would show."""
-    launch(
-        sample_radiance_kernel,
-        len(normals),
-        inputs=[radiance, gaussians, display_srgb, normals, views],
-        outputs=[out_colors, out_directions],
-        device=device,
-        block_dim=64,
-    )
+launch_sample_radiance = launcher(sample_radiance_kernel, block_dim=64)
+"""Take captured spherical harmonics for what views would show."""

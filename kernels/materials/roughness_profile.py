@@ -8,7 +8,7 @@ are looked up for every candidate.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.light.brdf import (
     ALPHA_FLOOR,
     fresnel_schlick,
@@ -180,28 +180,12 @@ def profile_kernel(
         out_fit.views[row] = weight_sum
 
 
-def launch_lobe_shares(batch, rays, light, normals, views, out_shares, device):
-    """Write the open share of every view's lobe of a batch's points, ``(points, views)`` vec4.
+launch_lobe_shares = launcher(lobe_shares_kernel, block_dim=128)
+"""Write the open share of every view's lobe of a batch's points, ``(points, views)`` vec4.
 
-    Views that count for nothing are left as they are.
-    """
-    launch(
-        lobe_shares_kernel,
-        out_shares.size,
-        inputs=[batch, rays, light, normals, views],
-        outputs=[out_shares],
-        device=device,
-        block_dim=128,
-    )
+Views that count for nothing are left as they are.
+"""
 
 
-def launch_profile(batch, light, lobes, normals, views, shares, candidates, out_fit, device):
-    """Write the misfit of every candidate and part of the views of a batch's points."""
-    launch(
-        profile_kernel,
-        len(batch.rows) * int(PARTS) * len(candidates),
-        inputs=[batch, light, lobes, normals, views, shares, candidates],
-        outputs=[out_fit],
-        device=device,
-        block_dim=128,
-    )
+launch_profile = launcher(profile_kernel, block_dim=128)
+"""Write the misfit of every candidate and part of the views of a batch's points."""

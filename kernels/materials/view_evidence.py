@@ -6,7 +6,7 @@ normal, 6 weight of both; 7 weight of saturated pixels; 8-10 captured colour les
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.spherical_harmonics import captured_radiance, srgb_to_linear
 from beam_warp.kernels.raster.project import RasterView
 
@@ -150,15 +150,8 @@ def finish_surface_kernel(
     out_agreement[i] = agreement
 
 
-def launch_write_pixels(view, drawn, captured, origin, out_pixels, device):
-    """Write what one view's pixels say."""
-    launch(
-        write_pixels_kernel,
-        view.width * view.height,
-        inputs=[view, drawn, captured, origin],
-        outputs=[out_pixels],
-        device=device,
-    )
+launch_write_pixels = launcher(write_pixels_kernel)
+"""Write what one view's pixels say."""
 
 
 def launch_add_rows(rows, view_count, columns, out_sums, device):
@@ -166,23 +159,9 @@ def launch_add_rows(rows, view_count, columns, out_sums, device):
     launch(add_rows_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device)
 
 
-def launch_observe(rows, positions, radiance, display_srgb, views, first_view, out_colors, out_directions, device):
-    """Write what some views show of every Gaussian."""
-    launch(
-        observe_kernel,
-        len(views) * len(positions),
-        inputs=[rows, positions, radiance, display_srgb, views, first_view],
-        outputs=[out_colors, out_directions],
-        device=device,
-    )
+launch_observe = launcher(observe_kernel)
+"""Write what some views show of every Gaussian."""
 
 
-def launch_finish_surface(sums, positions, origin, seen, out_positions, out_normals, out_agreement, device):
-    """Turn sums into a surface."""
-    launch(
-        finish_surface_kernel,
-        len(positions),
-        inputs=[sums, positions, origin, seen],
-        outputs=[out_positions, out_normals, out_agreement],
-        device=device,
-    )
+launch_finish_surface = launcher(finish_surface_kernel)
+"""Turn sums into a surface."""

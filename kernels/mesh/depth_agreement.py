@@ -7,7 +7,7 @@ the image or at an edge, the view says nothing.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.mesh.depth_pixels import (
     DepthCamera,
     footprint,
@@ -81,11 +81,8 @@ def flag_agreed_kernel(
     out_flags[pixel] = wp.where(agreed, 1, 0)
 
 
-def launch_flag_agreed(confirmed, contradicted, confirmations, flags, device):
-    """Flag the pixels that enough views confirm, and no more contradict."""
-    launch(
-        flag_agreed_kernel, len(flags), inputs=[confirmed, contradicted, confirmations], outputs=[flags], device=device
-    )
+launch_flag_agreed = launcher(flag_agreed_kernel)
+"""Flag the pixels that enough views confirm, and no more contradict."""
 
 
 def launch_compare_depths(view, pixel_count, cameras, pixels, tolerance, confirmed, contradicted, residuals, device):

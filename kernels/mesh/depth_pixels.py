@@ -15,7 +15,7 @@ All zeros are background. Inverse depth without weight is a surface that is not 
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -243,13 +243,9 @@ def launch_write_depth_pixels(depth, alpha, normals, camera, minimum_alpha, out_
     launch(write_depth_pixels_kernel, camera.width * camera.height, inputs=inputs, outputs=[out_pixels], device=device)
 
 
-def launch_write_pixel_colors(color, alpha, first_pixel, out_colors, device):
-    """Write the colours of one view among those of all."""
-    launch(
-        write_pixel_colors_kernel, len(alpha), inputs=[color, alpha, first_pixel], outputs=[out_colors], device=device
-    )
+launch_write_pixel_colors = launcher(write_pixel_colors_kernel)
+"""Write the colours of one view among those of all."""
 
 
-def launch_drop_pixels(keep, pixels, device):
-    """Take away the weight of pixels that are not to be kept."""
-    launch(drop_pixels_kernel, len(pixels), inputs=[keep], outputs=[pixels], device=device)
+launch_drop_pixels = launcher(drop_pixels_kernel)
+"""Take away the weight of pixels that are not to be kept."""

@@ -3,7 +3,7 @@
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -74,25 +74,9 @@ def find_seen_points_kernel(
     out_seen[index] = seen
 
 
-def launch_find_closest_points(mesh, points, out_faces, out_weights):
-    """Find the closest point of a mesh for every point."""
-    launch(
-        find_closest_points_kernel,
-        len(points),
-        inputs=[mesh, points],
-        outputs=[out_faces, out_weights],
-        device=points.device,
-        min_chunk=QUERY_CHUNK,
-    )
+launch_find_closest_points = launcher(find_closest_points_kernel, min_chunk=QUERY_CHUNK)
+"""Find the closest point of a mesh for every point."""
 
 
-def launch_find_seen_points(mesh, cameras, least_cosine, points, normals, out_seen):
-    """Find which points of a mesh some camera sees."""
-    launch(
-        find_seen_points_kernel,
-        len(points),
-        inputs=[mesh, cameras, least_cosine, points, normals],
-        outputs=[out_seen],
-        device=points.device,
-        min_chunk=QUERY_CHUNK,
-    )
+launch_find_seen_points = launcher(find_seen_points_kernel, min_chunk=QUERY_CHUNK)
+"""Find which points of a mesh some camera sees."""

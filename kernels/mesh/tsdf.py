@@ -7,7 +7,7 @@ same list. Distances are gathered: a voxel asks all views, in their order.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.mesh.depth_pixels import DepthCamera, is_background, pixel_point, project_point, sample_pixels
 
 wp.set_module_options({"enable_backward": False})
@@ -300,14 +300,12 @@ def launch_keep_keys(keys, flags, ends, count, kept, device):
     launch(keep_keys_kernel, count, inputs=[keys, flags, ends], outputs=[kept], device=device)
 
 
-def launch_spread_keys(keys, spread, device):
-    """Write the eight blocks of every lowest one."""
-    launch(spread_keys_kernel, 8 * len(keys), inputs=[keys], outputs=[spread], device=device)
+launch_spread_keys = launcher(spread_keys_kernel)
+"""Write the eight blocks of every lowest one."""
 
 
-def launch_find_neighbors(keys, neighbors, device):
-    """Find the blocks above every block."""
-    launch(find_neighbors_kernel, 8 * len(keys), inputs=[keys], outputs=[neighbors], device=device)
+launch_find_neighbors = launcher(find_neighbors_kernel)
+"""Find the blocks above every block."""
 
 
 def launch_integrate(keys, cameras, pixels, voxel, distances, weights, device):
@@ -316,9 +314,8 @@ def launch_integrate(keys, cameras, pixels, voxel, distances, weights, device):
     launch(integrate_kernel, VOXELS * len(keys), inputs=inputs, outputs=[distances, weights], device=device)
 
 
-def launch_flag_cells(neighbors, distances, flags, device):
-    """Flag the cells that marching cubes visits."""
-    launch(flag_cells_kernel, len(flags), inputs=[neighbors, distances], outputs=[flags], device=device)
+launch_flag_cells = launcher(flag_cells_kernel)
+"""Flag the cells that marching cubes visits."""
 
 
 def launch_write_cells(keys, neighbors, distances, flags, ends, cells, values, device):

@@ -12,7 +12,7 @@ pass stores its gradient: the slots of a splat lie side by side.
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.project import RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
@@ -190,9 +190,8 @@ def find_ranges_kernel(
         out_ranges[tile][1] = i + 1
 
 
-def launch_key_splats(splats, keys, order, device):
-    """Write every splat's depth key and number."""
-    launch(key_splats_kernel, len(splats.centers), inputs=[splats], outputs=[keys, order], device=device)
+launch_key_splats = launcher(key_splats_kernel)
+"""Write every splat's depth key and number."""
 
 
 def launch_count_pairs(order, splats, views, gaussian_count, band, counts, device):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.raster.bin_tiles import SplatOrder
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS
 from beam_warp.kernels.raster.project import Splats
@@ -67,9 +67,8 @@ def resolve_sums_kernel(
     out_gradients.bends[splat] = out_gradients.bends[splat] + to_bends[2]
 
 
-def launch_sum_pairs(pair_rows, order, out_sums, device):
-    """Add the rows of all pairs to the sums of their splats."""
-    launch(sum_pairs_kernel, out_sums.size, inputs=[pair_rows, order], outputs=[out_sums], device=device)
+launch_sum_pairs = launcher(sum_pairs_kernel)
+"""Add the rows of all pairs to the sums of their splats."""
 
 
 def launch_resolve_sums(sums, splats, channel_count, exact, gradients, device):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,6 +20,5 @@ def sum_views_kernel(first: int, rows: wp.array2d[float], out_sums: wp.array2d[f
     out_sums[gaussian, column] = total
 
 
-def launch_sum_views(rows, sums, device):
-    """Sum ``(V * N, K)`` rows over the views to ``(N, K)``."""
-    launch(sum_views_kernel, sums.shape[0] * sums.shape[1], inputs=[rows], outputs=[sums], device=device)
+launch_sum_views = launcher(sum_views_kernel)
+"""Sum ``(V * N, K)`` rows over the views to ``(N, K)``."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -110,9 +110,8 @@ def add_shape_gradients_kernel(
     out_logits[item] += opacity_gradient * kept * peak * (1.0 - peak)
 
 
-def launch_activate(shapes: Shapes, out_scales: Any, out_opacities: Any, device: Any) -> None:
-    """Write the scales and opacities that are drawn."""
-    launch(activate_kernel, out_scales.size, inputs=[shapes], outputs=[out_scales, out_opacities], device=device)
+launch_activate = launcher(activate_kernel)
+"""Write the scales and opacities that are drawn."""
 
 
 def launch_add_shape_gradients(

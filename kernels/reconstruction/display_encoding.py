@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -91,6 +91,5 @@ def launch_add_sample_gradients(
     launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
 
 
-def launch_square_error(encoded: Any, target: Any, out_errors: Any, device: Any) -> None:
-    """Write each pixel's sum of squared differences of values clipped to [0, 1]."""
-    launch(square_error_kernel, out_errors.size, inputs=[encoded, target], outputs=[out_errors], device=device)
+launch_square_error = launcher(square_error_kernel)
+"""Write each pixel's sum of squared differences of values clipped to [0, 1]."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
 from beam_warp.kernels.raster.project import RasterView
 
@@ -131,9 +131,8 @@ def launch_sample_colors(
     launch(sample_colors_kernel, len(positions), inputs=inputs, outputs=[out_samples], device=device)
 
 
-def launch_agree_colors(samples: Any, out_colors: Any, out_seen: Any, device: Any) -> None:
-    """Write the weighted mean of every point's samples, outliers counted little, and how many there are.
+launch_agree_colors = launcher(agree_colors_kernel)
+"""Write the weighted mean of every point's samples, outliers counted little, and how many there are.
 
-    Source: Cauchy's weights, Holland and Welsch 1977.
-    """
-    launch(agree_colors_kernel, len(out_colors), inputs=[samples], outputs=[out_colors, out_seen], device=device)
+Source: Cauchy's weights, Holland and Welsch 1977.
+"""

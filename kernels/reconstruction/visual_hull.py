@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
 from beam_warp.kernels.raster.project import RasterView
 
@@ -215,9 +215,8 @@ def gather_cells_kernel(
             out_depths[before, corner] = depths[block * BLOCK_POINTS + corner_index(cell, corner)]
 
 
-def launch_judge_blocks(grid: Grid, silhouettes: Silhouettes, out_states: Any, device: Any) -> None:
-    """Write which blocks of a grid are outside, inside, or may hold surface."""
-    launch(judge_blocks_kernel, len(out_states), inputs=[grid, silhouettes], outputs=[out_states], device=device)
+launch_judge_blocks = launcher(judge_blocks_kernel)
+"""Write which blocks of a grid are outside, inside, or may hold surface."""
 
 
 def launch_fill_blocks(blocks: Any, grid: Grid, silhouettes: Silhouettes, out_depths: Any, device: Any) -> None:
@@ -226,13 +225,9 @@ def launch_fill_blocks(blocks: Any, grid: Grid, silhouettes: Silhouettes, out_de
     launch(fill_blocks_kernel, len(out_depths), inputs=inputs, outputs=[out_depths], device=device)
 
 
-def launch_find_cells(depths: Any, out_crossed: Any, device: Any) -> None:
-    """Write 1 for cells that the surface may pass, 0 for others."""
-    launch(find_cells_kernel, len(out_crossed), inputs=[depths], outputs=[out_crossed], device=device)
+launch_find_cells = launcher(find_cells_kernel)
+"""Write 1 for cells that the surface may pass, 0 for others."""
 
 
-def launch_gather_cells(blocks: Any, depths: Any, ends: Any, out_cells: Any, out_depths: Any, device: Any) -> None:
-    """Write the subscripts and corner depths of crossed cells; ``ends`` are inclusive sums of their flags."""
-    launch(
-        gather_cells_kernel, len(ends), inputs=[blocks, depths, ends], outputs=[out_cells, out_depths], device=device
-    )
+launch_gather_cells = launcher(gather_cells_kernel)
+"""Write the subscripts and corner depths of crossed cells; ``ends`` are inclusive sums of their flags."""

@@ -166,14 +166,5 @@ launch_bounce_clusters = launcher(bounce_clusters_kernel, block_dim=32, min_chun
 """Let light bounce once between clusters."""
 
 
-def launch_gather_bounces(positions, arriving, clusters, radiosity, out_values, device):
-    """Write what arrives at Gaussians; without clusters' radiosity (an empty array) from the environment alone."""
-    launch(
-        gather_bounces_kernel,
-        len(positions),
-        inputs=[positions, arriving, clusters, radiosity],
-        outputs=[out_values],
-        device=device,
-        block_dim=128,
-        min_chunk=POINT_CHUNK,
-    )
+launch_gather_bounces = launcher(gather_bounces_kernel, block_dim=128, min_chunk=POINT_CHUNK)
+"""Write what arrives at Gaussians; without clusters' radiosity (an empty array) from the environment alone."""

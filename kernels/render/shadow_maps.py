@@ -13,7 +13,7 @@ texel, so that a kernel of any size leaves a plane unshadowed, and begins a bias
 import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
@@ -267,17 +267,9 @@ def face_towards(away: wp.vec3) -> int:
 
 def launch_gather_texels(images, mesh_depth, out_texels, device):
     """Put what a rasteriser drew, and depths of meshes (none: an empty array), into texels."""
-    launch(
-        gather_texels_kernel,
-        len(out_texels),
-        inputs=[images.alpha, images.median_depth, images.depth, mesh_depth],
-        outputs=[out_texels],
-        device=device,
-    )
+    inputs = [images.alpha, images.median_depth, images.depth, mesh_depth]
+    launch(gather_texels_kernel, len(out_texels), inputs=inputs, outputs=[out_texels], device=device)
 
 
-def launch_cast_mesh(surface, views, texels_of_view, out_depth, device):
-    """Cast a ray through every texel of every view, all of one size."""
-    launch(
-        cast_mesh_kernel, len(out_depth), inputs=[surface, views, texels_of_view], outputs=[out_depth], device=device
-    )
+launch_cast_mesh = launcher(cast_mesh_kernel)
+"""Cast a ray through every texel of every view, all of one size."""

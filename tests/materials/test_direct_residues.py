@@ -80,7 +80,7 @@ class Points:
 
     def gather(self, ratio, unshadowed):
         self.light.unshadowed.assign(np.asarray(unshadowed, np.float32))
-        launch_gather_light(self.batch, self.rays, ratio, self.light, self.device)
+        launch_gather_light(len(self.batch.rows), self.batch, self.rays, int(ratio), self.light, self.device)
         return {name: getattr(self.light, name).numpy().copy() for name in ("arriving", "noise", "tilt")}
 
     def residues(self, sky, views, diffuse_weight=ALBEDO_SCALING, weights=None):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, Demand, RelightStress
+from beam_warp.stability.relighting_cases.cases import DEFERRED, PATH, RENDERERS, Demand, RelightStress
 from beam_warp.stability.relighting_cases.measures import ROUNDING, largest_difference
 from beam_warp.stability.relighting_cases.scenes import RelightStudio, firefly, sun_at, white
 from beam_warp.stability.suite import stability_case
@@ -29,14 +29,7 @@ def broken_rows(studio: RelightStudio) -> RelightStress:
     return RelightStress(
         shots=tuple(Shot(cloud=c, camera=camera, **light) for c in (cloud, kept)),
         noisy=False,
-        demands=(
-            Demand(
-                what="largest difference",
-                measure=lambda drawn: largest_difference(drawn.images[1], drawn.images[0]),
-                high=0.0,
-                because="the same rows, the same bits",
-            ),
-        ),
+        demands=(_same_images(0.0, "the same rows, the same bits"),),
         done=f"{left_out.not_finite} rows left out",
     )
 
@@ -51,19 +44,18 @@ def full_turn(studio: RelightStudio) -> RelightStress:
         ),
         noisy=False,
         demands=(
-            Demand(
-                what="largest difference",
-                measure=lambda drawn: largest_difference(drawn.images[1], drawn.images[0]),
-                high=0.0,
-                because="the sine of 360° is below float32's resolution of 1: same bits",
-                of=(PATH,),
-            ),
-            Demand(
-                what="largest difference",
-                measure=lambda drawn: largest_difference(drawn.images[1], drawn.images[0]),
-                high=ROUNDING,
-                because="a thousand roundings",
-                of=(DEFERRED,),
-            ),
+            _same_images(0.0, "the sine of 360° is below float32's resolution of 1: same bits", of=(PATH,)),
+            _same_images(ROUNDING, "a thousand roundings", of=(DEFERRED,)),
         ),
+    )
+
+
+def _same_images(high: float, because: str, of: tuple[str, ...] = RENDERERS) -> Demand:
+    """Demand that two shots give the same image."""
+    return Demand(
+        what="largest difference",
+        measure=lambda drawn: largest_difference(drawn.images[1], drawn.images[0]),
+        high=high,
+        because=because,
+        of=of,
     )

@@ -24,7 +24,7 @@ def activated(log_scales, logits, filters, device):
     shapes = shapes_of(log_scales, logits, filters, device)
     scales = wp.zeros(len(logits), dtype=wp.vec3, device=device)
     opacities = wp.zeros(len(logits), dtype=float, device=device)
-    launch_activate(shapes, scales, opacities, device)
+    launch_activate(scales.size, shapes, scales, opacities, device)
     return scales.numpy(), opacities.numpy()
 
 
