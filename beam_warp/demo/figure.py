@@ -81,7 +81,7 @@ SKELETON = _skeleton()
 
 def dance(phase: float) -> dict[str, tuple[float, float, float]]:
     """Return the turn of each bone about the rest axes x, y, z [degree] at a moment of the dance; period 1."""
-    s, c = np.sin(2.0 * np.pi * phase), np.cos(2.0 * np.pi * phase)
+    s, c = float(np.sin(2.0 * np.pi * phase)), float(np.cos(2.0 * np.pi * phase))
     left, right = 0.5 * (1.0 + s), 0.5 * (1.0 - s)
     return {
         "pelvis": (0.0, 4.0 * c, 12.0 * s),
