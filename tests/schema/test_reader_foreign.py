@@ -56,9 +56,7 @@ def test_half_positions_in_centimetres_below_a_transform(tmp_path, rng):
     parent.AddTranslateOp().Set((10.0, 20.0, 30.0))
     parent.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
     parent.AddScaleOp().Set((2.0, 2.0, 2.0))
-    stage.GetRootLayer().Save()
-
-    found = read_asset(tmp_path / "a.usda")
+    found = saved(stage)
     cloud = found[0]
     assert (len(found), found.topology, cloud.axes) == (1, "constant", "rfu")
     assert not cloud.is_relightable

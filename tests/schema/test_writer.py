@@ -168,7 +168,7 @@ def test_same_input_gives_the_same_bytes(tmp_path, sequence):
 def test_memory_does_not_grow_with_length(tmp_path, cloud):
     def lazy(frames):
         def read(frame):
-            return cloud(frame, 1000, relightable=False, degree=2)
+            return cloud(frame, 300, relightable=False, degree=2)
 
         return GaussianSequence(frame_count=frames, read_frame=read, topology="perFrame")
 

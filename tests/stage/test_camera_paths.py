@@ -75,8 +75,10 @@ class TestOrbit:
         assert path.degrees_per_second == -90.0
         np.testing.assert_allclose(path.camera_at(1.0, 8, 8).position, [-1.0, 0.0, 0.0], atol=1e-15)
 
-    @pytest.mark.parametrize("elevation", [-89.0, -30.0, 0.0, 20.0, 60.0, 90.0])
-    @pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 160)])
+    @pytest.mark.parametrize(
+        ("elevation", "width", "height"),
+        [(-89.0, 160, 90), (-30.0, 90, 160), (0.0, 160, 90), (20.0, 90, 160), (60.0, 160, 90), (90.0, 90, 160)],
+    )
     def test_a_turn_frames_the_subject_all_the_way_round_and_tightly(self, rng, elevation, width, height):
         subject = rng.normal((3.0, -2.0, 1.0), (1.0, 0.4, 0.7), size=(200, 3))
         lens = {"elevation": elevation, "margin": 1.25}
