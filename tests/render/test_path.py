@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from support.estimates import LARGEST_Z, require_zero_mean
 from support.flat_scenes import brdf_twin, mesh_of, nothing, plate
-from support.shapes import quaternions_from_normals, sphere_points, tiles
+from support.shapes import cloud_of, quaternions_from_normals, sphere_points, tiles
 
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError
 from beam_warp.light.ggx import specular_albedo
@@ -40,20 +40,12 @@ def relightable(base_color=0.5, roughness=0.5, **arrays):
 def disc(height=0.0, normal=(0.0, 0.0, 1.0), *, size=1.0, opacity=ALPHA_MAX, center=(0.0, 0.0), **material):
     """One large flat Gaussian: a plane, as far as a narrow view of its middle is concerned."""
     normal = np.asarray(normal, float)[None] / np.linalg.norm(normal)
-    return relightable(
-        positions=np.array([[*center, height]]),
-        orientations=quaternions_from_normals(normal),
-        scales=np.array([[size, size, 1e-3 * size]]),
-        opacities=np.array([opacity]),
-        normals=normal,
-        **material,
-    )
+    place = {"positions": [[*center, height]], "orientations": quaternions_from_normals(normal), "normals": normal}
+    return relightable(**place, scales=[[size, size, 1e-3 * size]], opacities=[opacity], **material)
 
 
 def together(*clouds):
-    return GaussianCloud(
-        **{name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in clouds[0].arrays()}, axes="rfu"
-    )
+    return cloud_of(*(cloud.arrays() for cloud in clouds), axes="rfu")
 
 
 def ball(count=600, radius=1.0, **material):
@@ -181,13 +173,8 @@ def test_a_mesh_alone_is_what_the_path_tracer_of_meshes_sees(device):
     mesh = trimesh.creation.icosphere(subdivisions=3)
     mesh.apply_transform(np.diag([1.0, 1.0, 0.4, 1.0]))
     count = len(mesh.vertices)
-    surface = MaterialMesh(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.vertex_normals,
-        base_color=np.full((count, 3), 0.7),
-        roughness=np.full(count, 0.4),
-    )
+    shape = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.vertex_normals}
+    surface = MaterialMesh(**shape, base_color=np.full((count, 3), 0.7), roughness=np.full(count, 0.4))
     part = ShotMesh(surface=surface, catches_shadows=np.zeros(len(mesh.faces), bool))
     rng = np.random.default_rng(1)
     sky = EnvironmentMap(rng.gamma(0.3, 1.0, (16, 32, 3)).astype(np.float32))
