@@ -109,17 +109,11 @@ def test_absent_arrays_take_the_defaults_of_usd(tmp_path, rng):
 
 
 def test_float_is_preferred_and_long_arrays_are_cut(tmp_path, rng):
-    p = points(rng)
-    stage = author(
-        tmp_path / "a.usda",
-        meters=1.0,
-        positions=p,
-        positionsh=Vt.Vec3hArray.FromNumpy(np.zeros((5, 3), np.float16)),
-        opacities=np.linspace(0, 1, 9).astype(np.float32),
-    )
-    cloud = saved(stage)[0]
+    p, opacities = points(rng), np.linspace(0, 1, 9).astype(np.float32)
+    half = Vt.Vec3hArray.FromNumpy(np.zeros((5, 3), np.float16))
+    cloud = saved(author(tmp_path / "a.usda", meters=1.0, positions=p, positionsh=half, opacities=opacities))[0]
     assert np.array_equal(cloud.positions, p)
-    assert np.array_equal(cloud.opacities, np.linspace(0, 1, 9).astype(np.float32)[:5])
+    assert np.array_equal(cloud.opacities, opacities[:5])
 
 
 def test_quaternions_are_normalised(tmp_path, rng):
@@ -156,12 +150,9 @@ def test_a_moving_transform_makes_frames(tmp_path, rng):
     ("name", "space"), [("lin_rec709_scene", "lin_rec709_scene"), ("srgb_rec709_scene", "srgb_rec709_display")]
 )
 def test_colour_space_comes_from_an_ancestor(tmp_path, rng, name, space):
-    stage = author(
-        tmp_path / "a.usda",
-        positions=points(rng),
-        radiance__sphericalHarmonicsDegree=0,
-        radiance__sphericalHarmonicsCoefficients=np.zeros((5, 3), np.float32),
-    )
+    harmonics = {"Degree": 0, "Coefficients": np.zeros((5, 3), np.float32)}
+    radiance = {f"radiance__sphericalHarmonics{name}": value for name, value in harmonics.items()}
+    stage = author(tmp_path / "a.usda", positions=points(rng), **radiance)
     Usd.ColorSpaceAPI.Apply(stage.GetPrimAtPath("/World/Scan")).CreateColorSpaceNameAttr(name)
     found = saved(stage)
     assert found[0].radiance_color_space == space

@@ -157,10 +157,9 @@ class TestIrradiance:
     @pytest.mark.parametrize(("height", "size"), [(4, (16, 32)), (45, (64, 128)), (64, (16, 32))])
     def test_uniform_light_gives_pi(self, height, size):
         irradiance = EnvironmentMap.constant([1, 2, 0], height=height).irradiance_map(*size)
+        expected = np.broadcast_to([np.pi, 2 * np.pi, 0], (*size, 3))
         # The stated bound is δ²/12 for rows of δ = π/512, and float32 storage.
-        np.testing.assert_allclose(
-            irradiance / np.pi, np.broadcast_to([1, 2, 0], (*size, 3)), rtol=3.2e-6 + FLOAT32, atol=1e-12
-        )
+        np.testing.assert_allclose(irradiance, expected, rtol=3.2e-6 + FLOAT32, atol=1e-12)
 
     def test_hot_sun(self, rng):
         radiance = rng.random((128, 256, 3)).astype(np.float32)
