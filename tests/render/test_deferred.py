@@ -357,6 +357,7 @@ def test_shots_of_any_order_and_size(device, figure):
         first,
         replace(first, camera=figure_camera(one, azimuth=90.0)),
         replace(first, environment_rotation=70.0),
+        later,  # under the same light
         replace(later, lights=(lamp,)),
         replace(later, environment=None, lights=(inside, sun)),
         replace(later, mesh=mesh_of(plate())),
