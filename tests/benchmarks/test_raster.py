@@ -134,9 +134,8 @@ class TestPeer:
 
     def test_a_peer_that_draws_something_else_does_not(self, monkeypatch):
         shifted = lambda scene: scene._replace(cloud=figure(300, 24, 18, seed=1).cloud)  # noqa: E731
-        monkeypatch.setattr(
-            benchmark, "peer_for", lambda scene, values, device: (OwnPeer(shifted(scene), values), None)
-        )
+        other = lambda scene, values, device: (OwnPeer(shifted(scene), values), None)  # noqa: E731
+        monkeypatch.setattr(benchmark, "peer_for", other)
         found = benchmark.compare_with_peer(figure(300, 24, 18), resolve_device("cpu"))
         assert found["rgb"]["beyond_1e-4"] > 50
         assert found["gradients_relative_l2_all_pixels"]["positions"] > 0.1

@@ -2,41 +2,12 @@
 
 import numpy as np
 import pytest
-
-from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.world.gaussians import GaussianCloud
+from support.radiant_cloud import radiant_cloud
 
 
 @pytest.fixture(scope="session")
 def make_cloud():
-    """A function that makes a random cloud; unit vectors are unit to float32 rounding."""
-
-    def make(count=50, degree=3, *, materials=False, seed=1, **changes):
-        rng = np.random.default_rng(seed)
-
-        def units(width):
-            vectors = rng.normal(size=(count, width)).astype(np.float32)
-            return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-        fields = {
-            "positions": rng.normal(size=(count, 3)),
-            "orientations": units(4),
-            "scales": np.exp(rng.uniform(-8.0, 0.0, (count, 3))),
-            "opacities": rng.uniform(0.01, 0.99, count),
-            "radiance": rng.normal(size=(count, (degree + 1) ** 2, 3)),
-            "radiance_color_space": DISPLAY_SRGB,
-            "axes": "rfu",
-        }
-        if materials:
-            fields |= {
-                "base_color": rng.uniform(size=(count, 3)),
-                "roughness": rng.uniform(size=count),
-                "ambient_occlusion": rng.uniform(size=count),
-                "normals": units(3),
-            }
-        return GaussianCloud(**fields | changes)
-
-    return make
+    return radiant_cloud
 
 
 @pytest.fixture(scope="session")

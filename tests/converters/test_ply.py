@@ -61,9 +61,8 @@ def test_a_file_of_another_tool_is_read_as_plyfile_reads_it(data_dir):
     assert cloud.axes == "rdf"
     for name, expected in through_plyfile(path).items():
         assert np.allclose(getattr(cloud, name), expected, rtol=2 * EPSILON, atol=0.0), name
-    assert notes_of(sequence) == [
-        "axes are not stated: taken as rdf (3DGS training); pass --source-axes if they are others"
-    ]
+    (note,) = notes_of(sequence)
+    assert note == "axes are not stated: taken as rdf (3DGS training); pass --source-axes if they are others"
 
 
 @pytest.mark.parametrize("degree", [0, 3, 4])
@@ -127,9 +126,8 @@ finite = st.floats(-(2.0**100), 2.0**100, width=32)
 )
 def test_round_trip(tmp_path_factory, make_cloud, positions, radiance, scales, opacities, base_color):
     path = tmp_path_factory.mktemp("trip") / "a.ply"
-    cloud = make_cloud(
-        4, positions=positions, radiance=radiance, scales=scales, opacities=opacities, base_color=base_color
-    )
+    given = {"positions": positions, "radiance": radiance, "scales": scales, "opacities": opacities}
+    cloud = make_cloud(4, **given, base_color=base_color)
     write(cloud, path, profile="beam")
     back = converters.read(path, activation="log")[0]
     for name in ("positions", "radiance", "orientations", "base_color"):
@@ -188,10 +186,9 @@ def test_flat_gaussians_and_missing_colour(columns, ply_file, tmp_path):
     sequence = converters.read(ply_file(columns))
     assert np.array_equal(sequence[0].scales[:, 2], [0, 0, 0])
     assert sequence[0].radiance is None
-    assert notes_of(sequence)[:2] == [
-        "no scale_2: read as 2D Gaussians of thickness 0",
-        "no f_dc_0 … f_dc_2: read without colour",
-    ]
+    flat, colorless = notes_of(sequence)[:2]
+    assert flat == "no scale_2: read as 2D Gaussians of thickness 0"
+    assert colorless == "no f_dc_0 … f_dc_2: read without colour"
     # Written again, a flat Gaussian has the least scale that a log can say, and a colourless one stays colourless.
     converters.write(sequence, tmp_path / "b.ply")
     back = converters.read(tmp_path / "b.ply")[0]
@@ -314,28 +311,23 @@ def test_materials_of_other_producers(columns, ply_file, tmp_path, activation, p
     sequence = converters.read(ply_file(columns))
     assert sequence[0].base_color is None
     assert sequence.metadata["producer"] == f"{producer}, by its property names"
-    assert any(
-        note.startswith(f"materials of {producer} left out")
-        and note.endswith(f"pass --material-activation {activation} to read them")
-        for note in notes_of(sequence)
-    )
+    (note,) = (note for note in notes_of(sequence) if note.startswith(f"materials of {producer} left out"))
+    assert note.endswith(f"pass --material-activation {activation} to read them")
     cloud = converters.read(tmp_path / "a.ply", material_activation=activation)[0]
     assert np.allclose(cloud.base_color, base, rtol=EPSILON)
     assert np.allclose(cloud.roughness, rough, rtol=EPSILON)
     assert (cloud.normals is not None) == (activation == "gsir")
 
 
-def test_mesh2splat_is_named(columns, ply_bytes, tmp_path):
+def test_mesh2splat_is_named(columns, ply_file):
     columns |= {"metallicFactor": [0.0] * 3, "roughnessFactor": [0.5] * 3}
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    assert converters.inspect(tmp_path / "a.ply").producer == "mesh2splat, by its property names"
+    assert converters.inspect(ply_file(columns)).producer == "mesh2splat, by its property names"
 
 
 def test_materials_that_are_not_there(columns, ply_file):
     path = ply_file(columns)
-    with pytest.raises(
-        AssetFormatError, match=r"a\.ply: materials of gsir must have albedo_0, .* no material channels"
-    ):
+    message = r"a\.ply: materials of gsir must have albedo_0, .* no material channels"
+    with pytest.raises(AssetFormatError, match=message):
         converters.read(path, material_activation="gsir")
 
 
@@ -378,9 +370,8 @@ def test_a_full_disk_leaves_nothing(make_cloud, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("beam_warp.converters.ply_writer._row_source", lambda *_: full)
-    with pytest.raises(
-        OutputError, match=r"output must be a writable file, got .*a\.ply \(.*No space left on device\)"
-    ):
+    message = r"output must be a writable file, got .*a\.ply \(.*No space left on device\)"
+    with pytest.raises(OutputError, match=message):
         write(make_cloud(), tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
 

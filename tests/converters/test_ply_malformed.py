@@ -97,20 +97,14 @@ def test_wrong_header_lines(columns, ply_bytes, tmp_path, old, new, message):
 
 def test_limits_of_the_header(columns, ply_bytes, tmp_path):
     content = ply_bytes(columns)
-    for old, new, message in (
-        (b"element vertex", b"comment " + b"x" * 70_000 + b"\nelement vertex", "got none in the first 64 KiB"),
-        (
-            b"element vertex",
-            b"".join(b"element e%d 0\n" % i for i in range(16)) + b"element vertex",
-            "at most 16 elements, got 17",
-        ),
-        (
-            b"end_header",
-            b"element e 0\n" + b"".join(b"property float p%d\n" % i for i in range(1020)) + b"end_header",
-            "at most 1024 properties, got 1034",
-        ),
+    elements = b"".join(b"element e%d 0\n" % i for i in range(16))
+    properties = b"element e 0\n" + b"".join(b"property float p%d\n" % i for i in range(1020))
+    for place, more, message in (
+        (b"element vertex", b"comment " + b"x" * 70_000 + b"\n", "got none in the first 64 KiB"),
+        (b"element vertex", elements, "at most 16 elements, got 17"),
+        (b"end_header", properties, "at most 1024 properties, got 1034"),
     ):
-        refused(tmp_path, content.replace(old, new, 1), message)
+        refused(tmp_path, content.replace(place, more + place, 1), message)
 
 
 def test_lists_before_or_within_the_vertices(columns, ply_bytes, tmp_path):
@@ -121,6 +115,9 @@ def test_lists_before_or_within_the_vertices(columns, ply_bytes, tmp_path):
     extra = b"property list uchar int neighbours\nend_header"
     message = "element vertex must have no list properties, got neighbours"
     refused(tmp_path, content.replace(b"end_header", extra, 1), message)
+
+
+QUATERNION = "rot_0 … rot_3 must be a quaternion"
 
 
 def test_a_point_cloud_is_named(ply_bytes, tmp_path):
@@ -138,12 +135,8 @@ def test_a_point_cloud_is_named(ply_bytes, tmp_path):
         ("opacity", [0.0, np.nan, 0.0], "opacity must be finite, got NaN or infinity at row 1. Repair those rows, or"),
         ("scale_0", [-4.0, np.nan, np.nan], "natural logs in [-30, 20], got nan at row 1 (2 rows in all)"),
         ("scale_1", [-4.0, 1000.0, -4.0], "natural logs in [-30, 20], got 1000 at row 1."),
-        (
-            "rot_0",
-            [0.0, 0.0, 0.0],
-            "rot_0 … rot_3 must be a quaternion, got a zero quaternion at row 0 (2 rows in all)",
-        ),
-        ("rot_2", [0.0, np.nan, 0.0], "rot_0 … rot_3 must be a quaternion, got NaN or infinity at row 1."),
+        ("rot_0", [0.0, 0.0, 0.0], f"{QUATERNION}, got a zero quaternion at row 0 (2 rows in all)"),
+        ("rot_2", [0.0, np.nan, 0.0], f"{QUATERNION}, got NaN or infinity at row 1."),
     ],
 )
 def test_bad_values(columns, ply_bytes, tmp_path, name, values, message):

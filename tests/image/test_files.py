@@ -179,9 +179,8 @@ class TestPngAndJpeg:
     def test_linear_rgba_decodes_and_multiplies(self, tmp_path):
         write_png(tmp_path / "a.png", np.array([[[188, 188, 188, 51]]], np.uint8))
         expected = srgb_to_linear(188 / 255) * 0.2
-        np.testing.assert_allclose(
-            read_image(tmp_path / "a.png").linear_rgba()[0, 0], [*[expected] * 3, 0.2], rtol=1e-6
-        )
+        found = read_image(tmp_path / "a.png").linear_rgba()
+        np.testing.assert_allclose(found[0, 0], [*[expected] * 3, 0.2], rtol=1e-6)
         # The same bytes declared linear are not decoded.
         linear = read_image(tmp_path / "a.png", color_space=LINEAR_REC709).linear_rgba()
         np.testing.assert_allclose(linear[0, 0, 0], 188 / 255 * 0.2, rtol=1e-6)
@@ -195,9 +194,8 @@ class TestPngAndJpeg:
         PillowImage.new("P", (3, 2)).save(tmp_path / "a.png")
         assert read_image(tmp_path / "a.png").rgb().shape == (2, 3, 3)
         PillowImage.new("RGB", (8, 8), (255, 0, 0)).save(tmp_path / "a.jpg", quality=95)
-        np.testing.assert_allclose(
-            read_image(tmp_path / "a.jpg").rgb(), [[[1, 0, 0]]] * np.ones((8, 8, 1)), atol=2 / 255
-        )
+        red = [[[1, 0, 0]]] * np.ones((8, 8, 1))
+        np.testing.assert_allclose(read_image(tmp_path / "a.jpg").rgb(), red, atol=2 / 255)
 
     @pytest.mark.parametrize("size", [0, 40])
     def test_truncated(self, tmp_path, rng, size):

@@ -130,9 +130,8 @@ class TestFailures:
 
     def test_no_h264(self, tmp_path):
         program = fake_ffmpeg(tmp_path, "print(' V..... mpeg4  MPEG-4 part 2')")
-        with pytest.raises(
-            OutputError, match=r"built with libx264, got .*fake-ffmpeg without it. .*beam-warp\[video\]"
-        ):
+        message = r"built with libx264, got .*fake-ffmpeg without it. .*beam-warp\[video\]"
+        with pytest.raises(OutputError, match=message):
             require_encoder(program)
         require_encoder(fake_ffmpeg(tmp_path, "print(' V....D libx264  H.264')"))
         with pytest.raises(OutputError, match=r"ffmpeg must end well.*\(broken library\)"):

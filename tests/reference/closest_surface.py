@@ -5,13 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from beam_warp.trace.reference import ALPHA_MIN, FLOAT32_ROUNDOFF, RayPairs, ReferenceGaussians, candidate_pairs
-from beam_warp.world.gaussians import GaussianCloud
 
 
 @dataclass(frozen=True)
@@ -44,35 +42,24 @@ class SurfaceReference:
 
 
 def closest_surface_reference(
-    cloud: GaussianCloud,
-    origins: ArrayLike,
-    directions: ArrayLike,
+    cloud,
+    origins,
+    directions,
     *,
-    attributes: ArrayLike | None = None,
-    t_max: ArrayLike = math.inf,
-    threshold: float = 0.5,
-    stop: float = 1e-3,
-    front: Literal["peak", "entry"] = "peak",
-    cull: bool = False,
-    response_degree: Literal[2, 4] = 2,
-    middle: ArrayLike = (0.0, 0.0, 0.0),
-    roundoff: float = FLOAT32_ROUNDOFF,
-) -> SurfaceReference:
+    attributes=None,
+    t_max=math.inf,
+    threshold=0.5,
+    stop=1e-3,
+    front="peak",
+    cull=False,
+    response_degree=2,
+    middle=(0.0, 0.0, 0.0),
+    roundoff=FLOAT32_ROUNDOFF,
+):
     """Sort each ray's hits by (t, row) and blend them: the twin of `beam_warp.trace.first_surface.closest_surface`.
 
-    Args:
-        cloud: As `visibility_reference`.
-        origins: As `visibility_reference`.
-        directions: As `visibility_reference`.
-        attributes: Values to blend, ``(M, C)``; None for none.
-        t_max: As `visibility_reference`.
-        threshold: Transmittance below which a surface is met.
-        stop: Transmittance below which blending ends.
-        front: As `visibility_reference`.
-        cull: As `visibility_reference`.
-        response_degree: As `visibility_reference`.
-        middle: As `visibility_enclosure`.
-        roundoff: As `visibility_enclosure`.
+    A surface is met below the transmittance ``threshold``, and blending of ``attributes`` (M, C) ends below ``stop``;
+    all else is as `visibility_reference` and `visibility_enclosure` have it.
     """
     base = np.asarray(middle, np.float64)
     o = np.asarray(origins, np.float64).reshape(-1, 3) - base
@@ -121,17 +108,7 @@ class _Rules:
     roundoff: float
 
 
-def _blend_ray(
-    result: SurfaceReference,
-    ray: int,
-    index: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    seen: GaussianCloud,
-    gaussians: ReferenceGaussians,
-    segment: tuple[NDArray[np.float64], NDArray[np.float64], float],
-    values: NDArray[np.float64],
-    rules: _Rules,
-) -> None:
+def _blend_ray(result, ray, index, rows, seen, gaussians, segment, values, rules):
     """Write one row of ``result``: the candidates ``index`` of a ray (origin, direction, reach), blended in order."""
     o, d, reach = segment
     start, way = (np.broadcast_to(x, (len(index), 3)) for x in (o, d))
@@ -190,22 +167,14 @@ def _blend_ray(
     result.normal_error[ray] = 2.0 * spread / max(length, 1e-300) + 4.0 * rules.roundoff
 
 
-def _weighted_mean(
-    values: NDArray[np.float64], weights: NDArray[np.float64], errors: NDArray[np.float64], roundoff: float
-) -> tuple[Any, Any]:
+def _weighted_mean(values, weights, errors, roundoff):
     """Return the weighted mean of rows, and how far errors of the weights and rounded sums may carry it."""
     mean = weights @ values / weights.sum()
     moved = errors @ np.abs(values - mean) / max(weights.sum() - errors.sum(), 1e-300)
     return mean, moved + (len(weights) + 4.0) * roundoff * (weights @ np.abs(values)) / weights.sum()
 
 
-def _entry_normals(
-    gaussians: ReferenceGaussians,
-    o: NDArray[np.float64],
-    d: NDArray[np.float64],
-    index: NDArray[np.int64],
-    roundoff: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _entry_normals(gaussians, o, d, index, roundoff):
     """Return the unit normals of ellipsoids where a ray enters them, R S^-1 y, and how far float32 may be off.
 
     With the errors of `RayPairs`: y = q - h v / |v|, q the peak, h half the chord; M^T carries its error to the normal

@@ -1,9 +1,11 @@
 """The deferred renderer: closed forms of light on planes, furnace, turning, bounces, meshes, hazards, and frames again.
 
-Scenes are flat Gaussians so large that a pixel sees a plane; environments have 16 to 32 rows.
+Scenes are flat Gaussians so large that a pixel sees a plane; environments have 8 to 32 rows. Environments that several
+tests take are module constants: each is prepared once for a device, which takes longer than most images.
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,6 +30,22 @@ SMALL = DeferredOptions(environment_shadows=4, bounces=2, light_map_size=128, en
 FLOAT32 = float(np.finfo(np.float32).eps)
 
 
+def even_but(radiance, place, value, height=16):
+    """An even environment with other radiance at some texels."""
+    texels = np.full((height, 2 * height, 3), radiance, np.float32)
+    texels[place] = value
+    return EnvironmentMap(texels)
+
+
+BLACK, WHITE, FURNACE = (EnvironmentMap.constant(color) for color in ((0, 0, 0), (1, 1, 1), (1.0, 0.5, 2.0)))
+WALL_OF_LIGHT = even_but(0.02, np.s_[:8, 4:12], (1.0, 0.7, 0.5))
+FIREFLY = even_but(0.1, np.s_[3, 5], 5e4)
+SKY, OTHER_SKY = (
+    EnvironmentMap((np.random.default_rng(seed).random((8, 16, 3)) ** 4).astype(np.float32)) for seed in (1, 2)
+)
+SUN = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=0.0)
+
+
 def floor(**material):
     """A plane z = 0, one Gaussian."""
     return discs([0.0, 0.0, 0.0], UP, 50.0, **material)
@@ -44,20 +62,23 @@ def middle(image):
     return image.rgb[row, column] / image.alpha[row, column]
 
 
+prepared = cache(PreparedEnvironment)
+
+
 def render(shot, device, options=PLAIN, raster=None):
-    return DeferredRenderer(options, raster=raster, device=device).draw(shot)
+    """Draw with a new renderer; the environment alone is prepared before."""
+    light = [prepared(shot.environment, device)] if shot.environment else []
+    return DeferredRenderer(options, raster=raster, device=device, prepared=light).draw(shot)
 
 
-def figure(frame_count=1):
-    return figure_asset(frame_count=frame_count)
+@pytest.fixture(scope="module")
+def figure():
+    """Two frames of the demo figure. Read only."""
+    return list(figure_asset(frame_count=2))
 
 
 def figure_camera(cloud, size=(20, 30), azimuth=30.0):
     return Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
-
-
-def random_light(rng, height=16):
-    return EnvironmentMap((rng.random((height, 2 * height, 3)) ** 4).astype(np.float32))
 
 
 # ---- lights on a plane: closed forms --------------------------------------------------------------------------------
@@ -71,9 +92,8 @@ def test_a_plane_in_the_sun(device, roughness, direction):
     color = np.array([0.9, 0.5, 0.2])
     light = DirectionalLight(direction=direction, irradiance=(3.0, 2.0, 1.0), angular_diameter=0.0)
     eye = np.array([0.0, -2.0, 2.0])
-    found = middle(
-        render(Shot(cloud=floor(color=color, roughness=roughness), camera=camera(eye), lights=(light,)), device)
-    )
+    plane = floor(color=color, roughness=roughness)
+    found = middle(render(Shot(cloud=plane, camera=camera(eye), lights=(light,)), device))
     view, to_light = eye / np.linalg.norm(eye), -np.asarray(light.direction)
     diffuse = color * (1.0 - specular_albedo(view[2], roughness)) / np.pi
     expected = np.array([3.0, 2.0, 1.0]) * to_light[2] * (diffuse + brdf_twin(UP, view, to_light, roughness))
@@ -129,67 +149,48 @@ def test_a_wide_light_in_a_glossy_plane(device, roughness, diameter, most):
 
 def test_shadows_of_gaussians_on_gaussians(device):
     """A disc 1 m above the floor: dark below, lit beside, and partly lit if it is translucent."""
-    sun = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=0.0)
     for opacity, most in ((1.0, 0.05), (0.8, 0.25)):
-        cloud = discs([[0, 0, 0], [0, 0, 1]], UP, 1.0).with_arrays(
-            scales=np.array([[3.0, 3.0, 0.0], [0.2, 0.2, 0.0]], np.float32),
-            opacities=np.array([1.0, opacity], np.float32),
-        )
-        eye = (0.0, -3.0, 0.8)
-        below, beside = (
-            middle(render(Shot(cloud=cloud, camera=camera((x, *eye[1:]), (x, 0, 0)), lights=(sun,)), device, SMALL))[0]
-            for x in (0.0, 1.5)
-        )
-        free = middle(
-            render(
-                Shot(cloud=cloud, camera=camera((0.0, *eye[1:])), lights=(replace(sun, casts_shadows=False),)),
-                device,
-                replace(SMALL, bounces=0),
-            )
-        )[0]
-        assert below < most * free
-        assert beside > 0.9 * free
+        cloud = discs([[0, 0, 0], [0, 0, 1]], UP, 1.0)
+        cloud = cloud.with_arrays(scales=[[3.0, 3.0, 0.0], [0.2, 0.2, 0.0]], opacities=[1.0, opacity])
+
+        def seen_at(x, light, options, cloud=cloud):
+            shot = Shot(cloud=cloud, camera=camera((x, -3.0, 0.8), (x, 0, 0)), lights=(light,))
+            return middle(render(shot, device, options))[0]
+
+        free = seen_at(0.0, replace(SUN, casts_shadows=False), replace(SMALL, bounces=0))
+        assert seen_at(0.0, SUN, SMALL) < most * free
+        assert seen_at(1.5, SUN, SMALL) > 0.9 * free
 
 
 # ---- the environment ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("degrees", [0.0, 180.0])
-def test_without_shadows_it_is_the_split_sum(device, rng, degrees):
+def test_without_shadows_it_is_the_split_sum(device, figure, degrees):
     """Pixel by pixel of the G-buffer, to rounding: sums of some fifty float32 terms. Half a turn of the light is half a
     turn of normals and views, which changes signs."""
-    cloud = figure()[0]
+    cloud = figure[0]
     view = figure_camera(cloud)
-    light = random_light(rng)
-    found = render(Shot(cloud=cloud, camera=view, environment=light, environment_rotation=degrees), device)
+    found = render(Shot(cloud=cloud, camera=view, environment=SKY, environment_rotation=degrees), device)
     buffer = rasterize(cloud, view, device=device)
     turn = 1.0 if degrees == 0.0 else np.array([-1.0, -1.0, 1.0])
-    expected = shade(
-        PreparedEnvironment(light, device),
-        **buffer.channels | {"normals": turn * buffer.channels["normals"]},
-        alpha=buffer.alpha,
-        view_directions=turn * view.directions(),
-    )
+    surface = buffer.channels | {"normals": turn * buffer.channels["normals"], "alpha": buffer.alpha}
+    expected = shade(prepared(SKY, device), **surface, view_directions=turn * view.directions())
     np.testing.assert_allclose(found.rgb, expected, rtol=200 * FLOAT32, atol=200 * FLOAT32 * expected.max())
 
 
 @pytest.mark.parametrize("options", [PLAIN, SMALL])
-def test_turning_the_light_is_turning_everything_else_back(device, options):
+def test_turning_the_light_is_turning_everything_else_back(device, figure, options):
     """Any angle. Without shadows up to rounding; with them maps see the subject at another angle and their texels fall
     elsewhere: what differs is small against what turning the light changes."""
-    radiance = np.full((16, 32, 3), 0.02, np.float32)
-    radiance[:8, 4:12] = (1.0, 0.7, 0.5)
-    cloud, light, degrees = figure()[0], EnvironmentMap(radiance), 40.0
+    cloud, light, degrees = figure[0], WALL_OF_LIGHT, 40.0
     angle = -np.radians(degrees)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     q = np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])
     x, y, z, w = cloud.orientations.T
     turned_q = np.stack([q[3] * x - q[2] * y, q[3] * y + q[2] * x, q[3] * z + q[2] * w, q[3] * w - q[2] * z], axis=-1)
-    back = cloud.with_arrays(
-        positions=(cloud.positions @ turn.T).astype(np.float32),
-        normals=(cloud.normals @ turn.T).astype(np.float32),
-        orientations=turned_q.astype(np.float32),
-    )
+    turned = {"positions": cloud.positions @ turn.T, "normals": cloud.normals @ turn.T, "orientations": turned_q}
+    back = cloud.with_arrays(**{name: array.astype(np.float32) for name, array in turned.items()})
     view = figure_camera(cloud)
     pose = np.eye(4)
     pose[:3, :3] = turn
@@ -205,9 +206,8 @@ def test_turning_the_light_is_turning_everything_else_back(device, options):
 @pytest.mark.parametrize("options", [PLAIN, SMALL], ids=["plain", "shadows"])
 def test_white_furnace(device, roughness, options):
     """A white open plane under even light shows it, at every angle and roughness, within 1 %."""
-    furnace = EnvironmentMap.constant((1.0, 0.5, 2.0))
     for eye in ((0.0, -0.1, 2.0), (0.0, -2.0, 1.0), (0.0, -2.0, 0.25)):
-        shot = Shot(cloud=floor(roughness=roughness), camera=camera(eye), environment=furnace)
+        shot = Shot(cloud=floor(roughness=roughness), camera=camera(eye), environment=FURNACE)
         np.testing.assert_allclose(middle(render(shot, device, options)), [1.0, 0.5, 2.0], rtol=0.01)
 
 
@@ -226,17 +226,12 @@ def test_a_convex_body_is_open(device):
 
 def test_a_roof_darkens_what_is_below(device):
     """A floor under a roof that hides all of a sky that comes from above is dark; ambient occlusion says nothing."""
-    radiance = np.full((32, 64, 3), 1e-6, np.float32)
-    radiance[:2] = 50.0
-    light = EnvironmentMap(radiance)
-    low = discs([[0, 0, 0]], UP, 0.5)
-    both = discs([[0, 0, 0], [0, 0, 0.4]], UP, 0.5)
-    view = camera((0.0, -3.0, 0.3), size=9)
-    free, dark = (
-        middle(render(Shot(cloud=c, camera=view, environment=light), device, replace(SMALL, bounces=0)))[0]
-        for c in (low, both)
-    )
-    assert dark < 0.15 * free
+    light = even_but(1e-6, np.s_[:2], 50.0, height=32)
+    seen = []
+    for places in ([[0, 0, 0]], [[0, 0, 0], [0, 0, 0.4]]):
+        shot = Shot(cloud=discs(places, UP, 0.5), camera=camera((0.0, -3.0, 0.3)), environment=light)
+        seen.append(middle(render(shot, device, replace(SMALL, bounces=0)))[0])
+    assert seen[1] < 0.15 * seen[0]
 
 
 def test_bounces_in_a_closed_room(device):
@@ -246,9 +241,10 @@ def test_bounces_in_a_closed_room(device):
     openness, color = 0.4, 0.6
     outward = sphere_points(2000)[0]
     cloud = discs(outward, -outward, 0.06, color=color, openness=openness)
-    shot = Shot(cloud=cloud, camera=figure_camera(cloud), environment=EnvironmentMap.constant((1.0, 1.0, 1.0)))
+    shot = Shot(cloud=cloud, camera=figure_camera(cloud), environment=WHITE)
     for bounces in (1, 3):
-        frame = DeferredRenderer(replace(PLAIN, bounces=bounces), device=device).frame(shot)
+        options = replace(PLAIN, bounces=bounces)
+        frame = DeferredRenderer(options, device=device, prepared=[prepared(WHITE, device)]).frame(shot)
         arriving = frame.gaussians.values.numpy()[:, 8:11]
         share = specular_albedo(2.0 / 3.0, 1.0)
         reflects = color * (1.0 - share) + share
@@ -263,8 +259,7 @@ def test_bounces_in_a_closed_room(device):
 def test_a_mesh_is_shaded_like_gaussians(device, flip):
     """A plane of triangles and one of Gaussians show the same, from either side of its faces, up to their depths."""
     sun = DirectionalLight(direction=(0.3, 0.2, -1), irradiance=(3, 2, 1))
-    light = EnvironmentMap.constant((0.5, 0.6, 0.7))
-    rest = {"camera": camera(), "lights": (sun,), "environment": light}
+    rest = {"camera": camera(), "lights": (sun,), "environment": FURNACE}
     one = middle(render(Shot(cloud=floor(color=0.4), **rest), device))
     two = render(Shot(cloud=nothing(), mesh=mesh_of(plate(color=0.4, flip=flip)), **rest), device)
     assert (two.alpha == 1.0).all()
@@ -278,11 +273,10 @@ def test_a_mesh_is_shaded_like_gaussians(device, flip):
 def test_the_nearer_one_is_in_front(device, z):
     """A red plate of Gaussians before a white one of triangles, and behind it."""
     cloud = discs([0.0, 0.0, 0.0], UP, 5.0, color=(0.8, 0.0, 0.0), opacity=0.6)
-    light = EnvironmentMap.constant((1.0, 1.0, 1.0))
-    view = camera((0.0, -0.01, 3.0))
-    alone = render(Shot(cloud=cloud, camera=view, environment=light), device)
-    mesh = render(Shot(cloud=nothing(), camera=view, environment=light, mesh=mesh_of(plate(z))), device)
-    both = render(Shot(cloud=cloud, camera=view, environment=light, mesh=mesh_of(plate(z))), device)
+    rest = {"camera": camera((0.0, -0.01, 3.0)), "environment": WHITE}
+    alone = render(Shot(cloud=cloud, **rest), device)
+    mesh = render(Shot(cloud=nothing(), mesh=mesh_of(plate(z)), **rest), device)
+    both = render(Shot(cloud=cloud, mesh=mesh_of(plate(z)), **rest), device)
     expected = mesh.rgb if z > 0 else alone.rgb + (1.0 - alone.alpha[..., None]) * mesh.rgb
     np.testing.assert_allclose(both.rgb, expected, rtol=1e-5)
     np.testing.assert_allclose(both.alpha, 1.0, rtol=1e-6)
@@ -292,20 +286,13 @@ def test_the_nearer_one_is_in_front(device, z):
 
 def test_a_caught_shadow_is_what_light_is_missing(device):
     """Below a plate the sun's part of the irradiance is gone; beside it nothing is. The catcher is not seen."""
-    sun = DirectionalLight(direction=(0, 0, -1), irradiance=(2, 2, 2), angular_diameter=0.0)
-    sky = EnvironmentMap.constant((0.3, 0.3, 0.3))
+    sun = replace(SUN, irradiance=(6, 6, 6))
     mesh = mesh_of(plate(catches=True), plate(0.5, 0.3))
     cloud = discs([[-0.9, 0.0, 0.0], [0.9, 0.0, 0.0]], UP, 1e-3)  # the subject that shadow maps look at
-    for environment, share in ((None, 1.0), (sky, 2.0 / (2.0 + 0.3 * np.pi))):
+    for environment, share in ((None, 1.0), (WHITE, 6.0 / (6.0 + np.pi))):
         for x, expected in ((0.0, share), (0.7, 0.0)):
-            shot = Shot(
-                cloud=cloud,
-                camera=camera((x, -2.0, 0.2), (x, 0.0, 0.0)),
-                lights=(sun,),
-                environment=environment,
-                mesh=mesh,
-            )
-            image = render(shot, device, replace(PLAIN, light_map_size=128))
+            view = camera((x, -2.0, 0.2), (x, 0.0, 0.0))
+            image = render(Shot(cloud=cloud, camera=view, lights=(sun,), environment=environment, mesh=mesh), device)
             assert image.alpha[4, 4] == pytest.approx(expected, abs=1e-3)
             assert not image.rgb[4, 4].any()
             assert not image.layers["base_color"][4, 4].any()
@@ -326,14 +313,11 @@ def test_gaussians_cast_on_triangles_and_triangles_on_gaussians(device):
 
 
 @pytest.mark.parametrize("options", [PLAIN, SMALL], ids=["plain", "shadows"])
-def test_hazards_are_finite(device, rng, options):
+def test_hazards_are_finite(device, figure, rng, options):
     """Roughness 0.03 and 1, a firefly of 5e4, lights inside the subject and at a Gaussian, a camera among Gaussians,
     black and no light, no Gaussians."""
-    cloud = figure()[0]
+    cloud = figure[0]
     extremes = cloud.with_arrays(roughness=np.where(rng.random(len(cloud)) < 0.5, 0.03, 1.0).astype(np.float32))
-    firefly = np.full((16, 32, 3), 0.1, np.float32)
-    firefly[3, 5] = 5e4
-    bright = EnvironmentMap(firefly)
     inside = PointLight(position=tuple(np.median(cloud.positions, axis=0)), intensity=(5, 5, 5), radius=0.05)
     touching = PointLight(position=tuple(cloud.positions[0].tolist()), intensity=(5, 5, 5))
     spot = SpotLight(position=inside.position, direction=(0, 0, 1), intensity=(1, 1, 1), outer_angle=85.0)
@@ -341,14 +325,14 @@ def test_hazards_are_finite(device, rng, options):
     pose = view.camera_to_world.copy()
     pose[:3, 3] = cloud.positions[100]
     among = replace(view, camera_to_world=pose)
-    black = EnvironmentMap.constant((0, 0, 0))
-    renderer = DeferredRenderer(options, device=device)
+    lights = [prepared(light, device) for light in (FIREFLY, BLACK)]
+    renderer = DeferredRenderer(options, device=device, prepared=lights)
     shots = [
-        Shot(cloud=extremes, camera=view, environment=bright, lights=(inside, touching, spot)),
-        Shot(cloud=extremes, camera=among, environment=bright, lights=(inside,)),
-        Shot(cloud=cloud, camera=view, environment=black),
+        Shot(cloud=extremes, camera=view, environment=FIREFLY, lights=(inside, touching, spot)),
+        Shot(cloud=extremes, camera=among, environment=FIREFLY, lights=(inside,)),
+        Shot(cloud=cloud, camera=view, environment=BLACK),
         Shot(cloud=cloud, camera=view),
-        Shot(cloud=nothing(), camera=view, environment=bright, lights=(inside,)),
+        Shot(cloud=nothing(), camera=view, environment=FIREFLY, lights=(inside,)),
         Shot(cloud=nothing(), camera=view, lights=(inside,), mesh=mesh_of(plate(catches=True))),
     ]
     for shot in shots:
@@ -361,61 +345,53 @@ def test_hazards_are_finite(device, rng, options):
             assert image.alpha.any()
 
 
-def test_shots_of_any_order_and_size(device, rng):
+def test_shots_of_any_order_and_size(device, figure):
     """What a renderer keeps of shots before changes nothing: the same bits as a new renderer's."""
-    clouds = [*figure(2)]
-    fewer = clouds[0].select(np.arange(0, len(clouds[0]), 2))
-    light, other = random_light(rng), random_light(rng)
+    one, two = figure
     sun = DirectionalLight(direction=(1, 0.5, -1), irradiance=(1, 1, 1))
     lamp = PointLight(position=(2, -2, 2), intensity=(3, 3, 3), radius=0.1)
-    inside = PointLight(position=tuple(np.median(clouds[0].positions, axis=0)), intensity=(1, 1, 1))
-    view, small = figure_camera(clouds[0]), figure_camera(clouds[0], (10, 11))
+    inside = PointLight(position=tuple(np.median(one.positions, axis=0)), intensity=(1, 1, 1))
+    first = Shot(cloud=one, camera=figure_camera(one), environment=SKY, lights=(sun,))
+    later = replace(first, cloud=two, environment=OTHER_SKY)
     shots = [
-        Shot(cloud=clouds[0], camera=view, environment=light, lights=(sun,)),
-        Shot(cloud=clouds[0], camera=figure_camera(clouds[0], azimuth=90.0), environment=light, lights=(sun,)),
-        Shot(cloud=clouds[0], camera=view, environment=light, environment_rotation=70.0, lights=(sun,)),
-        Shot(cloud=clouds[1], camera=view, environment=other, lights=(lamp,)),
-        Shot(cloud=clouds[1], camera=view, lights=(inside, sun)),
-        Shot(cloud=clouds[1], camera=view, environment=other, mesh=mesh_of(plate()), lights=(sun,)),
-        Shot(cloud=clouds[1], camera=view, environment=other, lights=(sun, lamp)),
-        Shot(cloud=fewer, camera=small, environment=light),
+        first,
+        replace(first, camera=figure_camera(one, azimuth=90.0)),
+        replace(first, environment_rotation=70.0),
+        later,  # under the same light
+        replace(later, lights=(lamp,)),
+        replace(later, environment=None, lights=(inside, sun)),
+        replace(later, mesh=mesh_of(plate())),
+        replace(later, lights=(sun, lamp)),
+        Shot(cloud=one.select(np.arange(0, len(one), 2)), camera=figure_camera(one, (10, 11)), environment=SKY),
     ]
     renderer = DeferredRenderer(SMALL, device=device)
     for shot in shots:
-        found, fresh = renderer.draw(shot), render(shot, device, SMALL)
+        found, fresh = renderer.draw(shot), DeferredRenderer(SMALL, device=device).draw(shot)
         np.testing.assert_array_equal(found.rgb, fresh.rgb)
         np.testing.assert_array_equal(found.alpha, fresh.alpha)
 
 
-def test_launching_is_drawing(device, rng):
+def test_launching_is_drawing(device, figure):
     """After Gaussians, light and camera changed, one launch shows what a new renderer does, to the bit."""
-    one, two = figure(2)
-    light = random_light(rng)
+    one, two = figure
     sun, lower = (DirectionalLight(direction=(1, 0.5, z), irradiance=(1, 1, 1)) for z in (-1.0, -0.3))
-    mesh = mesh_of(plate())
-    first = Shot(cloud=one, camera=figure_camera(one), environment=light, lights=(sun,), mesh=mesh)
+    first = Shot(cloud=one, camera=figure_camera(one), environment=SKY, lights=(sun,), mesh=mesh_of(plate()))
     frame = DeferredRenderer(SMALL, device=device).frame(first)
     drawn = frame.image()
     for again in (frame.launch, frame.launch_view, frame.launch):
         again()
         np.testing.assert_array_equal(frame.image().rgb, drawn.rgb)
-    later = Shot(
-        cloud=two,
-        camera=figure_camera(one, azimuth=60.0),
-        environment=light,
-        environment_rotation=25.0,
-        lights=(lower,),
-        mesh=mesh,
-    )
+    view = figure_camera(one, azimuth=60.0)
+    later = replace(first, cloud=two, camera=view, environment_rotation=25.0, lights=(lower,))
     frame.set(later)
     frame.launch()
     np.testing.assert_array_equal(frame.image().rgb, render(later, device, SMALL).rgb)
 
 
-def test_gaussians_moved_on_the_device(device, rng):
+def test_gaussians_moved_on_the_device(device, figure):
     """Who writes positions into the frame's arrays and launches sees them there, with shadows of where they are."""
-    one, two = figure(2)
-    shot = Shot(cloud=one, camera=figure_camera(one), environment=random_light(rng))
+    one, two = figure
+    shot = Shot(cloud=one, camera=figure_camera(one), environment=SKY)
     frame = DeferredRenderer(SMALL, device=device).frame(shot)
     before = frame.image().rgb
     frame.gaussians.positions.assign(two.positions)
@@ -427,40 +403,33 @@ def test_gaussians_moved_on_the_device(device, rng):
     np.testing.assert_array_equal(frame.image().rgb, before)
 
 
-def test_a_frame_refuses_what_does_not_fit(device):
-    cloud = figure()[0]
+def test_a_frame_refuses_what_does_not_fit(device, figure):
+    cloud = figure[0]
     frame = DeferredRenderer(PLAIN, device=device).frame(Shot(cloud=cloud, camera=figure_camera(cloud)))
     other = Shot(cloud=cloud, camera=figure_camera(cloud, (9, 9)))
     assert not frame.fits(other)
-    with pytest.raises(
-        InvalidOptionError, match="shot must have 6000 Gaussians and 20 x 30 pixels, got 6000 and 9 x 9"
-    ):
+    message = "shot must have 6000 Gaussians and 20 x 30 pixels, got 6000 and 9 x 9"
+    with pytest.raises(InvalidOptionError, match=message):
         frame.set(other)
 
 
-def test_same_bits_with_any_number_of_threads(rng, monkeypatch):
-    cloud = figure()[0]
+def test_same_bits_with_any_number_of_threads(figure, monkeypatch):
+    cloud = figure[0]
     lamp = PointLight(position=(1, -1, 1.5), intensity=(3, 3, 3), radius=0.1)
-    shot = Shot(
-        cloud=cloud,
-        camera=figure_camera(cloud, (60, 80)),
-        environment=random_light(rng),
-        lights=(lamp,),
-        mesh=mesh_of(plate()),
-    )
+    view = figure_camera(cloud, (60, 80))
+    shot = Shot(cloud=cloud, camera=view, environment=SKY, lights=(lamp,), mesh=mesh_of(plate()))
     images = []
     for threads in ("1", "2", "2"):
         monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-        images.append(render(shot, "cpu", SMALL).rgb)
+        images.append(DeferredRenderer(SMALL, device="cpu").draw(shot).rgb)
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[1], images[2])
 
 
-def test_samples_are_averaged(device, rng):
+def test_samples_are_averaged(device, figure):
     """Three by three samples a pixel are the means of the image of three times the side; layers by coverage."""
-    cloud = figure()[0]
-    view = figure_camera(cloud)
-    shot = Shot(cloud=cloud, camera=view, environment=random_light(rng))
+    view = figure_camera(figure[0])
+    shot = Shot(cloud=figure[0], camera=view, environment=SKY)
     found = render(shot, device, replace(PLAIN, samples=3))
     fine = render(replace(shot, camera=view.supersampled(3)), device)
     np.testing.assert_allclose(found.rgb, fine.rgb.reshape(30, 3, 20, 3, 3).mean(axis=(1, 3)), rtol=1e-5, atol=1e-7)
@@ -471,8 +440,8 @@ def test_samples_are_averaged(device, rng):
     np.testing.assert_allclose(found.layers["roughness"][seen], roughness[seen] / weight[seen], rtol=1e-4)
 
 
-def test_layers_are_those_of_rasterize(device):
-    cloud = figure()[0]
+def test_layers_are_those_of_rasterize(device, figure):
+    cloud = figure[0]
     view = figure_camera(cloud)
     raster = RasterOptions(antialiased=True, low_pass=0.1)
     found = render(Shot(cloud=cloud, camera=view), device, raster=raster)
@@ -492,13 +461,12 @@ def test_options_are_checked():
 
 def test_where_the_front_leaks_light_still_falls_on_the_front(device):
     """Before a far back, a front of 0.8: the mean depth lies between the two, in the shadow of the front."""
-    light = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
-    camera = Camera.look_at((0.01, 0.0, 3.0), (0.0, 0.0, 0.0), width=8, height=8, vertical_fov=4.0)
+    view = camera((0.01, 0.0, 3.0), size=8, fov=4.0)
     means = []
     for opacity in (0.8, 0.99):
         cloud = discs([[0, 0, 0], [0, 0, -1]], UP, 1.0, color=0.5)
-        cloud = cloud.with_arrays(scales=np.tile([1.0, 1.0, 1e-3], (2, 1)), opacities=[opacity, 0.99])
-        image = render(Shot(cloud=cloud, camera=camera, lights=(light,)), device)
+        cloud = cloud.with_arrays(scales=[[1.0, 1.0, 1e-3]] * 2, opacities=[opacity, 0.99])
+        image = render(Shot(cloud=cloud, camera=view, lights=(SUN,)), device)
         means.append(image.rgb.mean() / image.alpha.mean())
     # one surface of one material: what leaks is lit as the front is, shadowed by nothing that is nearer
     assert means[0] == pytest.approx(means[1], rel=0.02)

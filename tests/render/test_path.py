@@ -1,11 +1,13 @@
 """The offline renderer: energy, lights and shadows against closed forms, no bias, and where things go wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from support.estimates import LARGEST_Z, require_zero_mean
-from support.flat_scenes import brdf_twin, mesh_of, plate
-from support.shapes import quaternions_from_normals, sphere_points, tiles
+from support.flat_scenes import brdf_twin, mesh_of, nothing, plate
+from support.shapes import cloud_of, quaternions_from_normals, sphere_points, tiles
 
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError
 from beam_warp.light.ggx import specular_albedo
@@ -19,6 +21,7 @@ from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.shot import Shot, ShotMesh
 
 WHITE = EnvironmentMap.constant((1.0, 1.0, 1.0))
+SUN = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
 ALPHA_MAX = 0.99
 
 
@@ -37,20 +40,12 @@ def relightable(base_color=0.5, roughness=0.5, **arrays):
 def disc(height=0.0, normal=(0.0, 0.0, 1.0), *, size=1.0, opacity=ALPHA_MAX, center=(0.0, 0.0), **material):
     """One large flat Gaussian: a plane, as far as a narrow view of its middle is concerned."""
     normal = np.asarray(normal, float)[None] / np.linalg.norm(normal)
-    return relightable(
-        positions=np.array([[*center, height]]),
-        orientations=quaternions_from_normals(normal),
-        scales=np.array([[size, size, 1e-3 * size]]),
-        opacities=np.array([opacity]),
-        normals=normal,
-        **material,
-    )
+    place = {"positions": [[*center, height]], "orientations": quaternions_from_normals(normal), "normals": normal}
+    return relightable(**place, scales=[[size, size, 1e-3 * size]], opacities=[opacity], **material)
 
 
 def together(*clouds):
-    return GaussianCloud(
-        **{name: np.concatenate([cloud.arrays()[name] for cloud in clouds]) for name in clouds[0].arrays()}, axes="rfu"
-    )
+    return cloud_of(*(cloud.arrays() for cloud in clouds), axes="rfu")
 
 
 def ball(count=600, radius=1.0, **material):
@@ -59,8 +54,16 @@ def ball(count=600, radius=1.0, **material):
     return relightable(normals=points, **parts, **material)
 
 
-def from_above(width=8, fov=2.0, height=2.0):
-    return Camera.look_at((0.01, 0.0, height), (0.0, 0.0, 0.0), width=width, height=width, vertical_fov=fov)
+def look(eye, target=(0.0, 0.0, 0.0), *, size=4, fov=1.0):
+    """A square view."""
+    return Camera.look_at(eye, target, width=size, height=size, vertical_fov=fov)
+
+
+ABOVE = (0.01, 0.0, 2.0)
+
+
+def render(shot, device="cpu", **options):
+    return PathRenderer(PathOptions(**options), device=device).draw(shot)
 
 
 def brdf_cosine(n, v, light, base_color, roughness):
@@ -72,17 +75,18 @@ def brdf_cosine(n, v, light, base_color, roughness):
 
 @pytest.mark.parametrize("roughness", [0.03, 0.3, 0.6, 1.0])
 def test_a_white_plane_under_even_light_shows_it(device, roughness):
-    shot = Shot(cloud=disc(base_color=1.0, roughness=roughness), camera=from_above(), environment=WHITE)
-    image = PathRenderer(PathOptions(samples=256), device=device).draw(shot)
+    view = look(ABOVE, size=8, fov=2.0)
+    shot = Shot(cloud=disc(base_color=1.0, roughness=roughness), camera=view, environment=WHITE)
+    image = render(shot, device, samples=256)
     assert image.alpha.min() > 0.9
     assert np.allclose(image.rgb.mean() / image.alpha.mean(), 1.0, atol=0.01)  # the issue's bound on the furnace
 
 
 def test_a_white_ball_sends_back_all_that_arrives(device):
     """Light that one side of a dimple sends to the other is not lost: with bounces the furnace is even everywhere."""
-    camera = Camera.look_at((0.0, -4.0, 0.0), (0.0, 0.0, 0.0), width=12, height=12, vertical_fov=20.0)
-    shot = Shot(cloud=ball(base_color=1.0, roughness=0.7), camera=camera, environment=WHITE)
-    image = PathRenderer(PathOptions(samples=64, bounces=16), device=device).draw(shot)
+    view = look((0.0, -4.0, 0.0), size=12, fov=20.0)
+    shot = Shot(cloud=ball(base_color=1.0, roughness=0.7), camera=view, environment=WHITE)
+    image = render(shot, device, samples=64, bounces=16)
     inside = image.alpha > 0.99
     assert inside.sum() > 60
     assert np.allclose(image.rgb[inside].mean(), image.alpha[inside].mean(), atol=0.01)
@@ -99,9 +103,9 @@ LIGHTS = {
 @pytest.mark.parametrize("kind", LIGHTS)
 def test_lights_shed_what_their_units_say(device, kind, roughness):
     """Irradiance 3, 2, 1 at the middle from all of them: intensity over the distance squared."""
-    shot = Shot(cloud=disc(roughness=roughness), camera=from_above(), lights=(LIGHTS[kind],))
-    image = PathRenderer(PathOptions(samples=16), device=device).draw(shot)
-    expected = brdf_cosine((0, 0, 1), (0.01, 0, 2.0), (1, 0, 1), 0.5, roughness) * np.array([3.0, 2.0, 1.0])
+    shot = Shot(cloud=disc(roughness=roughness), camera=look(ABOVE, size=8, fov=2.0), lights=(LIGHTS[kind],))
+    image = render(shot, device, samples=16)
+    expected = brdf_cosine((0, 0, 1), ABOVE, (1, 0, 1), 0.5, roughness) * np.array([3.0, 2.0, 1.0])
     seen = image.rgb[3:5, 3:5].mean(axis=(0, 1)) / image.alpha[3:5, 3:5].mean()
     # pixels are off the middle by up to 0.02: of the direction to the light, 2 %, and of its distance squared
     assert np.allclose(seen, expected, rtol=0.03)
@@ -111,27 +115,21 @@ def test_lights_shed_what_their_units_say(device, kind, roughness):
 def test_a_light_of_a_size_sheds_as_much_as_a_point(device, roughness):
     """A sphere's irradiance on what faces it is that of a point, and samples of light and BSDF agree on it."""
     small = PointLight(position=(0.0, 0.0, 1.0), intensity=(1.0, 1.0, 1.0))
-    large = PointLight(position=(0.0, 0.0, 1.0), intensity=(1.0, 1.0, 1.0), radius=0.3)
-    camera = Camera.look_at((1.5, 0.0, 1.0), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
+    cloud = disc(base_color=1.0, roughness=roughness)
     means = []
-    for light in (small, large):
-        cloud = disc(base_color=1.0, roughness=roughness)
-        image = PathRenderer(PathOptions(samples=1024), device=device).draw(
-            Shot(cloud=cloud, camera=camera, lights=(light,))
-        )
+    for light in (small, replace(small, radius=0.3)):
+        image = render(Shot(cloud=cloud, camera=look((1.5, 0.0, 1.0)), lights=(light,)), device, samples=1024)
         means.append(image.rgb.mean() / image.alpha.mean())
     # off the mirror direction the lobe is flat enough over 17 degrees; the diffuse part is exact for a sphere
     assert np.isclose(means[1], means[0], rtol=0.03)
 
 
 def test_a_half_opaque_disc_takes_half_of_the_light(device):
-    light = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
-    camera = Camera.look_at((1.0, 0.0, 0.4), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    ground = disc(roughness=1.0)
-    renderer = PathRenderer(PathOptions(samples=16, bounces=0), device=device)
-    free = renderer.draw(Shot(cloud=ground, camera=camera, lights=(light,)))
+    ground = Shot(cloud=disc(roughness=1.0), camera=look((1.0, 0.0, 0.4)), lights=(SUN,))
     screen = disc(height=0.8, size=0.05, opacity=0.5)
-    shaded = renderer.draw(Shot(cloud=together(ground, screen), camera=camera, lights=(light,)))
+    renderer = PathRenderer(PathOptions(samples=16, bounces=0), device=device)
+    free = renderer.draw(ground)
+    shaded = renderer.draw(replace(ground, cloud=together(ground.cloud, screen)))
     # the middle 1 cm of a Gaussian of 5 cm: alpha 0.5 exp(-0.02 / 2)
     assert np.isclose(shaded.rgb[1:3, 1:3].mean() / free.rgb[1:3, 1:3].mean(), 0.5, atol=0.02)
 
@@ -142,10 +140,9 @@ def test_penumbras_are_as_wide_as_the_light_says(device):
     light = PointLight(position=(0.0, 0.0, height), intensity=(4.0, 4.0, 4.0), radius=radius)
     ground, wall = plate(half=4.0, color=0.5), plate(1.0, 4.0, -4.0, color=0.5)
     camera = Camera.look_at((0.0, -0.01, 0.9), (0.0, 0.0, 0.0), width=64, height=8, vertical_fov=6.0)
-    cloud = disc(height=50.0)  # nothing in view
+    shot = Shot(cloud=nothing(), camera=camera, lights=(light,), mesh=ground)
     renderer = PathRenderer(PathOptions(samples=256, bounces=0), device=device)
-    shaded = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=mesh_of(ground, wall)))
-    free = renderer.draw(Shot(cloud=cloud, camera=camera, lights=(light,), mesh=ground))
+    free, shaded = renderer.draw(shot), renderer.draw(replace(shot, mesh=mesh_of(ground, wall)))
     share = (shaded.rgb[..., 0] / free.rgb[..., 0]).mean(axis=0)
     x = (np.arange(64) + 0.5 - camera.center_x) / camera.focal_x * 0.9
     # the edge at x = 0, height 1 appears on the light's disc at 2 x' - x seen from x: its chord divides the disc
@@ -158,18 +155,16 @@ def test_penumbras_are_as_wide_as_the_light_says(device):
 def test_catchers_show_the_light_that_is_missing(device):
     """Under a small ball at height h a catcher's alpha is the share of a cosine sky that the ball hides: (r / h)^2."""
     radius, height = 0.25, 0.6
-    cloud = ball(2000, radius, base_color=0.0).with_arrays()
+    cloud = ball(2000, radius, base_color=0.0)
     cloud = cloud.with_arrays(positions=cloud.positions + np.float32([0.0, 0.0, height]))
-    camera = Camera.look_at((0.0, 1e-3, 0.3), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    shot = Shot(cloud=cloud, camera=camera, environment=WHITE, mesh=plate(half=50.0, catches=True))
-    image = PathRenderer(PathOptions(samples=1024), device=device).draw(shot)
+    mesh = plate(half=50.0, catches=True)
+    shot = Shot(cloud=cloud, camera=look((0.0, 1e-3, 0.3)), environment=WHITE, mesh=mesh)
+    image = render(shot, device, samples=1024)
     assert np.all(image.rgb == 0.0)
     # tiles reach beyond the ball by a part of their size, 4 % of its radius: 8 % of the hidden share
     assert np.isclose(image.alpha.mean(), (radius / height) ** 2, rtol=0.1)
-    away = Camera.look_at((30.0, 0.0, 1.0), (30.0, 1.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    free = PathRenderer(PathOptions(samples=64), device=device).draw(
-        Shot(cloud=cloud, camera=away, environment=WHITE, mesh=shot.mesh)
-    )
+    away = look((30.0, 0.0, 1.0), (30.0, 1.0, 0.0))
+    free = render(replace(shot, camera=away), device, samples=64)
     assert free.alpha.max() < 0.01
 
 
@@ -178,24 +173,16 @@ def test_a_mesh_alone_is_what_the_path_tracer_of_meshes_sees(device):
     mesh = trimesh.creation.icosphere(subdivisions=3)
     mesh.apply_transform(np.diag([1.0, 1.0, 0.4, 1.0]))
     count = len(mesh.vertices)
-    surface = MaterialMesh(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.vertex_normals,
-        base_color=np.full((count, 3), 0.7),
-        roughness=np.full(count, 0.4),
-    )
+    shape = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.vertex_normals}
+    surface = MaterialMesh(**shape, base_color=np.full((count, 3), 0.7), roughness=np.full(count, 0.4))
     part = ShotMesh(surface=surface, catches_shadows=np.zeros(len(mesh.faces), bool))
     rng = np.random.default_rng(1)
     sky = EnvironmentMap(rng.gamma(0.3, 1.0, (16, 32, 3)).astype(np.float32))
-    camera = Camera.look_at((0.0, -4.0, 1.0), (0.0, 0.0, 0.0), width=10, height=10, vertical_fov=30.0)
-    nothing = disc().select(np.zeros(0, int))
-    ours = PathRenderer(PathOptions(samples=512, bounces=3), device=device).draw(
-        Shot(cloud=nothing, camera=camera, environment=sky, mesh=part)
-    )
-    other = trace_radiance(
-        TracedMesh.from_mesh(part.surface, device=device), camera, sky, sample_count=512, bounce_count=3
-    )
+    view = look((0.0, -4.0, 1.0), size=10, fov=30.0)
+    shot = Shot(cloud=nothing(), camera=view, environment=sky, mesh=part)
+    ours = render(shot, device, samples=512, bounces=3)
+    traced = TracedMesh.from_mesh(surface, device=device)
+    other = trace_radiance(traced, view, sky, sample_count=512, bounce_count=3)
     assert np.abs(ours.alpha - other.alpha).max() < 0.1  # both count samples that meet an edge
     solid = (ours.alpha == 1.0) & (other.alpha == 1.0)
     assert solid.sum() > 10
@@ -208,10 +195,9 @@ def corner():
     wall = disc(normal=(0.0, -1.0, 0.0), height=0.0, size=2.0, center=(0.0, 1.3), base_color=0.8)
     sky = np.full((16, 32, 3), 0.3, np.float32)
     sky[5, 20] = (60.0, 50.0, 40.0)
-    camera = Camera.look_at((0.3, -4.0, 0.4), (0.0, 0.0, 0.0), width=6, height=6, vertical_fov=30.0)
     return Shot(
         cloud=together(ball(300, roughness=0.3), wall),
-        camera=camera,
+        camera=look((0.3, -4.0, 0.4), size=6, fov=30.0),
         environment=EnvironmentMap(sky),
         lights=(PointLight(position=(1.5, -1.5, 1.5), intensity=(3.0, 3.0, 3.0), radius=0.3),),
     )
@@ -219,10 +205,8 @@ def corner():
 
 def test_few_samples_have_the_mean_of_many(corner):
     """No bias: the z-scores of pixels over seeds, against sixteen times as many samples a seed."""
-    few = [PathRenderer(PathOptions(samples=4, bounces=3, seed=s), device="cpu").draw(corner).rgb for s in range(48)]
-    many = [
-        PathRenderer(PathOptions(samples=64, bounces=3, seed=1000 + s), device="cpu").draw(corner).rgb for s in range(6)
-    ]
+    few = [render(corner, samples=4, bounces=3, seed=s).rgb for s in range(48)]
+    many = [render(corner, samples=64, bounces=3, seed=1000 + s).rgb for s in range(6)]
     means = [np.asarray(images, np.float64).mean(axis=-1) for images in (few, many)]
     variance = sum(m.var(axis=0, ddof=1) / len(m) for m in means)
     # six seeds give a variance of its own noise: pooled over the image it is known well
@@ -232,36 +216,33 @@ def test_few_samples_have_the_mean_of_many(corner):
 
 
 def test_indirect_light_is_what_bounces_add(corner):
-    direct = PathRenderer(PathOptions(samples=64, bounces=0), device="cpu").draw(corner)
-    whole = PathRenderer(PathOptions(samples=64, bounces=2), device="cpu").draw(corner)
+    direct, whole = (render(corner, samples=64, bounces=bounces) for bounces in (0, 2))
     assert np.all(direct.layers["indirect"] == 0.0)
     assert np.allclose(whole.rgb - whole.layers["indirect"], direct.rgb, atol=1e-5)
     assert whole.layers["indirect"].mean() > 0.02 * whole.rgb.mean()
 
 
 def test_the_same_seed_gives_the_same_bits(corner, monkeypatch):
-    first = PathRenderer(PathOptions(samples=20), device="cpu").draw(corner)
+    first = render(corner, samples=20)
     monkeypatch.setenv("BEAM_WARP_THREADS", "1")
-    again = PathRenderer(PathOptions(samples=20), device="cpu").draw(corner)
-    other = PathRenderer(PathOptions(samples=20, seed=1), device="cpu").draw(corner)
+    again = render(corner, samples=20)
+    other = render(corner, samples=20, seed=1)
     assert np.array_equal(first.rgb, again.rgb)
     assert not np.array_equal(first.rgb, other.rgb)
 
 
 def test_turning_the_sky_is_a_turned_sky(corner):
     """A quarter is a whole number of columns, so that nothing is resampled."""
-    turned = Shot(**{**vars(corner), "environment_rotation": 90.0})
-    rotated = Shot(**{**vars(corner), "environment": corner.environment.rotated(90.0)})
-    options = PathOptions(samples=256, bounces=1)
-    a, b = (PathRenderer(options, device="cpu").draw(shot) for shot in (turned, rotated))
-    plain = PathRenderer(options, device="cpu").draw(corner)
+    turned = replace(corner, environment_rotation=90.0)
+    rotated = replace(corner, environment=corner.environment.rotated(90.0))
+    a, b, plain = (render(shot, samples=256, bounces=1) for shot in (turned, rotated, corner))
     require_zero_mean((a.rgb - b.rgb).reshape(-1, 3))
     assert np.abs(a.rgb - plain.rgb).mean() > 5.0 * np.abs(a.rgb - b.rgb).mean()
 
 
 def test_an_interrupted_render_ends_with_the_same_bits(corner, tmp_path):
-    options = PathOptions(samples=4 * PASS_SAMPLES, target_error=1e-6)
-    whole = PathRenderer(options, device="cpu").draw(corner)
+    renderer = PathRenderer(PathOptions(samples=4 * PASS_SAMPLES, target_error=1e-6), device="cpu")
+    whole = renderer.draw(corner)
     path = tmp_path / "frame.checkpoint"
 
     def stop(done, most):
@@ -269,12 +250,10 @@ def test_an_interrupted_render_ends_with_the_same_bits(corner, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        PathRenderer(options, device="cpu").draw(corner, checkpoint=path, report=stop)
+        renderer.draw(corner, checkpoint=path, report=stop)
     assert path.exists()
     seen = []
-    image = PathRenderer(options, device="cpu").draw(
-        corner, checkpoint=path, report=lambda done, most: seen.append(done)
-    )
+    image = renderer.draw(corner, checkpoint=path, report=lambda done, most: seen.append(done))
     assert seen == [2 * PASS_SAMPLES, 3 * PASS_SAMPLES, 4 * PASS_SAMPLES]
     assert np.array_equal(image.rgb, whole.rgb)
     assert not path.exists()
@@ -287,7 +266,7 @@ def test_checkpoints_of_something_else_are_not_taken_up(corner, tmp_path):
     progress.advance()
     progress.save(path)
     assert PathRenderer(options, device="cpu").start(corner).resume(path)
-    brighter = Shot(**{**vars(corner), "environment": corner.environment.scaled(2.0)})
+    brighter = replace(corner, environment=corner.environment.scaled(2.0))
     assert not PathRenderer(options, device="cpu").start(brighter).resume(path)
     assert not PathRenderer(PathOptions(samples=4 * PASS_SAMPLES), device="cpu").start(corner).resume(path)
     path.write_bytes(b"not a checkpoint")
@@ -297,26 +276,21 @@ def test_checkpoints_of_something_else_are_not_taken_up(corner, tmp_path):
 
 def test_adaptive_sampling_reaches_its_error_and_stops_where_it_is_reached(corner):
     target = 0.02
-    options = PathOptions(samples=2048, target_error=target, bounces=1)
-    camera = Camera.look_at((0.3, -4.0, 0.4), (0.0, 0.0, 0.0), width=24, height=24, vertical_fov=60.0)
-    shot = Shot(**{**vars(corner), "camera": camera})
-    image = PathRenderer(options, device="cpu").draw(shot)
+    shot = replace(corner, camera=look((0.3, -4.0, 0.4), size=16, fov=60.0))
+    image = render(shot, samples=1024, target_error=target, bounces=1)
     counts = image.layers["samples"]
     assert FEWEST_PASSES * PASS_SAMPLES <= counts.min() < counts.max()
-    reference = PathRenderer(PathOptions(samples=2048, bounces=1, seed=7), device="cpu").draw(shot)
+    reference = render(shot, samples=512, bounces=1, seed=7)
     luminance = [np.sqrt(np.maximum(i.rgb @ [0.2126, 0.7152, 0.0722], 1e-3)) for i in (image, reference)]
     assert np.sqrt(np.mean((luminance[0] - luminance[1]) ** 2)) < target
 
 
 def test_the_inside_of_a_surface_is_not_seen_through_its_leaks(device):
     """Two half-opaque discs back to back: what passes the front one shows the front one, not the dark inside."""
-    light = DirectionalLight(direction=(0.0, 0.0, -1.0), irradiance=(1.0, 1.0, 1.0), angular_diameter=0.0)
     front = disc(height=0.5, opacity=0.5, base_color=0.8, roughness=1.0, size=0.2)
     back = disc(height=0.0, normal=(0.0, 0.0, -1.0), base_color=0.1, size=2.0)
-    camera = Camera.look_at((0.01, 0.0, 2.0), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    image = PathRenderer(PathOptions(samples=64, bounces=0), device=device).draw(
-        Shot(cloud=together(front, back), camera=camera, lights=(light,))
-    )
+    shot = Shot(cloud=together(front, back), camera=look(ABOVE), lights=(SUN,))
+    image = render(shot, device, samples=64, bounces=0)
     assert np.allclose(image.layers["base_color"], 0.8, atol=1e-5)
     assert np.allclose(image.layers["depth"], 1.5, atol=2e-3)
     assert image.alpha.mean() > 0.98  # both together stop nearly all: 1 - 0.5 x 0.01
@@ -326,36 +300,30 @@ def test_layers_do_not_mix_what_is_apart(device):
     """The foreground of an outline and what is behind it are shaded apart, never at a place in between."""
     front = disc(height=1.0, opacity=0.5, base_color=0.9, size=0.2)
     back = disc(height=0.0, base_color=0.1, size=2.0)
-    camera = Camera.look_at((0.01, 0.0, 2.0), (0.0, 0.0, 0.0), width=4, height=4, vertical_fov=1.0)
-    progress = PathRenderer(PathOptions(samples=1, bounces=0), device=device)
-    depths = [progress.draw(Shot(cloud=together(front, back), camera=camera)).layers["depth"]]
-    progress.options = PathOptions(samples=1, bounces=0, seed=3)
-    depths.append(progress.draw(Shot(cloud=together(front, back), camera=camera)).layers["depth"])
+    shot = Shot(cloud=together(front, back), camera=look(ABOVE))
+    depths = [render(shot, device, samples=1, bounces=0, seed=seed).layers["depth"] for seed in (0, 3)]
     found = np.concatenate([d[d > 0.0] for d in depths])
     assert np.all((np.abs(found - 1.0) < 2e-3) | (np.abs(found - 2.0) < 4e-3))
     assert 4 < (found < 1.5).sum() < len(found) - 4
 
 
 def test_denoising_takes_noise_off(corner):
-    camera = Camera.look_at((0.3, -4.0, 0.4), (0.0, 0.0, 0.0), width=48, height=48, vertical_fov=20.0)
-    shot = Shot(**{**vars(corner), "camera": camera})
-    noisy = PathRenderer(PathOptions(samples=8), device="cpu").draw(shot)
-    clean = PathRenderer(PathOptions(samples=8, denoiser="bilateral"), device="cpu").draw(shot)
-    truth = PathRenderer(PathOptions(samples=128, seed=5), device="cpu").draw(shot)
+    shot = replace(corner, camera=look((0.3, -4.0, 0.4), size=32, fov=20.0))
+    noisy = render(shot, samples=8)
+    clean = render(shot, samples=8, denoiser="bilateral")
+    truth = render(shot, samples=64, seed=5)
     errors = [np.sqrt(np.mean((image.rgb - truth.rgb) ** 2)) for image in (noisy, clean)]
     assert errors[1] < 0.8 * errors[0]
     assert np.array_equal(noisy.alpha, clean.alpha)
 
 
 HARD_CASES = {
-    "no Gaussians": {"cloud": disc().select(np.zeros(0, int))},
+    "no Gaussians": {"cloud": nothing()},
     "no light": {"environment": None, "lights": ()},
     "black sky": {"environment": EnvironmentMap.constant((0.0, 0.0, 0.0)), "lights": ()},
     "light inside": {"lights": (PointLight(position=(0.0, 0.0, 0.0), intensity=(5.0, 5.0, 5.0), radius=0.3),)},
     "light on the surface": {"lights": (PointLight(position=(0.0, -1.0, 0.0), intensity=(5.0, 5.0, 5.0)),)},
-    "camera inside": {
-        "camera": Camera.look_at((0.0, -0.2, 0.0), (0.0, 1.0, 0.0), width=6, height=6, vertical_fov=60.0)
-    },
+    "camera inside": {"camera": look((0.0, -0.2, 0.0), (0.0, 1.0, 0.0), size=6, fov=60.0)},
     "mirror": {"cloud": ball(300, roughness=0.03)},
     "roughness 0": {"cloud": ball(300, roughness=0.0)},
     "roughness 1": {"cloud": ball(300, roughness=1.0)},
@@ -364,8 +332,8 @@ HARD_CASES = {
 
 @pytest.mark.parametrize("case", HARD_CASES)
 def test_hard_cases_are_finite(corner, device, case):
-    shot = Shot(**{**vars(corner), **HARD_CASES[case]})
-    image = PathRenderer(PathOptions(samples=32), device=device).draw(shot)
+    shot = replace(corner, **HARD_CASES[case])
+    image = render(shot, device, samples=32)
     for array in (image.rgb, image.alpha, *image.layers.values()):
         assert np.isfinite(array).all()
         assert array.shape[:2] == (shot.camera.height, shot.camera.width)
@@ -379,12 +347,13 @@ def test_a_sun_of_fifty_thousand_does_not_make_fireflies_of_direct_light(device)
     """The sky is drawn by its product with the cosine: a sun that is 5e4 times the rest is found by every sample."""
     sky = np.full((64, 128, 3), 0.2, np.float32)
     sky[16, 40] = 5e4
-    direction = EnvironmentMap(sky).directions()[16, 40]
-    shot = Shot(cloud=disc(roughness=1.0), camera=from_above(), environment=EnvironmentMap(sky))
-    image = PathRenderer(PathOptions(samples=64), device=device).draw(shot)
+    sky = EnvironmentMap(sky)
+    direction = sky.directions()[16, 40]
+    shot = Shot(cloud=disc(roughness=1.0), camera=look(ABOVE, size=8, fov=2.0), environment=sky)
+    image = render(shot, device, samples=64)
     values = image.rgb.mean(axis=-1) / image.alpha
     assert values.std() / values.mean() < 0.05
-    sun = 5e4 * EnvironmentMap(sky).solid_angles()[16, 0] * brdf_cosine((0, 0, 1), (0.01, 0, 2.0), direction, 0.5, 1.0)
+    sun = 5e4 * sky.solid_angles()[16, 0] * brdf_cosine((0, 0, 1), ABOVE, direction, 0.5, 1.0)
     assert np.isclose(values.mean(), sun + 0.2 * 0.5, rtol=0.05)  # the even sky: base colour and a little specular
 
 
@@ -398,9 +367,6 @@ def test_options_are_checked():
 
 def test_what_cannot_be_relit_is_refused(corner):
     with pytest.raises(InvalidArrayError, match="Decompose"):
-        Shot(
-            cloud=GaussianCloud(**{n: a for n, a in corner.cloud.arrays().items() if n != "roughness"}, axes="rfu"),
-            camera=corner.camera,
-        )
+        Shot(cloud=corner.cloud.with_arrays(roughness=None), camera=corner.camera)
     with pytest.raises(InvalidOptionError, match="axes"):
         Shot(cloud=corner.cloud.with_arrays(axes="rub"), camera=corner.camera)

@@ -193,9 +193,8 @@ class TestMistakes:
     def test_which_prim(self, tmp_path):
         author(tmp_path / "a.usda", prims=("/A/One", "/A/Two")).Save()
         assert read(tmp_path / "a.usda", prim_path="/A/Two").prim_path == "/A/Two"
-        with pytest.raises(
-            InvalidOptionError, match=r"prim must be a camera of .*, got '/A' \(it has /A/One, /A/Two\)"
-        ):
+        message = r"prim must be a camera of .*, got '/A' \(it has /A/One, /A/Two\)"
+        with pytest.raises(InvalidOptionError, match=message):
             read(tmp_path / "a.usda", prim_path="/A")
 
     def test_files(self, tmp_path):

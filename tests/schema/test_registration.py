@@ -26,9 +26,8 @@ def splats(stage):
 
 
 def run(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, **environment}
-    ).stdout
+    command, environment = [sys.executable, "-c", code], {**os.environ, **environment}
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
 
 
 def test_applies_to_particle_fields_only(splats):
@@ -126,10 +125,8 @@ def test_late_registration_warns_with_the_remedy():
 
 
 def test_other_hosts_find_the_schema_by_path():
-    code = (
-        f"from pxr import Usd; print(Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('{MATERIAL_API}') is not None)"
-    )
-    assert run(code, PXR_PLUGINPATH_NAME=str(PLUGIN_FOLDER)).strip() == "True"
+    known = f"Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('{MATERIAL_API}') is not None"
+    assert run(f"from pxr import Usd; print({known})", PXR_PLUGINPATH_NAME=str(PLUGIN_FOLDER)).strip() == "True"
 
 
 def test_plugin_type_differs_from_its_alias():

@@ -63,10 +63,6 @@ def drop_material(asset):
             asset.splats.RemoveProperty(name)
 
 
-def clear_color_space(asset):
-    asset.splats.GetAttribute("beam:baseColorh").ClearColorSpace()
-
-
 def both_precisions(asset):
     values = np.asarray(asset.splats.GetAttribute("opacitiesh").Get()).astype(np.float32)
     asset.set("opacities", Vt.FloatArray.FromNumpy(values))
@@ -97,14 +93,6 @@ def flipped_quaternions(asset):
     attribute.Set(Vt.QuathArray.FromNumpy(-np.array(attribute.Get(1.0))), 1.0)
 
 
-def no_gaussians(asset):
-    asset.open(GaussianSequence.from_clouds([asset.make_cloud(0, 0)]), "none.usdc")
-
-
-def shorter_opacities(asset):
-    asset.set("opacitiesh", Vt.HalfArray([0.5]))
-
-
 def cut_segment(asset):
     asset.open_clips()
     layer = asset.folder / "clips.000030.usdc"
@@ -124,10 +112,6 @@ def gap_in_clip(asset):
     asset.layer("clips.000030.usdc").EraseTimeSample("/Asset/Splats.beam:ambientOcclusionh", 35.0)
 
 
-def lost_reference(asset):
-    asset.root.GetReferences().AddReference("./nowhere.usdc")
-
-
 def no_low_pass(asset):
     asset.splats.CreateAttribute("beam:rasterLowPass", Sdf.ValueTypeNames.Float).Set(0.0)
 
@@ -143,18 +127,18 @@ BREAKERS = {
     "BEAM-STAGE-003": lambda asset: asset.stage.ClearMetadata("upAxis"),
     "BEAM-STAGE-004": lambda asset: asset.splats.SetTypeName("Xform"),
     "BEAM-STAGE-005": lambda asset: asset.stage.ClearMetadata("timeCodesPerSecond"),
-    "BEAM-STAGE-006": lost_reference,
+    "BEAM-STAGE-006": lambda asset: asset.root.GetReferences().AddReference("./nowhere.usdc"),
     "BEAM-GEO-001": lambda asset: asset.splats.RemoveProperty("opacitiesh"),
     "BEAM-GEO-002": both_precisions,
     "BEAM-GEO-003": lambda asset: UsdGeom.Xformable(asset.splats).AddScaleOp().Set((1.0, 2.0, 1.0)),
     "BEAM-GEO-004": lambda asset: asset.splats.RemoveProperty("extent"),
-    "BEAM-GEO-010": shorter_opacities,
+    "BEAM-GEO-010": lambda asset: asset.set("opacitiesh", Vt.HalfArray([0.5])),
     "BEAM-GEO-011": lambda asset: asset.change("positions", 2, np.nan, time=1.0),
     "BEAM-GEO-012": lambda asset: asset.change("orientationsh", 2, [0.0, 0.0, 0.0, 1.1], time=0.0),
     "BEAM-GEO-013": lambda asset: asset.change("scalesh", 2, -3.0),
     "BEAM-GEO-014": lambda asset: asset.change("opacitiesh", 2, 1.5),
     "BEAM-GEO-015": lambda asset: asset.change("extent", 1, 0.0, time=1.0),
-    "BEAM-GEO-016": no_gaussians,
+    "BEAM-GEO-016": lambda asset: asset.open(GaussianSequence.from_clouds([asset.make_cloud(0, 0)]), "none.usdc"),
     "BEAM-SH-001": lambda asset: asset.splats.RemoveProperty("radiance:sphericalHarmonicsDegree"),
     "BEAM-SH-002": lambda asset: asset.set("radiance:sphericalHarmonicsDegree", 2),
     "BEAM-API-001": drop_material,
@@ -169,7 +153,7 @@ BREAKERS = {
     "BEAM-MAT-015": lambda asset: asset.change("beam:normalConfidenceh", 2, 1.25),
     "BEAM-MAT-016": lambda asset: asset.change("beam:baseColorErrorh", 2, -0.25),
     "BEAM-MAT-017": lambda asset: asset.change("beam:observability", 2, 64),
-    "BEAM-COLOR-001": clear_color_space,
+    "BEAM-COLOR-001": lambda asset: asset.splats.GetAttribute("beam:baseColorh").ClearColorSpace(),
     "BEAM-COLOR-002": lambda asset: asset.set("beam:radianceColorSpace", "acescg"),
     "BEAM-RASTER-001": no_low_pass,
     "BEAM-TOKEN-001": lambda asset: asset.splats.RemoveProperty("beam:brdf"),

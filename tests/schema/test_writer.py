@@ -142,10 +142,8 @@ def test_extent_is_three_sigma_of_each_frame(cloud, written):
 @pytest.mark.parametrize("frames", [4, 65])
 def test_quaternions_keep_their_sign_over_time(cloud, written, frames):
     base = cloud()
-    clouds = [
-        base.with_arrays(orientations=base.orientations * (-1) ** frame, positions=base.positions + frame)
-        for frame in range(frames)
-    ]
+    changes = [(base.positions + frame, base.orientations * (-1) ** frame) for frame in range(frames)]
+    clouds = [base.with_arrays(positions=positions, orientations=turns) for positions, turns in changes]
     attribute = written(clouds, "a.usda", segment_length=30).GetAttribute("orientationsh")
     first = np.asarray(attribute.Get(0))
     assert all(np.array_equal(np.asarray(attribute.Get(frame)), first) for frame in range(frames))
@@ -167,9 +165,7 @@ def test_same_input_gives_the_same_bytes(tmp_path, sequence):
 
 def test_memory_does_not_grow_with_length(tmp_path, cloud):
     def lazy(frames):
-        def read(frame):
-            return cloud(frame, 1000, relightable=False, degree=2)
-
+        read = lambda frame: cloud(frame, 300, relightable=False, degree=2)  # noqa: E731
         return GaussianSequence(frame_count=frames, read_frame=read, topology="perFrame")
 
     peaks = []
@@ -182,19 +178,15 @@ def test_memory_does_not_grow_with_length(tmp_path, cloud):
     assert peaks[1] < 1.2 * peaks[0]
 
 
-def broken_after(sequence, frame):
-    def read(index):
-        if index == frame:
-            raise RuntimeError("the disk that holds the source went away")
-        return sequence[index]
-
-    return GaussianSequence(frame_count=len(sequence), read_frame=read)
-
-
 @pytest.mark.parametrize("name", ["a.usda", "a.usdz"])
-def test_a_failing_source_leaves_nothing(tmp_path, sequence, name):
+def test_a_failing_source_leaves_nothing(tmp_path, cloud, name):
+    def read(frame):
+        if frame == 40:
+            raise RuntimeError("the disk that holds the source went away")
+        return cloud(frame)
+
     with pytest.raises(RuntimeError, match="went away"):
-        write_asset(broken_after(sequence(65), 40), tmp_path / name)
+        write_asset(GaussianSequence(frame_count=65, read_frame=read), tmp_path / name)
     assert names(tmp_path) == []
 
 
@@ -240,16 +232,14 @@ def test_bad_sequences(tmp_path, cloud, sequence):
     target = tmp_path / "a.usda"
     with pytest.raises(InvalidOptionError, match=r"axes must be rub \(y up\) or rfu \(z up\).* got 'rdf'\. Convert"):
         write_asset(sequence(1, axes="rdf"), target)
-    mixed = GaussianSequence(2, [cloud(), cloud(axes="rfu")].__getitem__)
-    with pytest.raises(
-        InvalidOptionError, match=r"axes must be the same in every frame, got 'rfu' after 'rub' at frame 1"
+    for change, error, message in (
+        ({"axes": "rfu"}, InvalidOptionError, "axes must be the same in every frame, got 'rfu' after 'rub' at frame 1"),
+        ({"degree": None}, InvalidArrayError, "same arrays, got a difference in radiance at frame 1"),
+        ({"count": 3}, InvalidOptionError, "topology must be perFrame where counts change, got 3 .* after 6"),
     ):
-        write_asset(mixed, target)
-    with pytest.raises(InvalidArrayError, match=r"same arrays, got a difference in radiance at frame 1"):
-        write_asset(GaussianSequence(2, [cloud(), cloud(degree=None)].__getitem__), target)
-    shrinking = GaussianSequence(2, [cloud(), cloud(count=3)].__getitem__, topology="constant")
-    with pytest.raises(InvalidOptionError, match=r"topology must be perFrame where counts change, got 3 .* after 6"):
-        write_asset(shrinking, target)
+        frames = [cloud(), cloud(**change)]
+        with pytest.raises(error, match=message):
+            write_asset(GaussianSequence(2, frames.__getitem__, topology="constant"), target)
     assert names(tmp_path) == []
 
 

@@ -9,8 +9,8 @@ from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 
 def camera(target, side=9, fov=10.0, up=(0.0, 0.0, 1.0)):
-    return Camera.look_at((0.5, -3.0, 2.0), np.add((0.5, -3.0, 2.0), target), up=up, width=side, height=side,
-                          vertical_fov=fov)  # fmt: skip
+    eye = (0.5, -3.0, 2.0)
+    return Camera.look_at(eye, np.add(eye, target), up=up, width=side, height=side, vertical_fov=fov)
 
 
 @pytest.fixture
@@ -23,11 +23,9 @@ def smooth():
 @pytest.mark.parametrize("rotation", [0.0, 33.0, -90.0, 400.0])
 def test_it_shows_what_is_in_that_direction(smooth, target, rotation):
     view = camera(target)
-    angle = np.radians(rotation)
-    d = view.directions()
-    turned = np.stack(
-        [np.cos(angle) * d[..., 0] + np.sin(angle) * d[..., 1], np.cos(angle) * d[..., 1] - np.sin(angle) * d[..., 0],
-         d[..., 2]], axis=-1)  # fmt: skip
+    cosine, sine = np.cos(np.radians(rotation)), np.sin(np.radians(rotation))
+    x, y, z = np.moveaxis(view.directions(), -1, 0)
+    turned = np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
     # Between texels of pi / 128 a sine is off its chord by (pi / 128)^2 / 8 in each of two axes.
     np.testing.assert_allclose(Backdrop(smooth).seen(view, rotation), 2.0 + turned, atol=2 * (np.pi / 128) ** 2 / 8)
 

@@ -20,6 +20,7 @@ from beam_warp.stage.camera_paths import (
 from beam_warp.world.camera import Camera
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+STRETCHED = np.diag([2.0, 1.0, 1.0, 1.0])
 
 
 def pose(position=(0.0, 0.0, 0.0), turn=None):
@@ -75,8 +76,10 @@ class TestOrbit:
         assert path.degrees_per_second == -90.0
         np.testing.assert_allclose(path.camera_at(1.0, 8, 8).position, [-1.0, 0.0, 0.0], atol=1e-15)
 
-    @pytest.mark.parametrize("elevation", [-89.0, -30.0, 0.0, 20.0, 60.0, 90.0])
-    @pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 160)])
+    @pytest.mark.parametrize(
+        ("elevation", "width", "height"),
+        [(-89.0, 160, 90), (-30.0, 90, 160), (0.0, 160, 90), (20.0, 90, 160), (60.0, 160, 90), (90.0, 90, 160)],
+    )
     def test_a_turn_frames_the_subject_all_the_way_round_and_tightly(self, rng, elevation, width, height):
         subject = rng.normal((3.0, -2.0, 1.0), (1.0, 0.4, 0.7), size=(200, 3))
         lens = {"elevation": elevation, "margin": 1.25}
@@ -104,9 +107,8 @@ class TestOrbit:
         np.testing.assert_allclose(ours.camera_to_world, other.camera_to_world, atol=1e-12)
 
     def test_a_point_and_a_line_can_be_framed(self):
-        assert (
-            np.linalg.norm(OrbitPath(subject=np.zeros((1, 3)), degrees_per_second=1.0).camera_at(0, 9, 9).position) == 1
-        )
+        point = OrbitPath(subject=np.zeros((1, 3)), degrees_per_second=1.0)
+        assert np.linalg.norm(point.camera_at(0, 9, 9).position) == 1
         upright = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
         camera = OrbitPath(subject=upright, degrees_per_second=1.0, margin=1.0).camera_at(5.0, 64, 64)
         assert image_extent(camera, upright)[1] == pytest.approx(1.0, abs=1e-12)
@@ -186,16 +188,13 @@ class TestKeyframes:
         assert np.array_equal(catmull_rom(b, a, a, b, 0.3), a)
 
     def test_it_is_continuous(self):
-        path = KeyframePath(
-            tuple(key(t, p) for t, p in ((0, (0, 0, 0)), (1, (3, 0, 0)), (1.5, (3, 1, 0)), (4, (9, 9, 9))))
-        )
+        path = KeyframePath((key(0), key(1, (3, 0, 0)), key(1.5, (3, 1, 0)), key(4, (9, 9, 9))))
         for time in (1.0, 1.5):
             before, after = (path.camera_at(time + e, 8, 8).position for e in (-1e-7, 1e-7))
             assert np.linalg.norm(before - after) < 1e-5
-            speeds = [
-                path.camera_at(time + e, 8, 8).position - path.camera_at(time, 8, 8).position for e in (-1e-6, 1e-6)
-            ]
-            backward, forward = (speed / np.linalg.norm(speed) for speed in speeds)
+            here = path.camera_at(time, 8, 8).position
+            steps = [path.camera_at(time + e, 8, 8).position - here for e in (-1e-6, 1e-6)]
+            backward, forward = (step / np.linalg.norm(step) for step in steps)
             assert -backward @ forward > 1.0 - 1e-4  # no corner
 
     def test_a_target_stays_in_the_middle_and_the_camera_level(self):
@@ -219,19 +218,11 @@ class TestKeyframes:
         [
             (lambda: KeyframePath(()), InvalidOptionError, "keyframes must be 1 to 1000000, got 0"),
             (lambda: KeyframePath((key(1.0), key(1.0))), InvalidOptionError, r"keyframes\[1\].time must be after the"),
-            (
-                lambda: KeyframePath((key(0.0),), "cubic"),
-                InvalidOptionError,
-                "interpolation must be one of smooth, linear",
-            ),
+            (lambda: KeyframePath((key(0.0),), "cubic"), InvalidOptionError, "interpolation must be .* smooth, linear"),
             (lambda: key(np.nan), InvalidOptionError, "time must be a number in"),
             (lambda: key(0.0, fov=180.0), InvalidOptionError, r"fov must be a number in \[0.01, 179\], got 180.0"),
             (lambda: key(0.0, (0.0, np.nan, 0.0)), InvalidArrayError, "camera_to_world must be finite"),
-            (
-                lambda: Keyframe(time=0.0, camera_to_world=np.diag([2.0, 1.0, 1.0, 1.0])),
-                InvalidArrayError,
-                "camera_to_world must hold a rotation",
-            ),
+            (lambda: Keyframe(time=0.0, camera_to_world=STRETCHED), InvalidArrayError, "world must hold a rotation"),
         ],
     )
     def test_mistakes(self, make, error, message):
@@ -245,16 +236,17 @@ def written(folder, content, name="path.json"):
     return path
 
 
+EYE = {"time": 0, "camera_to_world": np.eye(4).tolist()}
+MIRRORED = EYE | {"camera_to_world": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}
+SHORT = EYE | {"camera_to_world": [1]}
+UNSORTED = [{"time": t, "position": [0, -1, 0], "target": [0, 0, 0]} for t in (0, 2, 1)]
+
+
 class TestOurFile:
     def test_positions_and_targets(self, tmp_path):
-        content = {
-            "interpolation": "linear",
-            "keyframes": [
-                {"time": 0, "position": [0, -4, 1], "target": [0, 0, 1]},
-                {"time": 2, "position": [0, -2, 1], "target": [0, 0, 1], "fov": 50},
-            ],
-        }
-        path = read_camera_path(written(tmp_path, content))
+        start = {"time": 0, "position": [0, -4, 1], "target": [0, 0, 1]}
+        end = start | {"time": 2, "position": [0, -2, 1], "fov": 50}
+        path = read_camera_path(written(tmp_path, {"interpolation": "linear", "keyframes": [start, end]}))
         expected = Camera.look_at((0, -3, 1), (0, 0, 1), width=80, height=60, vertical_fov=42.5)
         got = path.camera_at(1.0, 80, 60)
         np.testing.assert_allclose(got.camera_to_world, expected.camera_to_world, atol=1e-15)
@@ -264,8 +256,6 @@ class TestOurFile:
         frames = [{"time": 0, "camera_to_world": pose((1, 2, 3)).tolist(), "fov": 20}]
         camera = read_camera_path(written(tmp_path, frames)).camera_at(9.0, 8, 8)
         assert np.array_equal(camera.position, [1.0, 2.0, 3.0])
-
-    EYE = np.eye(4).tolist()
 
     @pytest.mark.parametrize(
         ("content", "message"),
@@ -280,26 +270,11 @@ class TestOurFile:
             ([{"time": 0, "position": [0, 0, 0], "target": [0, 0, 0]}], "keyframes[0].target must differ from eye"),
             ([{"time": 0, "position": [0, 0, 0], "target": [0, 0, 1]}], "keyframes[0]: up must not be parallel"),
             ('[{"time": 0, "position": [0, NaN, 0]}]', "keyframes[0].position must be 3 finite numbers, got [0, NaN,"),
-            (
-                [{"time": 0, "camera_to_world": [[1, 0], [0, 1]]}],
-                "keyframes[0].camera_to_world must have shape (4, 4), got (2, 2).",
-            ),
-            (
-                [{"time": 0, "camera_to_world": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}],
-                "keyframes[0].camera_to_world must hold a rotation",
-            ),
-            (
-                [{"time": 0, "camera_to_world": EYE, "target": [0, 0, 1]}],
-                "keyframes[0].target must be left out beside camera_to_world",
-            ),
-            (
-                [{"time": 0, "camera_to_world": EYE, "fov": 181}],
-                "keyframes[0].fov must be a number in [0.01, 179], got 181.0.",
-            ),
-            (
-                [{"time": t, "position": [0, -1, 0], "target": [0, 0, 0]} for t in (0, 2, 1)],
-                "keyframes[2].time must be after the one before (2), got 1. Sort the key frames by time.",
-            ),
+            ([SHORT], "keyframes[0].camera_to_world must have shape (4, 4), got (1,)."),
+            ([MIRRORED], "keyframes[0].camera_to_world must hold a rotation"),
+            ([EYE | {"target": [0, 0, 1]}], "keyframes[0].target must be left out beside camera_to_world"),
+            ([EYE | {"fov": 181}], "keyframes[0].fov must be a number in [0.01, 179], got 181.0."),
+            (UNSORTED, "keyframes[2].time must be after the one before (2), got 1. Sort the key frames by time."),
         ],
     )
     def test_mistakes(self, tmp_path, content, message):
@@ -319,18 +294,10 @@ class TestOurFile:
 class TestNerfstudio:
     def content(self, **changes):
         poses = [Camera.orbit((0, 0, 1), 3.0, a, 20.0, width=8, height=8, vertical_fov=40.0) for a in (0, 10, 20)]
-        entries = [
-            {"camera_to_world": (c.camera_to_world @ OPENGL).ravel().tolist(), "fov": 40, "aspect": 1} for c in poses
-        ]
-        return {
-            "camera_type": "perspective",
-            "render_height": 90,
-            "render_width": 160,
-            "fps": 10,
-            "seconds": 0.3,
-            "camera_path": entries,
-            "keyframes": [],
-        } | changes
+        matrices = [(camera.camera_to_world @ OPENGL).ravel().tolist() for camera in poses]
+        entries = [{"camera_to_world": matrix, "fov": 40, "aspect": 1} for matrix in matrices]
+        film = {"camera_type": "perspective", "render_height": 90, "render_width": 160, "fps": 10, "seconds": 0.3}
+        return film | {"camera_path": entries, "keyframes": []} | changes
 
     def test_one_pose_an_image(self, tmp_path):
         path = read_camera_path(written(tmp_path, self.content()))
@@ -346,10 +313,7 @@ class TestNerfstudio:
             ({"camera_type": "fisheye"}, "camera_type must be perspective, got 'fisheye'."),
             ({"camera_path": []}, "camera_path must be a list of 1 to 1000000 cameras, got []."),
             ({"camera_path": [1]}, "camera_path[0] must be an object, got 1."),
-            (
-                {"camera_path": [{"camera_to_world": [1, 2]}]},
-                "camera_path[0].camera_to_world must have shape (4, 4), got (2,).",
-            ),
+            ({"camera_path": [SHORT]}, "camera_path[0].camera_to_world must have shape (4, 4), got (1,)."),
             ({"camera_path": [{"fov": 1}]}, "camera_path[0].camera_to_world must"),
             ({"fps": 0}, "fps must be a number in [0.001, 1e+06], got 0."),
         ],

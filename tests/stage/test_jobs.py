@@ -89,9 +89,8 @@ def test_frames_are_rendered_once(pattern):
 
 
 def test_an_interrupted_sequence_goes_on(pattern):
-    with pytest.raises(
-        RenderInterruptedError, match=r"2 of 5 images are whole in .*f%03d.exr; the same command goes on"
-    ):
+    message = r"2 of 5 images are whole in .*f%03d.exr; the same command goes on"
+    with pytest.raises(RenderInterruptedError, match=message):
         job(MadeUpRenderer(stop_at=2)).render_frames(pattern, frames())
     assert sorted(path.name for path in pattern.folder.iterdir()) == [".f#.exr.frames.jsonl", "f000.exr", "f001.exr"]
     second = MadeUpRenderer()
@@ -153,30 +152,27 @@ def test_stills_are_written_over(tmp_path):
 
 @needs_ffmpeg
 class TestFilm:
+    def film(self, tmp_path, renderer, heard=None, **options):
+        work = job(renderer, heard=heard)
+        return work.render_film(Film(tmp_path / "x.mp4"), frames(), VideoOptions(crf=1), ffmpeg=FFMPEG, **options)
+
     def test_a_film_is_its_frames(self, tmp_path):
-        film, heard = Film(tmp_path / "x.mp4"), []
-        job(MadeUpRenderer(), heard=heard).render_film(film, frames(), VideoOptions(crf=1), ffmpeg=FFMPEG)
+        heard = []
+        self.film(tmp_path, MadeUpRenderer(), heard)
         assert [path.name for path in tmp_path.iterdir()] == ["x.mp4"]
         assert [entry for entry in heard if entry[0] == "encode"] == [("encode", n, 5) for n in range(1, 6)]
         with pytest.raises(OutputError, match=r"out must be a new file, got .*x.mp4, which is there. Pass --overwrite"):
-            job(MadeUpRenderer()).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG)
-        job(MadeUpRenderer()).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG, overwrite=True)
+            self.film(tmp_path, MadeUpRenderer())
+        self.film(tmp_path, MadeUpRenderer(), overwrite=True)
 
-    def test_an_interrupted_film_goes_on(self, tmp_path):
-        film = Film(tmp_path / "x.mp4")
+    @pytest.mark.parametrize(("decisive", "kept"), [("made up", [0, 1, 2]), ("other", [])])
+    def test_an_interrupted_film_goes_on_and_another_begins_again(self, tmp_path, decisive, kept):
         with pytest.raises(RenderInterruptedError, match="3 of 5 images are whole"):
-            job(MadeUpRenderer(stop_at=3)).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG)
+            self.film(tmp_path, MadeUpRenderer(stop_at=3))
         assert [path.name for path in tmp_path.iterdir()] == [".x.mp4.frames"]
-        second = MadeUpRenderer()
-        assert job(second).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG).kept == [0, 1, 2]
-        assert second.numbers == [3, 4]
-
-    def test_frames_of_another_film_are_rendered_again(self, tmp_path):
-        film = Film(tmp_path / "x.mp4")
-        with pytest.raises(RenderInterruptedError):
-            job(MadeUpRenderer(stop_at=3)).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG)
-        second = MadeUpRenderer(("other",))
-        assert job(second).render_film(film, frames(), VideoOptions(), ffmpeg=FFMPEG).kept == []
+        second = MadeUpRenderer((decisive,))
+        assert self.film(tmp_path, second).kept == kept
+        assert second.numbers == [number for number in range(5) if number not in kept]
 
 
 def test_a_film_that_cannot_be_encoded_is_refused_before_it_is_rendered(tmp_path):

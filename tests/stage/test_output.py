@@ -33,9 +33,8 @@ class TestNames:
         ["%04d_%04d.png", "%s.png", "100%.png", "%04d.mp4", "%04d/x.png", "%f.exr", "%4d.png", "%099d.png", "%%.png"],
     )
     def test_one_integer_field(self, name):
-        with pytest.raises(
-            InvalidOptionError, match="out must have one integer field in the name of an image, such as"
-        ):
+        message = "out must have one integer field in the name of an image, such as"
+        with pytest.raises(InvalidOptionError, match=message):
             parse_target(Path(name))
 
     @pytest.mark.parametrize("name", ["x.gif", "x", "x.jpg", "x.png.bak"])
@@ -105,9 +104,8 @@ class TestResume:
     def test_a_frame_of_another_size_is_not_ours(self, pattern):
         render(pattern, self.JOB)
         pattern.path(3).write_text("painted over")
-        with pytest.raises(
-            OutputError, match=r"f003.png of another input, option or version \(1 in all\). Pass --over"
-        ):
+        message = r"f003.png of another input, option or version \(1 in all\). Pass --over"
+        with pytest.raises(OutputError, match=message):
             render(pattern, self.JOB)
         assert render(pattern, self.JOB, overwrite=True) == [3]
 

@@ -19,10 +19,8 @@ def cloud(**changes):
 
 
 def mesh(catches=False):
-    surface = MaterialMesh(
-        vertices=np.eye(3), faces=[[0, 1, 2]], normals=np.tile([0, 0, 1.0], (3, 1)),
-        base_color=np.ones((3, 3)), roughness=np.ones(3),
-    )  # fmt: skip
+    shape = {"vertices": np.eye(3), "faces": [[0, 1, 2]], "normals": np.tile([0, 0, 1.0], (3, 1))}
+    surface = MaterialMesh(**shape, base_color=np.ones((3, 3)), roughness=np.ones(3))
     return ShotMesh(surface=surface, catches_shadows=np.array([catches]))
 
 

@@ -113,9 +113,8 @@ class TestPlacing:
     def test_on_the_ground_and_centred(self, rng):
         places = rng.normal((5.0, -3.0, 7.0), size=(50, 3))
         frames = sequence(*(cloud(places + np.array((0.0, 0.0, 0.1 * frame))) for frame in range(3)))
-        got = asset(
-            frames, on_ground=True, centered=True, rotate=(90.0, 0.0, 0.0), scale=0.5, translate=(1.0, 0.0, 2.0)
-        )
+        placed = {"rotate": (90.0, 0.0, 0.0), "scale": 0.5, "translate": (1.0, 0.0, 2.0)}
+        got = asset(frames, on_ground=True, centered=True, **placed)
         low, high = got.subject.min(axis=0), got.subject.max(axis=0)
         np.testing.assert_allclose([low[2], *(0.5 * (low + high))[:2]], [2.0, 1.0, 0.0], atol=1e-5)
         only = asset(frames, on_ground=True).placement.translation
@@ -136,10 +135,7 @@ class TestPlacing:
         [
             ({"translate": (0.0, 1.0)}, r"translate must have shape \(3,\), got \(2,\)"),
             ({"translate": (0.0, np.nan, 1.0)}, "translate must be finite"),
-            (
-                {"rotate": (0.0, 1.0)},
-                r"rotate must be an angle about z, or three angles about x, y and z, got \(0.0, 1.0\)",
-            ),
+            ({"rotate": (0.0, 1.0)}, r"rotate must be an angle about z, or three angles .* and z, got \(0.0, 1.0\)"),
             ({"rotate": np.nan}, "rotate must be a number in"),
             ({"start": np.inf}, "start must be a number in"),
         ],
@@ -149,10 +145,8 @@ class TestPlacing:
             asset(**options)
 
     def test_what_is_not_relightable(self):
-        with pytest.raises(
-            InvalidOptionError,
-            match=r"asset must be relightable, got one without roughness, normals in frame 0 of ghost. Estimate its",
-        ):
+        message = "asset must be relightable, got one without roughness, normals in frame 0 of ghost. Estimate its"
+        with pytest.raises(InvalidOptionError, match=message):
             asset(sequence(cloud(roughness=None, normals=None)), name="ghost")
 
 
@@ -225,9 +219,8 @@ class TestFramesThatDiffer:
         scene = stage(asset(sequence(cloud(np.zeros((4, 3))), cloud(np.zeros((6, 3)))), name="crowd"))
         assert scene.notes == ()
         assert [len(scene.shot(time, 8, 6).cloud) for time in (0.0, 0.04, 0.06, 0.1)] == [4, 4, 6, 6]
-        assert scene.notes == (
-            "crowd: frames have different numbers of Gaussians: the nearer frame is shown between frames",
-        )
+        (note,) = scene.notes
+        assert note == "crowd: frames have different numbers of Gaussians: the nearer frame is shown between frames"
 
     def test_empty_frames(self):
         none = np.zeros((0, 3))
@@ -249,9 +242,8 @@ class TestCamera:
     def test_by_default_it_frames_the_assets_from_the_front(self, rng):
         places = rng.normal(size=(100, 3))
         camera = Stage(assets=(asset(sequence(cloud(places)), translate=(9.0, 0.0, 0.0)),)).shot(0.0, 64, 48).camera
-        expected = Camera.frame_cloud(
-            places + np.array((9.0, 0.0, 0.0)), cloud(places).opacities, width=64, height=48, vertical_fov=35.0
-        )
+        moved = places + np.array((9.0, 0.0, 0.0))
+        expected = Camera.frame_cloud(moved, cloud(places).opacities, width=64, height=48, vertical_fov=35.0)
         np.testing.assert_allclose(camera.camera_to_world, expected.camera_to_world, atol=1e-5)
 
     def test_it_frames_all_assets_and_their_way(self):
@@ -265,9 +257,8 @@ class TestCamera:
     def test_meshes_alone_are_framed(self, tmp_path):
         write_mesh(trimesh.creation.box((1, 1, 1)), tmp_path / "box.ply")
         scene = read(tmp_path, {"meshes": ["box.ply"]})
-        np.testing.assert_allclose(
-            scene.shot(0.0, 8, 8).camera.project([[0.0, 0.0, 0.0]])[0, :2], [4.0, 4.0], atol=1e-6
-        )
+        middle = scene.shot(0.0, 8, 8).camera.project([[0.0, 0.0, 0.0]])[0, :2]
+        np.testing.assert_allclose(middle, [4.0, 4.0], atol=1e-6)
 
 
 def read(folder, content, name="stage.json", version=True):
@@ -296,9 +287,8 @@ class TestMeshes:
     def test_a_file_is_placed_and_joined_with_the_rest(self, tmp_path):
         write_mesh(trimesh.creation.icosphere(1, 1.0), tmp_path / "ball.ply")
         placed = {"path": "ball.ply", "translate": [0, 0, 5], "rotate": [0, 90, 0], "scale": 2, "roughness": 0.25}
-        scene = read(
-            tmp_path, {"meshes": [{"ground": True, "height": 1}, placed | {"base_color": [0.2, 0.4, 0.6]}, "ball.ply"]}
-        )
+        meshes = [{"ground": True, "height": 1}, placed | {"base_color": [0.2, 0.4, 0.6]}, "ball.ply"]
+        scene = read(tmp_path, {"meshes": meshes})
         surface = scene.mesh.surface
         assert surface.faces.max() == len(surface.vertices) - 1
         assert len(surface.faces) == 2 + 80 + 80
@@ -509,6 +499,10 @@ class TestDigest:
             scene.digest(0.0)
 
 
+KEYS_OF_NO_PLACE = {"type": "keyframes", "keyframes": [{"time": 0, "position": [0, 0], "target": [0, 1, 0]}]}
+LOOKS_NOWHERE = {"type": "fixed", "position": [0, 0, 0], "target": [0, 0, 0]}
+
+
 def changed(place, value):
     """The full stage with one field changed; ``...`` removes it."""
     content = copy.deepcopy(FULL)
@@ -571,16 +565,8 @@ class TestMistakes:
             (("camera", "subject"), [], "camera must have no field but type, center, distance, azimuth,"),
             (("camera", "degrees_per_second"), 3, "camera.turns must be left out beside degrees_per_second"),
             (("camera",), {"type": "keyframes"}, "camera.keyframes must be a list of 1 to 1000000 key frames,"),
-            (
-                ("camera",),
-                {"type": "keyframes", "keyframes": [{"time": 0, "position": [0, 0], "target": [0, 1, 0]}]},
-                "camera.keyframes[0].position must be 3 finite numbers, got [0, 0].",
-            ),
-            (
-                ("camera",),
-                {"type": "fixed", "position": [0, 0, 0], "target": [0, 0, 0]},
-                "camera.target must differ from eye, got [0.0, 0.0, 0.0] for both.",
-            ),
+            (("camera",), KEYS_OF_NO_PLACE, "camera.keyframes[0].position must be 3 finite numbers, got [0, 0]."),
+            (("camera",), LOOKS_NOWHERE, "camera.target must differ from eye, got [0.0, 0.0, 0.0] for both."),
             (("camera",), "lights.json", "camera: lights.json: keyframes[0] must have no field but time,"),
             (("camera",), {"type": "file", "path": "keys.json", "prim": "/C"}, "camera.prim must be left out"),
         ],
@@ -619,12 +605,11 @@ class TestMistakes:
     def test_no_file_and_no_json(self, tmp_path):
         with pytest.raises(MissingFileError, match="stage must be a readable file, got"):
             Stage.read(tmp_path / "none.json")
-        (tmp_path / "a.json").write_text("{")
-        with pytest.raises(AssetFormatError, match="stage must be JSON in UTF-8, got Expecting"):
-            Stage.read(tmp_path / "a.json")
-        (tmp_path / "a.json").write_bytes(b"\xff\xfe")
-        with pytest.raises(AssetFormatError, match="stage must be JSON in UTF-8, got"):
-            Stage.read(tmp_path / "a.json")
-        (tmp_path / "a.json").write_text("[1]")
-        with pytest.raises(AssetFormatError, match=r"a.json: must be an object, got \[1\]"):
-            Stage.read(tmp_path / "a.json")
+        for content, message in (
+            (b"{", "stage must be JSON in UTF-8, got Expecting"),
+            (b"\xff\xfe", "stage must be JSON in UTF-8, got"),
+            (b"[1]", r"a.json: must be an object, got \[1\]"),
+        ):
+            (tmp_path / "a.json").write_bytes(content)
+            with pytest.raises(AssetFormatError, match=message):
+                Stage.read(tmp_path / "a.json")

@@ -116,10 +116,8 @@ class TestBetweenFrames:
             "observability": ([1], [2], [1]),
             "roughness_error": ([0.0], [2.0], [0.5]),
         }
-        first, second = (
-            one(**{name: values[end] for name, values in ends.items()}, radiance_color_space=LINEAR_REC709)
-            for end in (0, 1)
-        )
+        given = [{name: values[end] for name, values in ends.items()} for end in (0, 1)]
+        first, second = (one(**arrays, radiance_color_space=LINEAR_REC709) for arrays in given)
         got = blend_clouds(first, second, 0.25)
         for name, values in ends.items():
             np.testing.assert_allclose(getattr(got, name), values[2], rtol=4 * EPSILON, atol=EPSILON, err_msg=name)
@@ -161,33 +159,29 @@ class TestBetweenFrames:
 
 
 class TestReading:
-    def counting(self, clouds):
-        read = []
+    def counting(self, **options):
+        """A sampler of four frames, and the frames that it has read."""
+        clouds, read = [sphere(0.1 * i) for i in range(4)], []
         source = GaussianSequence(len(clouds), lambda frame: (read.append(frame), clouds[frame])[1])
-        return source, read
+        return TimeSampler(source, **options), read
 
     def test_each_frame_is_read_once_as_time_goes_on(self):
-        source, read = self.counting([sphere(0.1 * i) for i in range(4)])
-        sampler = TimeSampler(source)
+        sampler, read = self.counting()
         assert read == []
         for place in np.arange(0.0, 3.01, 0.25):
             sampler.at(place)
         assert read == [0, 1, 2, 3]
 
     def test_two_frames_are_kept(self):
-        source, read = self.counting([sphere(0.1 * i) for i in range(4)])
-        sampler = TimeSampler(source)
+        sampler, read = self.counting()
         for place in (0.5, 1.5, 0.5, 0.25, 1.0):
             sampler.at(place)
         assert read == [0, 1, 2, 0]
 
     def test_the_nearest_only(self):
-        source, read = self.counting([sphere(0.1 * i) for i in range(4)])
-        sampler = TimeSampler(source, blend="nearest")
-        assert [sampler.at(place).positions[0, 0] for place in (1.4, 1.5)] == [
-            sphere(0.1).positions[0, 0],
-            sphere(0.2).positions[0, 0],
-        ]
+        sampler, read = self.counting(blend="nearest")
+        for place, turn in ((1.4, 0.1), (1.5, 0.2)):
+            assert np.array_equal(sampler.at(place).positions, sphere(turn).positions)
         assert read == [1, 2]
         assert sampler.notes == ()
 

@@ -1,5 +1,7 @@
 """A relightable asset of the demo figure: discs on its surface with its materials, the same ones in every frame."""
 
+from functools import cache
+
 import numpy as np
 
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for
@@ -11,10 +13,12 @@ from beam_warp.world.harmonics import SH_C0
 DISCS = 6_000
 OPENNESS = 0.8
 
+figure_for = cache(demo_figure_for)  # it takes most of the time, and tests of one run ask for one or two sizes
+
 
 def figure_asset(size=48, frame_count=2, metadata=None):
     """Opaque discs; ambient occlusion is `OPENNESS` everywhere, radiance is base colour under white light."""
-    figure = demo_figure_for(size)
+    figure = figure_for(size)
     faces = weights = None
     clouds = []
     for frame in range(frame_count):

@@ -6,30 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.harmonics import sh_color
 from scipy.spatial.transform import Rotation
+from support.radiant_cloud import radiant_cloud
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.axes import AXIS_CODES, TARGETS, axes_matrix, change_axes, handedness
-from beam_warp.world.gaussians import GaussianCloud
 
 EPSILON = np.finfo(np.float32).eps
 
 
-def make_cloud(rng, count=20, degree=3, axes="rdf"):
-    def units(width):
-        vectors = rng.normal(size=(count, width))
-        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-    return GaussianCloud(
-        positions=rng.normal(size=(count, 3)),
-        orientations=units(4),
-        scales=np.exp(rng.uniform(-6.0, 0.0, (count, 3))),
-        opacities=rng.uniform(size=count),
-        radiance=rng.normal(size=(count, (degree + 1) ** 2, 3)),
-        radiance_color_space=DISPLAY_SRGB,
-        normals=units(3),
-        axes=axes,
-    )
+def make_cloud(axes="rdf", degree=3):
+    return radiant_cloud(20, degree, materials=True, axes=axes)
 
 
 def covariances(cloud):
@@ -53,18 +39,17 @@ def test_there_are_48_codes_half_of_each_hand():
 
 
 @pytest.mark.parametrize("code", ["rd", "rdd", "RDF"])
-def test_a_wrong_code_or_scale_is_refused(code, rng):
+def test_a_wrong_code_or_scale_is_refused(code):
     with pytest.raises(InvalidOptionError, match=r"target must be three letters, one each of r/l, u/d and f/b, got"):
-        change_axes(make_cloud(rng), code)
+        change_axes(make_cloud(), code)
     with pytest.raises(InvalidOptionError, match=r"scale must be a number in \[1e-06, 1e\+06\], got nan"):
-        change_axes(make_cloud(rng), "rub", scale=float("nan"))
+        change_axes(make_cloud(), "rub", scale=float("nan"))
 
 
 @settings(max_examples=40, deadline=None)
 @given(source=st.sampled_from(AXIS_CODES), target=st.sampled_from(AXIS_CODES))
 def test_every_pair_keeps_what_is_meant(source, target):
-    rng = np.random.default_rng(7)
-    cloud = make_cloud(rng, axes=source)
+    cloud = make_cloud(source)
     moved = change_axes(cloud, target)
     matrix = axes_matrix(source, target)
     assert moved.axes == target
@@ -75,15 +60,14 @@ def test_every_pair_keeps_what_is_meant(source, target):
     expected = matrix @ covariances(cloud) @ matrix.T
     assert np.abs(covariances(moved) - expected).max() <= 16 * EPSILON
     # Colours: from the corresponding direction. 16 coefficients of at most 5, each rounded once.
-    directions = rng.normal(size=(len(cloud), 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = Rotation.random(len(cloud), rng=7).apply([0.0, 0.0, 1.0])
     seen, seen_moved = sh_color(cloud.radiance, directions), sh_color(moved.radiance, directions @ matrix.T)
     assert np.abs(seen - seen_moved).max() <= 16 * 5 * EPSILON
 
 
 @pytest.mark.parametrize("target", ["luf", "ruf", "rdb"])
-def test_a_pure_flip_and_back_is_bit_exact(target, rng):
-    cloud = make_cloud(rng, degree=4, axes="rub")
+def test_a_pure_flip_and_back_is_bit_exact(target):
+    cloud = make_cloud("rub", degree=4)
     back = change_axes(change_axes(cloud, target), "rub")
     for name, array in cloud.arrays().items():
         same = np.array_equal(getattr(back, name), array)
@@ -93,16 +77,16 @@ def test_a_pure_flip_and_back_is_bit_exact(target, rng):
     assert np.array_equal(back.orientations * signs, cloud.orientations)
 
 
-def test_unreal_is_in_centimetres(rng):
-    cloud = make_cloud(rng, axes="rub")
+def test_unreal_is_in_centimetres():
+    cloud = make_cloud("rub")
     axes, units = TARGETS["unreal"]
     moved = change_axes(cloud, axes, scale=units)
     assert np.allclose(moved.positions, 100.0 * cloud.positions[:, [2, 0, 1]] * [-1, 1, 1], rtol=2 * EPSILON)
     assert np.allclose(moved.scales, 100.0 * cloud.scales, rtol=EPSILON)
 
 
-def test_zeroth_degree_and_no_optional_arrays(rng):
-    cloud = make_cloud(rng, degree=0).with_arrays(normals=None)
+def test_zeroth_degree_and_no_optional_arrays():
+    cloud = make_cloud(degree=0).with_arrays(normals=None)
     assert change_axes(cloud, "rdf") is cloud  # nothing to do
     moved = change_axes(cloud, "fru")
     assert np.array_equal(moved.radiance, cloud.radiance)
