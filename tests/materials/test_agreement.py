@@ -28,7 +28,7 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.shapes import sphere_zone, tile
 
-SIZE = 64
+SIZE = 40
 
 
 def subject():
@@ -76,8 +76,9 @@ def sequence(cloud, count, metadata=None):
 
 
 def test_a_picture_by_content_is_warned_of():
-    assert judge_environment(studio()) == []
-    picture = EnvironmentMap(np.clip(studio().radiance * 2.0, 0.0, 1.0))
+    light = studio()
+    assert judge_environment(light) == []
+    picture = EnvironmentMap(np.clip(light.radiance * 2.0, 0.0, 1.0))
     assert [finding.code for finding in judge_environment(picture)] == ["ldr-environment"]
 
 

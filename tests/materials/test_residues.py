@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 from support.estimates import require_honest, require_zero_mean
+from support.flat_scenes import brdf_twin
 from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles
 
 from beam_warp import Camera, Scene
 from beam_warp.errors import InvalidOptionError
-from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, smith_lambda, specular_albedo
+from beam_warp.light.ggx import DIELECTRIC_F0, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.residues import surface_residues, view_surfaces
 from beam_warp.raster.sources import upload_gaussians
@@ -157,11 +158,8 @@ def quadrature(scene, found, environment, roughness, offset, cuts):
         h = w[up] + v
         h /= np.linalg.norm(h, axis=1, keepdims=True)
         fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (1.0 - h @ v) ** 5
-        alpha = roughness**2
-        shadowing = 1.0 / (1.0 + smith_lambda(n @ v, alpha) + smith_lambda(cosine[up], alpha))
-        lobe = ggx_distribution(h @ n, alpha) * shadowing * fresnel / (4.0 * (n @ v) * cosine[up])
-        diffuse.append(((1.0 - fresnel)[:, None] * arriving).sum(axis=0) / np.pi)
-        specular.append((lobe[:, None] * arriving).sum(axis=0))
+        diffuse.append((1.0 - fresnel) @ arriving / np.pi)
+        specular.append(brdf_twin(n, v, w[up], roughness) @ arriving)
     return np.array(diffuse), np.array(specular)
 
 

@@ -64,15 +64,11 @@ class TestCases:
         assert ((result >= truth.low) & (result <= truth.high)).all()
 
     @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
-    def test_cases_are_the_same_each_time(self, case):
-        one, other = case.build(), case.build()
-        assert np.array_equal(one.cloud.positions, other.cloud.positions)
-        assert np.array_equal(one.rays[0], other.rays[0])
-
-    @pytest.mark.parametrize("case", SMALL, ids=lambda case: case.name)
-    def test_rays_meet_something(self, case):
+    def test_cases_are_the_same_each_time_and_their_rays_meet_something(self, case):
         """A case whose rays all miss would prove nothing."""
-        stress = case.build()
+        stress, again = case.build(), case.build()
+        assert np.array_equal(stress.cloud.positions, again.cloud.positions)
+        assert np.array_equal(stress.rays[0], again.rays[0])
         if stress.known is None and len(stress.rays[0]):
             truth = stability.ReferenceVisibility.of(stress, Scene.from_gaussians(stress.cloud, "cpu"))
             assert (truth.rays.hits > 0).mean() > 0.5
@@ -98,14 +94,13 @@ class TestTheSuiteItself:
 
         assert self.outcome(monkeypatch, lose).faults == ("1 rays differ by more than rounding explains",)
 
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1.5])
-    def test_nonsense_is_noticed(self, monkeypatch, bad):
+    def test_nonsense_is_noticed(self, monkeypatch):
         def spoil(v):
-            v[3] = bad
+            v[3:7] = np.nan, np.inf, -0.1, 1.5
             return v
 
         outcome = self.outcome(monkeypatch, spoil, "duplicates on 2⁻ᵏ")
-        assert outcome.faults[0] == "1 rays are not finite or outside [0, 1]"
+        assert outcome.faults[0] == "4 rays are not finite or outside [0, 1]"
         assert np.isfinite(outcome.error)
 
     @pytest.mark.parametrize(
@@ -119,15 +114,7 @@ class TestTheSuiteItself:
             ("depth", lambda x: np.random.default_rng(0).permutation(x), "rays meet their thresholds out of order"),
             ("depth", lambda x: x * np.nan, "rays meet their thresholds out of order"),
         ],
-        ids=[
-            "biased light",
-            "NaN depth",
-            "negative depth",
-            "short normals",
-            "NaN normals",
-            "shuffled",
-            "NaN threshold",
-        ],
+        ids=["too light", "NaN depth", "depth behind", "short normals", "NaN normals", "shuffled", "NaN threshold"],
     )
     def test_wrong_surfaces_are_noticed(self, monkeypatch, name, change, fault):
         real = stability.closest_surface
