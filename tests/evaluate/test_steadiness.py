@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+import trimesh
 from support.figure_asset import changed, figure_asset
 
 from beam_warp.capture.capture import Capture
@@ -213,10 +214,8 @@ class TestSurface:
 
 def test_rays_stop_at_a_box(device):
     """Rays hit at the distance that arithmetic gives, from outside and from within; those that miss are NaN."""
-    corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [face for a, b, c, d in squares for face in ((a, b, c), (a, c, d))]
-    tree = SurfaceTree(corners, faces, device=device)
+    box = trimesh.creation.box(bounds=[(0, 0, 0), (1, 1, 1)])
+    tree = SurfaceTree(box.vertices, box.faces, device=device)
     slant = np.array([3.0, 0.0, 4.0]) / 5.0
     origins = [(-2.0, 0.3, 0.4), (0.4, 0.6, 0.3), (-2.0, 0.3, 1.4), (-0.75, 0.3, -1.2)]
     directions = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), slant]

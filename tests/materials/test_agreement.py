@@ -108,7 +108,7 @@ def test_silhouettes_of_the_same_are_the_same(cloud, views, device):
 def test_wrong_axes_are_refused_and_the_right_ones_named(cloud, views, code):
     """The sequence was written in other axes than it is read in; read as they are, it matches again."""
     wrong = replace(change_axes(cloud, code), axes=cloud.axes)
-    match = match_silhouettes(wrong, views, device="cpu")
+    match = match_silhouettes(wrong, views[:3], device="cpu")
     assert match.overlap < LEAST_OVERLAP
     assert match.finding is not None
     assert f"were {code}" in match.finding.remedy

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support.color_evidence import color_evidence
+from support.shapes import aligned
 
 from beam_warp.materials.base_color import SATURATED_PART, fill_from_neighbors, solve_base_color
-from beam_warp.world.gaussians import GaussianCloud, Observability
+from beam_warp.world.gaussians import Observability
 
 
 def evidence(count, **changes):
@@ -19,15 +20,8 @@ def evidence(count, **changes):
 
 def line(count):
     """Gaussians a metre apart on a line."""
-    positions = np.zeros((count, 3))
-    positions[:, 0] = np.arange(count)
-    return GaussianCloud(
-        positions=positions,
-        orientations=np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 4)),
-        scales=np.ones((count, 3)),
-        opacities=np.ones(count),
-        normal_confidence=np.ones(count),
-    )
+    positions = np.arange(count)[:, None] * [1.0, 0.0, 0.0]
+    return aligned(positions, 1.0, 1.0, normal_confidence=np.ones(count))
 
 
 NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}

@@ -1,5 +1,7 @@
 """What views show of Gaussians: closed forms on tiled spheres and planes, and what is behind a surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
@@ -138,10 +140,7 @@ class TestColors:
 
     def test_silhouettes_count_for_nothing(self, ball, device):
         cameras = around(2)
-        views = [
-            CapturedView(name=v.name, camera=v.camera, color=v.color * 0.0, alpha=v.alpha * 0.5)
-            for v in captured(ball, cameras)
-        ]
+        views = [replace(view, color=view.color * 0.0, alpha=view.alpha * 0.5) for view in captured(ball, cameras)]
         found = view_evidence(ball, cameras, views, device=device)
         assert (found.colors.numpy()[..., 3] == 0.0).all()
         assert found.seen.any()
