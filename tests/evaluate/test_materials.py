@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
@@ -34,44 +35,34 @@ def asset():
     return figure_asset()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_lights():
+    """Lights have few texels, which are quick to blur, and are read once, so that renderers know them again."""
+    read = EnvironmentMap.read
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EnvironmentMap, "read", cache(lambda path: read(path).resized(16, 32)))
+        yield
+
+
 @pytest.fixture(scope="module")
 def relighters():
     """One deferred renderer for all tests, which prepares a light once."""
-    renderers = {}
-
-    def make(raster, samples, device):
-        key = (raster, samples, device)
-        if key not in renderers:
-            renderers[key] = RELIGHTERS["deferred"](raster, samples, device)
-        return renderers[key]
-
-    return {"deferred": make}
+    return {"deferred": cache(RELIGHTERS["deferred"])}
 
 
 @pytest.fixture(scope="module")
-def capture(relit_capture, tmp_path_factory):
-    """The capture with other lights of the same names, of few texels: they are quick to blur."""
-    folder = shutil.copytree(relit_capture.folder, tmp_path_factory.mktemp("dim") / "capture")
-    for name in ("sunset", "stage"):
-        path = folder / "truth" / f"{name}.exr"
-        radiance = EnvironmentMap.read(path).resized(16, 32).radiance
-        write_exr(path, {part: radiance[..., index] for index, part in enumerate("RGB")})
-    return Capture.read(folder)
-
-
-@pytest.fixture(scope="module")
-def evaluated(asset, capture, tmp_path_factory):
+def evaluated(asset, relit_capture, tmp_path_factory):
     """The asset's scores against the traced truth, and the folder of its images."""
     renders = tmp_path_factory.mktemp("evaluated") / "renders"
-    found = evaluate_asset(asset, capture, EvaluateOptions(device="cpu"), renders=renders)
+    found = evaluate_asset(asset, relit_capture, EvaluateOptions(device="cpu"), renders=renders)
     return found, renders
 
 
 @pytest.fixture(scope="module")
-def mirror(evaluated, capture, tmp_path_factory):
+def mirror(evaluated, relit_capture, tmp_path_factory):
     """A capture whose truth is what the asset itself shows."""
     renders = evaluated[1]
-    folder = shutil.copytree(capture.folder, tmp_path_factory.mktemp("mirror") / "capture")
+    folder = shutil.copytree(relit_capture.folder, tmp_path_factory.mktemp("mirror") / "capture")
     content = json.loads((folder / "transforms.json").read_text())
     for record in content["frames"]:
         if "truth" in record:
@@ -221,14 +212,14 @@ def protocol(capture, renders):
 
 
 class TestAgainstTruth:
-    def test_numbers_are_those_of_the_protocol(self, evaluated, capture):
+    def test_numbers_are_those_of_the_protocol(self, evaluated, relit_capture):
         found, renders = evaluated
         scores = {**found.scores.mean_channels(), **found.scores.mean_relit()["deferred"]}
-        for name, (box, solid) in protocol(capture, renders).items():
+        for name, (box, solid) in protocol(relit_capture, renders).items():
             assert scores[name].psnr == pytest.approx(box, abs=1e-6), name
             assert scores[name].solid_psnr == pytest.approx(solid, abs=1e-6), name
 
-    def test_the_shared_tool_agrees(self, evaluated, capture, data_dir):
+    def test_the_shared_tool_agrees(self, evaluated, relit_capture, data_dir):
         """The shared tool, independent of this package, agrees: PSNR to its last digit, the others to theirs."""
         tool = data_dir.parent / "tools" / "score_capture.py"
         if not tool.is_file():
@@ -236,7 +227,7 @@ class TestAgainstTruth:
         found, renders = evaluated
         words = [f"{light}={renders / f'deferred_{light}'}" for light in ("sunset", "stage")]
         said = subprocess.run(
-            [sys.executable, tool, capture.folder, renders, "--relit", *words],
+            [sys.executable, tool, relit_capture.folder, renders, "--relit", *words],
             check=True,
             capture_output=True,
             text=True,
@@ -263,28 +254,20 @@ class TestAgainstTruth:
 
 class TestRefusals:
     @pytest.mark.parametrize(
-        ("change", "says"),
+        ("arrays", "options", "says"),
         [
-            (lambda cloud: {"positions": cloud.positions + np.float32(0.6)}, "asset must stand where the capture"),
-            (lambda _: {"axes": "rub"}, "Check the axes"),
-            (lambda _: {"roughness": None, "normals": None}, r"without roughness, normals in frame 0\. Estimate its"),
+            (lambda _: {}, {"frames": (7, 8)}, r"asset must show a frame whose truth is known \(0, 1\), got one of"),
+            (lambda _: {}, {"split": "train"}, "truth must be a capture whose train views have exact channels"),
+            (lambda cloud: {"positions": cloud.positions + np.float32(0.6)}, {}, "asset must stand where the capture"),
+            (lambda _: {"axes": "rub"}, {}, "Check the axes"),
+            (lambda _: {"roughness": None, "normals": None}, {}, r"without roughness, normals in frame 0\. Estimate"),
         ],
-        ids=["elsewhere", "lying", "without materials"],
+        ids=["frames", "truth", "place", "axes", "materials"],
     )
-    def test_assets(self, asset, capture, change, says):
+    def test_what_does_not_match(self, asset, relit_capture, arrays, options, says):
+        wrong = changed(asset, lambda _, cloud: cloud.with_arrays(**arrays(cloud)))
         with pytest.raises(InvalidOptionError, match=says):
-            score(changed(asset, lambda _, cloud: cloud.with_arrays(**change(cloud))), capture, "cpu")
-
-    @pytest.mark.parametrize(
-        ("options", "says"),
-        [
-            ({"frames": (7, 8)}, r"asset must show a frame whose truth is known \(0, 1\), got one of"),
-            ({"split": "train"}, "truth must be a capture whose train views have exact channels"),
-        ],
-    )
-    def test_truth_that_is_not_there(self, asset, capture, options, says):
-        with pytest.raises(InvalidOptionError, match=says):
-            score(asset, capture, "cpu", **options)
+            score(wrong, relit_capture, "cpu", **options)
 
     def test_a_light_that_is_not_there(self, asset, folder, relighters):
         (folder / "truth" / "stage.exr").unlink()

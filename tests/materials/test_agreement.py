@@ -31,12 +31,6 @@ from beam_warp.world.shapes import sphere_zone, tile
 SIZE = 40
 
 
-def subject():
-    """A figure that no turn maps to itself: balls of three sizes on three axes, off the origin."""
-    places = ((0.0, 0.1, 0.3, 0.3), (0.5, 0.1, 0.2, 0.15), (0.0, -0.4, 0.3, 0.2), (0.1, 0.1, 0.9, 0.12))
-    return tile(tuple(sphere_zone(np.array(place[:3]), place[3], -1.0, 1.0, 0.04) for place in places))
-
-
 def cameras(count=5):
     size = {"width": SIZE, "height": SIZE, "vertical_fov": 40.0}
     return [Camera.orbit((0, 0, 0.4), 3.0, 72.0 * k, 15.0 * (-1) ** k, **size) for k in range(count)]
@@ -44,7 +38,9 @@ def cameras(count=5):
 
 @pytest.fixture(scope="module")
 def cloud():
-    return subject()
+    """A figure that no turn maps to itself: balls of three sizes on three axes, off the origin."""
+    places = ((0.0, 0.1, 0.3, 0.3), (0.5, 0.1, 0.2, 0.15), (0.0, -0.4, 0.3, 0.2), (0.1, 0.1, 0.9, 0.12))
+    return tile(tuple(sphere_zone(np.array(place[:3]), place[3], -1.0, 1.0, 0.04) for place in places))
 
 
 @pytest.fixture(scope="module")

@@ -146,12 +146,8 @@ class TestRecovery:
             drawn = rasterize_values(cloud, camera, truth, device=device).values
             views.append(BakeTarget(camera, drawn, np.ones_like(drawn)))
         where = resolve_device(device)
-        found = bake(
-            upload_gaussians(cloud, where),
-            views,
-            options=BakeOptions(ridge=0.0, passes=60, tolerance=1e-5),
-            device=where,
-        )
+        options = BakeOptions(ridge=0.0, passes=60, tolerance=1e-5)
+        found = bake(upload_gaussians(cloud, where), views, options=options, device=where)
         seen = found.evidence[:, 0] > 5.0
         assert seen.sum() > 200
         error = np.abs(found.values - truth)[seen]

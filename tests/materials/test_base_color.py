@@ -18,12 +18,6 @@ def evidence(count, **changes):
     return made
 
 
-def line(count):
-    """Gaussians a metre apart on a line."""
-    positions = np.arange(count)[:, None] * [1.0, 0.0, 0.0]
-    return aligned(positions, 1.0, 1.0, normal_confidence=np.ones(count))
-
-
 NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
 """No view of the third Gaussian counts."""
 
@@ -42,7 +36,8 @@ NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
 )
 def test_what_is_without_evidence_says_why(why, flags):
     """Cut pixels leave no view, and none that faces the surface; that is neither want of light nor a grazing view."""
-    solved = solve_base_color(line(5), evidence(5, **why), np.pi)
+    line = aligned(np.arange(5)[:, None] * [1.0, 0.0, 0.0], 1.0, 1.0, normal_confidence=np.ones(5))
+    solved = solve_base_color(line, evidence(5, **why), np.pi)
     assert solved.observability.tolist() == [0, 0, int(flags), 0, 0]
     np.testing.assert_allclose(solved.base_color, 0.5)
 

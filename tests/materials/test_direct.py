@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import warp as wp
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
 
 from beam_warp import Scene, irradiance
@@ -31,20 +30,13 @@ def certain(cloud, scene, normals, offset="auto"):
     return SurfacePoints.at_centers(cloud, scene, surface, offset)
 
 
-@cache
-def _prepared(texels, shape, device):
-    """Blurring a light for every roughness takes seconds on a CPU: the same light is prepared once."""
-    environment = EnvironmentMap(np.frombuffer(texels, np.float32).reshape(shape))
-    return PreparedEnvironment(environment, wp.get_device(device))
-
-
-def prepared(environment, device):
-    return _prepared(environment.radiance.tobytes(), environment.radiance.shape, str(device))
+prepared = cache(PreparedEnvironment)
+"""Blurring a light for every roughness takes its time on a CPU: the same light is prepared once."""
 
 
 def decompose(cloud, normals, environment, device, options=None, frames=(0,)):
     scene = Scene.from_gaussians(cloud, device)
-    light = prepared(environment, scene.device)
+    light = prepared(environment, device)
     roughness = np.full(len(cloud), ROUGHNESS, np.float32)
     evidence = None
     chosen = options or MaterialOptions()
@@ -61,6 +53,7 @@ def reflected(base_color, irradiance):
     return (1.0 - SPECULAR_ALBEDO) * base_color * irradiance / np.pi + SPECULAR_ALBEDO * irradiance / np.pi
 
 
+@cache
 def sky():
     """Bright above, dim below, with a warm sun: nothing uniform about it."""
     radiance = EnvironmentMap.constant((0.3, 0.4, 0.6), height=32).radiance.copy()
@@ -243,14 +236,9 @@ class TestExposure:
         truth = rng.choice([0.05, 0.3, 0.8], (1500, 1), p=[0.4, 0.4, 0.2]) * np.ones(3)
         cloud = colored(cloud_of(tiles(points, points, spacing)), reflected(truth, np.pi), DISPLAY_SRGB)
         scene = Scene.from_gaussians(cloud, "cpu")
-        factor = estimate_exposure(
-            cloud,
-            scene,
-            certain(cloud, scene, points),
-            np.full(1500, ROUGHNESS, np.float32),
-            prepared(EVEN, scene.device).scaled(2.0**stops),
-            options=MaterialOptions(),
-        )
+        surface, rough = certain(cloud, scene, points), np.full(1500, ROUGHNESS, np.float32)
+        light = prepared(EVEN, "cpu").scaled(2.0**stops)
+        factor = estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions())
         assert abs(np.log2(factor) + stops) < 0.25
 
 
@@ -262,9 +250,8 @@ def test_views_are_unit_and_on_the_visible_side():
 
 
 def test_scaled_light_is_light_prepared_from_a_scaled_environment(device):
-    scene = Scene.from_gaussians(cloud_of(tiles(*[sphere_points(50)[0]] * 2, 0.5)), device)
-    one = prepared(sky(), scene.device).scaled(4.0)
-    other = PreparedEnvironment(sky().scaled(4.0), scene.device)
+    one = prepared(sky(), device).scaled(4.0)
+    other = PreparedEnvironment(sky().scaled(4.0), device)
     assert one.mean_irradiance == pytest.approx(other.mean_irradiance, rel=1e-6)
     for name in ("radiance", "luminance", "block_power", "row_cdf", "column_cdf", "block_direction"):
         ours, theirs = (getattr(light.blocks, name).numpy() for light in (one, other))

@@ -112,15 +112,8 @@ def decomposed():
     scene = Scene.from_gaussians(cloud, "cpu")
     surface = SurfacePoints.seen_by(cloud, evidence, scene)
     light = PreparedEnvironment(sky(), wp.get_device("cpu"))
-    measured = measure_materials(
-        cloud,
-        scene,
-        surface,
-        np.full(len(cloud), ROUGHNESS, np.float32),
-        light,
-        options=MaterialOptions(bounce=False),  # the model has none
-        views=evidence,
-    )
+    rough, options = np.full(len(cloud), ROUGHNESS, np.float32), MaterialOptions(bounce=False)  # the model has none
+    measured = measure_materials(cloud, scene, surface, rough, light, options=options, views=evidence)
     known = cloud.with_arrays(normal_confidence=surface.confidence)
     solved = solve_base_color(known, measured.evidence, light.mean_irradiance)
     good = (solved.observability & np.uint8(NOT_MEASURED)) == 0

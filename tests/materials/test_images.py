@@ -50,9 +50,7 @@ class Ball:
         points, spacing = sphere_points(count)
         # colours that neighbours share: a Gaussian is told from its neighbours by what pixels resolve
         steps = np.floor(2.0 * points + 2.0)
-        self.truth = (
-            (0.2 + 0.15 * steps).astype(np.float32) if truth is None else np.full((count, 3), truth, np.float32)
-        )
+        self.truth = np.float32(0.2 + 0.15 * steps if truth is None else np.full((count, 3), truth))
         self.cloud = cloud_of(tiles(points, points, spacing, opacity=0.95))
         self.scene = Scene.from_gaussians(self.cloud, device)
         self.light = even_light((1.0, 1.0, 1.0), device)
@@ -69,17 +67,11 @@ class Ball:
             name=f"view {number}", camera=camera, color=color.astype(np.float32), alpha=np.clip(drawn.alpha, 0.0, 1.0)
         )
 
-    def decompose(self, views=None, **options):
+    def decompose(self, views=None, light=None, **options):
         more = {k: options.pop(k) for k in ("previous", "frame", "progress") if k in options}
-        return decompose_by_images(
-            self.cloud,
-            self.scene,
-            self.views if views is None else views,
-            self.roughness,
-            self.light,
-            ImagePathOptions(**(FEW | options)),
-            **more,
-        )
+        shown = self.views if views is None else views
+        chosen = ImagePathOptions(**(FEW | options))
+        return decompose_by_images(self.cloud, self.scene, shown, self.roughness, light or self.light, chosen, **more)
 
 
 @cache
@@ -110,17 +102,14 @@ class TestKnownMaterials:
         cloud = cloud_of(tiles(floor, up, spacing, opacity=0.99), tiles(disc, up[: len(disc)], spacing, opacity=0.99))
         scene = Scene.from_gaussians(cloud, device)
         light = even_light((1.0, 1.0, 1.0), device)
-        cameras = [
-            Camera.orbit((0, 0, 0), 3.0, 90.0 * i, 14.0, width=64, height=32, vertical_fov=24.0) for i in range(4)
-        ]
         views = []
-        for camera in cameras:
+        for azimuth in (0.0, 90.0, 180.0, 270.0):
+            camera = Camera.orbit((0, 0, 0), 3.0, azimuth, 14.0, width=64, height=32, vertical_fov=24.0)
             drawn = rasterize_values(cloud, camera, np.zeros((len(cloud), 0), np.float32), device=device)
             color = np.repeat(0.3 * drawn.alpha[..., None], 3, axis=2)
             views.append(CapturedView(name="", camera=camera, color=color, alpha=np.clip(drawn.alpha, 0, 1)))
-        found = decompose_by_images(
-            cloud, scene, views, np.full(len(cloud), 0.9, np.float32), light, ImagePathOptions(**FEW)
-        )
+        roughness = np.full(len(cloud), 0.9, np.float32)
+        found = decompose_by_images(cloud, scene, views, roughness, light, ImagePathOptions(**FEW))
         middle = np.linalg.norm(floor[:, :2], axis=1) < 0.1
         seen = found.occlusion_evidence[: len(floor)][middle] > 0.5
         assert seen.sum() > 3
@@ -176,8 +165,7 @@ class TestGuards:
 
     def test_the_unlit_is_filled_from_neighbours(self, device):
         made = ball(device, truth=0.5)
-        dark = even_light((1.0, 1.0, 0.0), device)
-        found = decompose_by_images(made.cloud, made.scene, made.views, made.roughness, dark, ImagePathOptions(**FEW))
+        found = made.decompose(light=even_light((1.0, 1.0, 0.0), device))
         assert (found.color_evidence == 0.0).all()  # no light in the last channel
         assert found.filled[:, 0].all()
         assert not found.filled[:, 1].all()
@@ -188,14 +176,8 @@ class TestGuards:
         far = tiles(np.tile((0.0, 0.0, 9.0), (10, 1)), np.tile((0.0, 0.0, 1.0), (10, 1)), 0.1)
         near = {name: getattr(made.cloud, name) for name in far}
         cloud = cloud_of(near, far)
-        found = decompose_by_images(
-            cloud,
-            Scene.from_gaussians(cloud, device),
-            made.views,
-            np.full(len(cloud), ROUGHNESS, np.float32),
-            made.light,
-            ImagePathOptions(**FEW),
-        )
+        scene, roughness = Scene.from_gaussians(cloud, device), np.full(len(cloud), ROUGHNESS, np.float32)
+        found = decompose_by_images(cloud, scene, made.views, roughness, made.light, ImagePathOptions(**FEW))
         assert found.filled[-10:].all()
         assert not found.filled[:-10].all(axis=1).any()
         # the mean of eight Gaussians seen at grazing angles or through others
@@ -204,10 +186,8 @@ class TestGuards:
 
     def test_nothing_in_any_view(self, device):
         made = ball(device)
-        away = replace(
-            made.views[0], camera=Camera.orbit((0, 0, 99), 4.0, 0.0, 0.0, width=40, height=40, vertical_fov=36)
-        )
-        found = made.decompose([away])
+        elsewhere = Camera.orbit((0, 0, 99), 4.0, 0.0, 0.0, width=40, height=40, vertical_fov=36)
+        found = made.decompose([replace(made.views[0], camera=elsewhere)])
         assert "no view shows a surface: every value is a prior" in found.notes
         assert found.filled.all()
         assert np.isfinite(found.base_color).all()

@@ -132,18 +132,9 @@ class TestDiscretisation:
 
         Half is allowed, for edges grow and lifted origins open up, against each other and not at the same rate.
         """
-        errors = [
-            measure_occlusion(
-                shape,
-                "cpu",
-                spacing=shape.spacing * refinement,
-                point_count=6,
-                sample_count=4,
-                frame_count=4,
-                quadrature_count=512,
-            ).discretisation
-            for refinement in (1.0, 0.5, 0.25)
-        ]
+        few = {"point_count": 6, "sample_count": 4, "frame_count": 4, "quadrature_count": 512}
+        spacings = [shape.spacing * refinement for refinement in (1.0, 0.5, 0.25)]
+        errors = [measure_occlusion(shape, "cpu", spacing=each, **few).discretisation for each in spacings]
         if shape.name == "plane":
             assert max(errors) < 1e-9  # nothing on a plane lies above it
         else:
