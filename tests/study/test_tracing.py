@@ -52,18 +52,11 @@ class TestPlan:
         ):
             assert {each[name] for each in settings if name in each} == set(levels)
 
-    @pytest.mark.parametrize(
-        ("text", "meaning"),
-        [
-            ("auto", ("auto", 0.0)),
-            ("0.02", ("metres", 0.02)),
-            ("0.02 m", ("metres", 0.02)),
-            ("2t", ("thicknesses", 2.0)),
-            ("0", ("metres", 0.0)),
-        ],
-    )
-    def test_offsets(self, text, meaning):
-        assert parse_offset(text) == meaning
+    def test_offsets(self):
+        assert parse_offset("auto") == ("auto", 0.0)
+        assert parse_offset("2t") == ("thicknesses", 2.0)
+        assert parse_offset("0") == ("metres", 0.0)
+        assert parse_offset("0.02") == parse_offset("0.02 m") == ("metres", 0.02)
 
     @pytest.mark.parametrize(
         ("options", "says"),
