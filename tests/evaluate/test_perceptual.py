@@ -9,13 +9,9 @@ import pytest
 from beam_warp.evaluate.perceptual import LPIPS_SIDE, PerceptualMetrics, checkpoint_folder
 
 
-def without(monkeypatch, *names):
-    for name in names:
-        monkeypatch.setitem(sys.modules, name, None)  # importing it raises ImportError
-
-
-def pretend_lpips(monkeypatch, made):
-    """Packages that would download when a network is made, as the real ones do."""
+def pretend_lpips(monkeypatch):
+    """Packages that would download when a network is made, as the real ones do; return what networks are made of."""
+    made = []
     models = ModuleType("torchvision.models")
     url = "https://example.org/models/alexnet-0123.pth"
     models.AlexNet_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url=url))
@@ -32,10 +28,12 @@ def pretend_lpips(monkeypatch, made):
     monkeypatch.setitem(sys.modules, "torchvision", ModuleType("torchvision"))
     monkeypatch.setitem(sys.modules, "torchvision.models", models)
     monkeypatch.setitem(sys.modules, "lpips", lpips)
+    return made
 
 
 def test_what_is_not_installed_is_named_with_its_extra(monkeypatch):
-    without(monkeypatch, "flip_evaluator", "lpips")
+    for name in ("flip_evaluator", "lpips"):
+        monkeypatch.setitem(sys.modules, name, None)  # importing it raises ImportError
     found = PerceptualMetrics.installed()
     assert found.measures == {}
     assert found.absent["flip"].endswith("pip install 'beam-warp[evaluate]'")
@@ -44,8 +42,7 @@ def test_what_is_not_installed_is_named_with_its_extra(monkeypatch):
 
 
 def test_lpips_without_weights_makes_no_network(monkeypatch, tmp_path):
-    made = []
-    pretend_lpips(monkeypatch, made)
+    made = pretend_lpips(monkeypatch)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     found = PerceptualMetrics.installed()
     assert str(tmp_path / "hub" / "checkpoints" / "alexnet-0123.pth") in found.absent["lpips"]
@@ -53,8 +50,7 @@ def test_lpips_without_weights_makes_no_network(monkeypatch, tmp_path):
 
 
 def test_lpips_with_weights(monkeypatch, tmp_path):
-    made = []
-    pretend_lpips(monkeypatch, made)
+    made = pretend_lpips(monkeypatch)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     checkpoint_folder().mkdir(parents=True)
     (checkpoint_folder() / "alexnet-0123.pth").write_bytes(b"weights")
@@ -67,7 +63,7 @@ def test_lpips_with_weights(monkeypatch, tmp_path):
 
 
 def test_an_old_torchvision_is_said(monkeypatch):
-    pretend_lpips(monkeypatch, [])
+    pretend_lpips(monkeypatch)
     monkeypatch.setitem(sys.modules, "torchvision.models", ModuleType("torchvision.models"))
     assert "torchvision 0.13 or newer" in PerceptualMetrics.installed().absent["lpips"]
 

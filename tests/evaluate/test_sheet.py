@@ -15,13 +15,8 @@ from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
 @pytest.fixture(scope="module")
 def views(relit_capture):
     kept = []
-    score_materials(
-        figure_asset(),
-        relit_capture,
-        EvaluateOptions(samples=1, relighters=(), device="cpu"),
-        metrics=PerceptualMetrics(),
-        observe=kept.append,
-    )
+    asset, options = figure_asset(frame_count=1), EvaluateOptions(samples=1, relighters=(), device="cpu")
+    score_materials(asset, relit_capture, options, metrics=PerceptualMetrics(), observe=kept.append)
     return kept
 
 

@@ -71,9 +71,15 @@ class Problem:
             sides.append(np.sqrt(strength) * anchor[:, column].astype(np.float64))
         return np.concatenate(rows), np.concatenate(sides)
 
+    def best(self, column, low=0.0, high=1.0, **pulls):
+        """The column's values, by a dense solver on the triangle of its rows."""
+        a, b = self.dense(column, **pulls)
+        q, r = np.linalg.qr(a)
+        return lsq_linear(r, q.T @ b, (low, high), method="bvls", tol=1e-14, max_iter=1000).x
+
     def objective(self, values, column, **pulls):
         a, b = self.dense(column, **pulls)
-        return np.sum((a @ values[:, column].astype(np.float64) - b) ** 2)
+        return np.sum((a @ values.astype(np.float64) - b) ** 2)
 
 
 @cache
@@ -93,8 +99,7 @@ class TestOptimum:
         assert found.values.max() <= 1.0
         at_bounds = 0
         for column in range(columns):
-            a, b = made.dense(column, **pulls)
-            wanted = lsq_linear(a, b, (0.0, 1.0), tol=1e-14, max_iter=1000).x
+            wanted = made.best(column, **pulls)
             # both residuals are below 1e-6 of their start, of length 20 or so; the condition of A'A is below 1e3
             np.testing.assert_allclose(found.values[:, column], wanted, atol=2e-5)
             at_bounds += ((wanted < 1e-6) | (wanted > 1.0 - 1e-6)).sum()
@@ -103,9 +108,7 @@ class TestOptimum:
     def test_other_bounds(self, device):
         made = problem(device)
         found = made.bake(prior=made.prior, ridge=0.01, low=0.2, high=0.6, passes=200, tolerance=1e-6)
-        a, b = made.dense(0, ridge=0.01)
-        wanted = lsq_linear(a, b, (0.2, 0.6), tol=1e-14, max_iter=1000).x
-        np.testing.assert_allclose(found.values[:, 0], wanted, atol=2e-5)
+        np.testing.assert_allclose(found.values[:, 0], made.best(0, 0.2, 0.6, ridge=0.01), atol=2e-5)
         # the bounds themselves, as float32 holds them
         assert found.values.min() == np.float32(0.2)
         assert found.values.max() == np.float32(0.6)
@@ -117,17 +120,17 @@ class TestOptimum:
         assert len(found.residuals) < 60
         assert found.passes == len(found.residuals) + 1  # and one for the means, one for the first gradient
 
-    def test_tens_of_passes_do_what_a_thousand_steps_do(self, device):
+    def test_tens_of_passes_do_what_hundreds_of_steps_do(self, device):
         made = problem(device)
         quick = made.bake(prior=made.prior, ridge=0.01, passes=30, tolerance=0.0)
-        slow = made.bake(prior=made.prior, ridge=0.01, solver="adam", steps=1000)
+        slow = made.bake(prior=made.prior, ridge=0.01, solver="adam", steps=300)
         gaps = []
         for column in range(4):
-            a, b = made.dense(column, ridge=0.01)
-            best = 2.0 * lsq_linear(a, b, (0.0, 1.0), tol=1e-14, max_iter=1000).cost
-            gaps.append([made.objective(v.values, column, ridge=0.01) / best - 1.0 for v in (quick, slow)])
+            best = made.objective(made.best(column, ridge=0.01), column, ridge=0.01)
+            found = (made.objective(v.values[:, column], column, ridge=0.01) for v in (quick, slow))
+            gaps.append([objective / best - 1.0 for objective in found])
         gradients, adam = np.mean(gaps, axis=0)
-        assert slow.passes == pytest.approx(1000 / 3)
+        assert slow.passes == pytest.approx(100)
         assert adam < 0.01  # it is at the same problem
         assert gradients < adam
 
@@ -143,12 +146,8 @@ class TestRecovery:
             drawn = rasterize_values(cloud, camera, truth, device=device).values
             views.append(BakeTarget(camera, drawn, np.ones_like(drawn)))
         where = resolve_device(device)
-        found = bake(
-            upload_gaussians(cloud, where),
-            views,
-            options=BakeOptions(ridge=0.0, passes=60, tolerance=1e-5),
-            device=where,
-        )
+        options = BakeOptions(ridge=0.0, passes=60, tolerance=1e-5)
+        found = bake(upload_gaussians(cloud, where), views, options=options, device=where)
         seen = found.evidence[:, 0] > 5.0
         assert seen.sum() > 200
         error = np.abs(found.values - truth)[seen]

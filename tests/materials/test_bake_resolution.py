@@ -67,9 +67,8 @@ class TestBlocks:
         weights[: height // 2] = 0.0  # whole blocks of nothing
         held = np.where(weights > 0.0, targets, np.nan).astype(np.float32)
         camera = around(0.0, width, height)
-        found = reduced_target(
-            BakeTarget(camera, upload(held, float, where), upload(weights, float, where)), factor, where
-        )
+        target = BakeTarget(camera, upload(held, float, where), upload(weights, float, where))
+        found = reduced_target(target, factor, where)
         if factor == 1:
             np.testing.assert_array_equal(found.weights.numpy(), weights)
             return

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support.color_evidence import color_evidence
+from support.shapes import aligned
 
 from beam_warp.materials.base_color import SATURATED_PART, fill_from_neighbors, solve_base_color
-from beam_warp.world.gaussians import GaussianCloud, Observability
+from beam_warp.world.gaussians import Observability
 
 
 def evidence(count, **changes):
@@ -15,19 +16,6 @@ def evidence(count, **changes):
         for row, value in rows.items():
             getattr(made, name)[row] = value
     return made
-
-
-def line(count):
-    """Gaussians a metre apart on a line."""
-    positions = np.zeros((count, 3))
-    positions[:, 0] = np.arange(count)
-    return GaussianCloud(
-        positions=positions,
-        orientations=np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 4)),
-        scales=np.ones((count, 3)),
-        opacities=np.ones(count),
-        normal_confidence=np.ones(count),
-    )
 
 
 NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
@@ -48,7 +36,8 @@ NOTHING = {"numerator": {2: 0.0}, "denominator": {2: 0.0}, "observed": {2: 0.0}}
 )
 def test_what_is_without_evidence_says_why(why, flags):
     """Cut pixels leave no view, and none that faces the surface; that is neither want of light nor a grazing view."""
-    solved = solve_base_color(line(5), evidence(5, **why), np.pi)
+    line = aligned(np.arange(5)[:, None] * [1.0, 0.0, 0.0], 1.0, 1.0, normal_confidence=np.ones(5))
+    solved = solve_base_color(line, evidence(5, **why), np.pi)
     assert solved.observability.tolist() == [0, 0, int(flags), 0, 0]
     np.testing.assert_allclose(solved.base_color, 0.5)
 

@@ -1,9 +1,12 @@
 """Light at points and what it leaves in views, kernel by kernel, against float64: sums, residues, bounce, fit."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import warp as wp
 from support.estimates import LARGEST_Z
+from support.flat_scenes import brdf_twin
 from support.shapes import cloud_of, disc_points, sphere_points, tiles
 from support.structures import filled
 
@@ -50,10 +53,6 @@ def structured(directions):
         + np.exp(8.0 * (directions @ warm - 1.0))[..., None] * np.array([6.0, 4.0, 2.0])
         + np.exp(5.0 * (directions @ cool - 1.0))[..., None] * np.array([0.5, 1.0, 3.0])
     )
-
-
-def to_device(array, dtype, device):
-    return wp.array(np.ascontiguousarray(array, np.float32), dtype=dtype, device=device)
 
 
 class Points:
@@ -138,25 +137,15 @@ class TestGatheredLight:
             )
 
     def test_tilt_is_what_a_turn_of_the_normal_does(self, device, rng):
-        """d ln E / d angle, by central differences of E(n) = mean of (L V / (pi pdf)) n.w over the same rays."""
-        normals, directions, weights, visibility = random_rays(rng, 40, 64)
-        points = Points(normals, directions, weights, visibility, device)
-        found = points.gather(True, np.ones((40, 3)))["tilt"]
-        normals, directions, weights, visibility = (single(a) for a in (normals, directions, weights, visibility))
-        step = 1e-5
-        expected = np.empty(40)
-        for p in range(40):
-            n, w = normals[p], directions[p]
-            per_cosine = weights[p].sum(1) * visibility[p] / (w @ n)
-            across = np.linalg.svd(n[None])[2][1:]
-
-            def light(axis, angle, n=n, w=w, per_cosine=per_cosine):
-                turned = np.cos(angle) * n + np.sin(angle) * axis
-                return float((per_cosine * (w @ turned)).sum())
-
-            slopes = [(light(axis, step) - light(axis, -step)) / (2.0 * step) for axis in across]
-            expected[p] = np.hypot(*slopes) / light(across[0], 0.0)
-        # central differences of a sine err by step^2 / 6; dividing by small cosines magnifies the rounding of n.w
+        """E(n) = mean of (L V / (pi pdf)) n.w is n.F: d ln E / d angle is F's part across n over its part along n."""
+        rays = random_rays(rng, 40, 64)
+        found = Points(*rays, device).gather(True, np.ones((40, 3)))["tilt"]
+        normals, directions, weights, visibility = (single(array) for array in rays)
+        per_cosine = weights.sum(2) * visibility / np.einsum("pi,pki->pk", normals, directions)
+        flux = np.einsum("pk,pki->pi", per_cosine, directions)
+        along = (flux * normals).sum(1, keepdims=True)
+        expected = np.linalg.norm(flux - along * normals, axis=1) / along[:, 0]
+        # dividing by small cosines magnifies the rounding of n.w
         np.testing.assert_allclose(found, expected, rtol=64 * EPS / 1e-2)
 
     def test_points_without_light_are_stated_unknown_not_divided(self, device):
@@ -188,27 +177,17 @@ def variance_of_sum(terms, paired):
 
 @pytest.fixture(scope="module")
 def sky():
-    prepared = {}
-
-    def on(device):
-        if device not in prepared:
-            height = 64
-            prepared[device] = PreparedEnvironment(
-                EnvironmentMap(structured(texel_directions(height, 2 * height)).astype(np.float32)), device=device
-            )
-        return prepared[device]
-
-    return on
+    radiance = structured(texel_directions(64, 128)).astype(np.float32)
+    return cache(lambda device: PreparedEnvironment(EnvironmentMap(radiance), device=device))
 
 
-def even_rays(normals, samples, visible=None):
+def even_rays(normals, samples):
     """Rays evenly over the sphere (density 1 / 4 pi) under the structured sky; half of them lie below the surface."""
     count = len(normals)
     directions = np.tile(sphere_points(samples)[0], (count, 1, 1))
     cosine = np.maximum(np.einsum("pi,pki->pk", normals, directions), 0.0)
     weights = structured(directions) * (4.0 * cosine)[..., None]
-    visibility = np.ones((count, samples)) if visible is None else visible(directions)
-    return directions, weights, visibility
+    return directions, weights, np.ones((count, samples))
 
 
 def views_of(normals, cosines, rng):
@@ -218,16 +197,6 @@ def views_of(normals, cosines, rng):
     around = np.cos(phi)[..., None] * across[:, 0] + np.sin(phi)[..., None] * across[:, 1]
     c = np.asarray(cosines)[:, None, None]
     return c * normals + np.sqrt(1.0 - c * c) * around
-
-
-def specular_brdf(n, v, w, roughness):
-    """GGX with height-correlated Smith and Schlick's Fresnel, float64; rows of w."""
-    alpha = roughness * roughness
-    h = unit(v + w)
-    n_l, n_v = w @ n, float(v @ n)
-    masking = 1.0 / (1.0 + smith_lambda(n_l, alpha) + smith_lambda(n_v, alpha))
-    fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight(h @ v)
-    return ggx_distribution(h @ n, alpha) * masking * fresnel / (4.0 * n_l * n_v)
 
 
 class TestResidues:
@@ -262,29 +231,21 @@ class TestResidues:
     @pytest.mark.parametrize("roughness", [0.4, 0.8])
     def test_what_is_in_the_way_takes_its_share_of_the_lobe(self, device, rng, sky, roughness):
         normals = unit(rng.normal(size=(17, 3)))
-        wall = unit(np.array([0.2, 1.0, 0.1]))
-
-        def visible(directions):
-            return (directions @ wall < 0.1).astype(float)
-
-        rays = even_rays(normals, 512, visible)
-        free = even_rays(normals, 512)
+        directions, weights, everything = even_rays(normals, 512)
+        visibility = (directions @ unit(np.array([0.2, 1.0, 0.1])) < 0.1).astype(float)
         views = views_of(normals, self.COSINES, rng)
-        hidden = Points(normals, *rays, device, roughness=roughness)
-        opened = Points(normals, *free, device, roughness=roughness)
-        for points in (hidden, opened):
+        speculars = []
+        for seen in (visibility, everything):
+            points = Points(normals, directions, weights, seen, device, roughness=roughness)
             points.gather(True, np.ones((17, 3)))
-        specular, _ = hidden.residues(sky(device), views)
-        whole, _ = opened.residues(sky(device), views)
-        share = specular[..., 0] / whole[..., 0]
-        directions, weights, visibility = (single(array) for array in rays)
+            speculars.append(points.residues(sky(device), views)[0][..., 0])
+        share = speculars[0] / speculars[1]
+        directions, weights = single(directions), single(weights)
         for v in range(len(self.COSINES)):
             for p in range(17):
-                w = directions[p][directions[p] @ normals[p] > 1e-6]
-                power = (weights[p].sum(1) * 1.0)[directions[p] @ normals[p] > 1e-6]
-                lobe = power * specular_brdf(normals[p], views[v, p], w, roughness)
-                seen = visibility[p][directions[p] @ normals[p] > 1e-6]
-                expected = (lobe * seen).sum() / lobe.sum()
+                up = directions[p] @ normals[p] > 1e-6
+                lobe = weights[p, up].sum(1) * brdf_twin(normals[p], views[v, p], directions[p, up], roughness)
+                expected = (lobe * visibility[p, up]).sum() / lobe.sum()
                 # float32 of n.h at D's peak: relative error of D is at most 4 eps / alpha^2
                 assert abs(share[v, p] - expected) < 64 * EPS / roughness**4
 
@@ -440,9 +401,8 @@ class TestBounce:
             sample_count=self.SAMPLES,
         )
         out = wp.zeros(len(points), dtype=wp.vec3, device=device)
-        launch_trace_bounce(
-            scene, EXACT.settings(scene), batch, to_device(radiance, wp.vec3, device), (seed, 0), self.SAMPLES, out
-        )
+        sent = wp.array(np.float32(radiance), dtype=wp.vec3, device=device)
+        launch_trace_bounce(scene, EXACT.settings(scene), batch, sent, (seed, 0), self.SAMPLES, out)
         return out.numpy()
 
     def test_a_disc_overhead_sends_its_radiance_times_its_form_factor(self, device):

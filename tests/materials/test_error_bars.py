@@ -8,11 +8,12 @@ tiles, by the split sum and by the blending, and must say by how much.
 import numpy as np
 import pytest
 import warp as wp
+from support.flat_scenes import brdf_twin
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
 
 from beam_warp import Scene
 from beam_warp.capture.views import CapturedView
-from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
+from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials
@@ -72,23 +73,17 @@ def model(points, normals, ball_count, base_color, cameras):
     cosines = np.linspace(0.0, 1.0, 1001)
     albedo_table = specular_albedo(cosines, np.full(1001, ROUGHNESS))
     sent = np.zeros((len(cameras), len(points), 3))
-    alpha = ROUGHNESS**2
     for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        up = directions @ normal > 0.0
-        w = directions[up][visible(point, i < ball_count, directions[up])]
-        n_l = w @ normal
-        arriving = light[up][visible(point, i < ball_count, directions[up])] * n_l[:, None]
+        open_to = (directions @ normal > 0.0) & visible(point, i < ball_count, directions)
+        w = directions[open_to]
+        arriving = light[open_to] * (w @ normal)[:, None]
         diffuse = base_color[i] * arriving.sum(axis=0) / np.pi
-        masking_l = smith_lambda(n_l, alpha)
         for k, camera in enumerate(cameras):
             v = unit(camera.position - point)
             n_v = float(v @ normal)
             if n_v < 0.02:
                 continue
-            h = unit(w + v)
-            fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * schlick_weight(h @ v)
-            lobe = ggx_distribution(h @ normal, alpha) * fresnel / (1.0 + masking_l + smith_lambda(n_v, alpha))
-            specular = ((lobe / (4.0 * n_l * n_v))[:, None] * arriving).sum(axis=0)
+            specular = brdf_twin(normal, v, w, ROUGHNESS) @ arriving
             sent[k, i] = diffuse * (1.0 - np.interp(n_v, cosines, albedo_table)) + specular
     return sent
 
@@ -117,15 +112,8 @@ def decomposed():
     scene = Scene.from_gaussians(cloud, "cpu")
     surface = SurfacePoints.seen_by(cloud, evidence, scene)
     light = PreparedEnvironment(sky(), wp.get_device("cpu"))
-    measured = measure_materials(
-        cloud,
-        scene,
-        surface,
-        np.full(len(cloud), ROUGHNESS, np.float32),
-        light,
-        options=MaterialOptions(bounce=False),  # the model has none
-        views=evidence,
-    )
+    rough, options = np.full(len(cloud), ROUGHNESS, np.float32), MaterialOptions(bounce=False)  # the model has none
+    measured = measure_materials(cloud, scene, surface, rough, light, options=options, views=evidence)
     known = cloud.with_arrays(normal_confidence=surface.confidence)
     solved = solve_base_color(known, measured.evidence, light.mean_irradiance)
     good = (solved.observability & np.uint8(NOT_MEASURED)) == 0

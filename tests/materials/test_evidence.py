@@ -1,5 +1,7 @@
 """What views show of Gaussians: closed forms on tiled spheres and planes, and what is behind a surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
@@ -18,20 +20,10 @@ from beam_warp.world.harmonics import SH_C0
 SIDE = 96
 
 
-def around(count=8, distance=4.0, side=SIDE):
+def around(count=8):
     golden = 180.0 * (3.0 - 5.0**0.5)
-    return [
-        Camera.orbit(
-            (0.0, 0.0, 0.0),
-            distance,
-            azimuth=golden * k % 360.0,
-            elevation=float(np.degrees(np.arcsin(1.0 - (2.0 * k + 1.0) / count))),
-            width=side,
-            height=side,
-            vertical_fov=35.0,
-        )
-        for k in range(count)
-    ]
+    places = [(golden * k % 360.0, float(np.degrees(np.arcsin(1.0 - (2 * k + 1) / count)))) for k in range(count)]
+    return [Camera.orbit((0, 0, 0), 4.0, *place, width=SIDE, height=SIDE, vertical_fov=35.0) for place in places]
 
 
 @pytest.fixture
@@ -103,19 +95,14 @@ class TestSurface:
 
 
 class TestColors:
-    def test_a_perfect_fit_shows_its_own_colour(self, ball, device):
+    @pytest.mark.parametrize(("more", "tolerance"), [(0.0, 2e-5), (0.125, 1e-4)])
+    def test_what_the_fit_does_not_explain_is_added(self, ball, device, more, tolerance):
+        """Image and rendering are the same function of the same Gaussians: without more, nothing is spread back."""
         cameras = around()
-        colors, shown = shown_colors(ball, cameras, captured(ball, cameras, device=device), device=device)
-        truth = np.broadcast_to(0.5 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
-        # image and rendering are the same function of the same Gaussians: nothing is left to be spread back
-        np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=2e-5)
-
-    def test_what_the_fit_does_not_explain_is_added(self, ball, device):
-        cameras = around()
-        brighter = captured(ball, cameras, lambda color: color + 0.125 * (color.sum(axis=-1, keepdims=True) > 0.0))
-        colors, shown = shown_colors(ball, cameras, brighter, device=device)
-        truth = np.broadcast_to(0.625 + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
-        np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=1e-4)
+        views = captured(ball, cameras, lambda color: color + more * (color.sum(axis=-1, keepdims=True) > 0.0), device)
+        colors, shown = shown_colors(ball, cameras, views, device=device)
+        truth = np.broadcast_to(0.5 + more + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
+        np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=tolerance)
 
     def test_display_colour_is_decoded(self, ball, device):
         cameras = around(4)
@@ -138,10 +125,7 @@ class TestColors:
 
     def test_silhouettes_count_for_nothing(self, ball, device):
         cameras = around(2)
-        views = [
-            CapturedView(name=v.name, camera=v.camera, color=v.color * 0.0, alpha=v.alpha * 0.5)
-            for v in captured(ball, cameras)
-        ]
+        views = [replace(view, color=view.color * 0.0, alpha=view.alpha * 0.5) for view in captured(ball, cameras)]
         found = view_evidence(ball, cameras, views, device=device)
         assert (found.colors.numpy()[..., 3] == 0.0).all()
         assert found.seen.any()

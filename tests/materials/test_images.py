@@ -1,6 +1,7 @@
 """The image path as a whole: known materials come back from closed-form captures; guards, fills, notes, refusals."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,6 +38,11 @@ def around(count, size=40):
     ]
 
 
+@cache
+def even_light(radiance, device):
+    return PreparedEnvironment(EnvironmentMap.constant(radiance, height=16), device)
+
+
 class Ball:
     """A convex body under even light: its radiance is rho (1 - E) + E, E the albedo of the specular lobe."""
 
@@ -44,12 +50,10 @@ class Ball:
         points, spacing = sphere_points(count)
         # colours that neighbours share: a Gaussian is told from its neighbours by what pixels resolve
         steps = np.floor(2.0 * points + 2.0)
-        self.truth = (
-            (0.2 + 0.15 * steps).astype(np.float32) if truth is None else np.full((count, 3), truth, np.float32)
-        )
+        self.truth = np.float32(0.2 + 0.15 * steps if truth is None else np.full((count, 3), truth))
         self.cloud = cloud_of(tiles(points, points, spacing, opacity=0.95))
         self.scene = Scene.from_gaussians(self.cloud, device)
-        self.light = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0), height=32), self.scene.device)
+        self.light = even_light((1.0, 1.0, 1.0), device)
         self.roughness = np.full(count, ROUGHNESS, np.float32)
         self.views = [self.capture(camera, device, i) for i, camera in enumerate(around(views))]
 
@@ -63,23 +67,22 @@ class Ball:
             name=f"view {number}", camera=camera, color=color.astype(np.float32), alpha=np.clip(drawn.alpha, 0.0, 1.0)
         )
 
-    def decompose(self, views=None, **options):
+    def decompose(self, views=None, light=None, **options):
         more = {k: options.pop(k) for k in ("previous", "frame", "progress") if k in options}
-        return decompose_by_images(
-            self.cloud,
-            self.scene,
-            self.views if views is None else views,
-            self.roughness,
-            self.light,
-            ImagePathOptions(**(FEW | options)),
-            **more,
-        )
+        shown = self.views if views is None else views
+        chosen = ImagePathOptions(**(FEW | options))
+        return decompose_by_images(self.cloud, self.scene, shown, self.roughness, light or self.light, chosen, **more)
+
+
+@cache
+def ball(device, **options):
+    return Ball(device, **options)
 
 
 class TestKnownMaterials:
     @pytest.mark.parametrize("solver", ["cg", "adam"])
     def test_ball_under_even_light(self, device, solver):
-        made = Ball(device)
+        made = ball(device)
         found = made.decompose(solver=solver, steps=300)
         seen = found.color_evidence > 2.0
         assert seen.mean() > 0.8
@@ -98,18 +101,15 @@ class TestKnownMaterials:
         up = np.tile((0.0, 0.0, 1.0), (len(floor), 1))
         cloud = cloud_of(tiles(floor, up, spacing, opacity=0.99), tiles(disc, up[: len(disc)], spacing, opacity=0.99))
         scene = Scene.from_gaussians(cloud, device)
-        light = PreparedEnvironment(EnvironmentMap.constant((1, 1, 1), height=32), scene.device)
-        cameras = [
-            Camera.orbit((0, 0, 0), 3.0, 90.0 * i, 14.0, width=64, height=32, vertical_fov=24.0) for i in range(4)
-        ]
+        light = even_light((1.0, 1.0, 1.0), device)
         views = []
-        for camera in cameras:
+        for azimuth in (0.0, 90.0, 180.0, 270.0):
+            camera = Camera.orbit((0, 0, 0), 3.0, azimuth, 14.0, width=64, height=32, vertical_fov=24.0)
             drawn = rasterize_values(cloud, camera, np.zeros((len(cloud), 0), np.float32), device=device)
             color = np.repeat(0.3 * drawn.alpha[..., None], 3, axis=2)
             views.append(CapturedView(name="", camera=camera, color=color, alpha=np.clip(drawn.alpha, 0, 1)))
-        found = decompose_by_images(
-            cloud, scene, views, np.full(len(cloud), 0.9, np.float32), light, ImagePathOptions(**FEW)
-        )
+        roughness = np.full(len(cloud), 0.9, np.float32)
+        found = decompose_by_images(cloud, scene, views, roughness, light, ImagePathOptions(**FEW))
         middle = np.linalg.norm(floor[:, :2], axis=1) < 0.1
         seen = found.occlusion_evidence[: len(floor)][middle] > 0.5
         assert seen.sum() > 3
@@ -121,7 +121,7 @@ class TestKnownMaterials:
 class TestResolution:
     def test_pixels_far_finer_than_splats_are_baked_in_blocks(self, device, monkeypatch):
         """Splats of five pixels: the note says so, and what is drawn of the result is as of a bake of all pixels."""
-        made = Ball(device, count=40)
+        made = ball(device, count=40)
         found = made.decompose()
         assert any(note.startswith("baked from means of 2 x 2 pixels") for note in found.notes)
         monkeypatch.setattr(image_path, "reduction_factor", lambda *_, **__: 1)
@@ -141,7 +141,7 @@ class TestResolution:
 
 class TestGuards:
     def test_black_and_overbright_pixels_stay_in_bounds(self, device):
-        made = Ball(device)
+        made = ball(device)
         dark = [replace(view, color=np.zeros_like(view.color)) for view in made.views]
         bright = [replace(view, color=view.color * np.float32(100.0)) for view in made.views]
         assert made.decompose(dark).base_color.max() < 0.01
@@ -149,7 +149,7 @@ class TestGuards:
 
     def test_pixels_not_of_the_subject_count_for_nothing(self, device):
         """Half of every image is said not to be the subject, and holds nonsense."""
-        made = Ball(device)
+        made = ball(device)
         wanted = made.decompose()
         damaged = []
         for view in made.views:
@@ -164,27 +164,20 @@ class TestGuards:
         np.testing.assert_array_equal(found.occlusion_evidence, wanted.occlusion_evidence)
 
     def test_the_unlit_is_filled_from_neighbours(self, device):
-        made = Ball(device, truth=0.5)
-        dark = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 0.0), height=32), made.scene.device)
-        found = decompose_by_images(made.cloud, made.scene, made.views, made.roughness, dark, ImagePathOptions(**FEW))
+        made = ball(device, truth=0.5)
+        found = made.decompose(light=even_light((1.0, 1.0, 0.0), device))
         assert (found.color_evidence == 0.0).all()  # no light in the last channel
         assert found.filled[:, 0].all()
         assert not found.filled[:, 1].all()
 
     def test_what_no_view_sees_is_filled(self, device):
         """Ten Gaussians out of every image, nearest to the ball's top."""
-        made = Ball(device, views=2, truth=0.5)
+        made = ball(device, views=2, truth=0.5)
         far = tiles(np.tile((0.0, 0.0, 9.0), (10, 1)), np.tile((0.0, 0.0, 1.0), (10, 1)), 0.1)
         near = {name: getattr(made.cloud, name) for name in far}
         cloud = cloud_of(near, far)
-        found = decompose_by_images(
-            cloud,
-            Scene.from_gaussians(cloud, device),
-            made.views,
-            np.full(len(cloud), ROUGHNESS, np.float32),
-            made.light,
-            ImagePathOptions(**FEW),
-        )
+        scene, roughness = Scene.from_gaussians(cloud, device), np.full(len(cloud), ROUGHNESS, np.float32)
+        found = decompose_by_images(cloud, scene, made.views, roughness, made.light, ImagePathOptions(**FEW))
         assert found.filled[-10:].all()
         assert not found.filled[:-10].all(axis=1).any()
         # the mean of eight Gaussians seen at grazing angles or through others
@@ -192,11 +185,9 @@ class TestGuards:
         assert (found.ambient_occlusion[-10:] > 0.5).all()
 
     def test_nothing_in_any_view(self, device):
-        made = Ball(device)
-        away = replace(
-            made.views[0], camera=Camera.orbit((0, 0, 99), 4.0, 0.0, 0.0, width=40, height=40, vertical_fov=36)
-        )
-        found = made.decompose([away])
+        made = ball(device)
+        elsewhere = Camera.orbit((0, 0, 99), 4.0, 0.0, 0.0, width=40, height=40, vertical_fov=36)
+        found = made.decompose([replace(made.views[0], camera=elsewhere)])
         assert "no view shows a surface: every value is a prior" in found.notes
         assert found.filled.all()
         assert np.isfinite(found.base_color).all()
@@ -204,7 +195,7 @@ class TestGuards:
 
 class TestBehaviour:
     def test_same_seed_same_bits_other_frame_other_noise(self, device, monkeypatch):
-        made = Ball(device, views=2)
+        made = ball(device, views=2)
         first = made.decompose(frame=3)
         monkeypatch.setenv("BEAM_WARP_THREADS", "3")
         again, other = made.decompose(frame=3), made.decompose(frame=4)
@@ -213,7 +204,7 @@ class TestBehaviour:
         assert not np.array_equal(first.base_color, other.base_color)
 
     def test_a_temporal_term_takes_flicker_off(self, device):
-        made = Ball(device, views=2)
+        made = ball(device, views=2)
         first = made.decompose(frame=0).base_color
         free = made.decompose(frame=1)
         held = made.decompose(frame=1, previous=first, temporal=10.0)
@@ -222,7 +213,7 @@ class TestBehaviour:
         np.testing.assert_allclose(held.ambient_occlusion[seen], free.ambient_occlusion[seen], atol=1e-3)
 
     def test_stages_and_progress_are_told(self, device):
-        made, calls = Ball(device, views=2), []
+        made, calls = ball(device, views=2), []
         found = made.decompose(progress=lambda done, total: calls.append((done, total)))
         assert calls == [(1, 2), (2, 2)]
         assert list(found.seconds) == [
@@ -230,7 +221,7 @@ class TestBehaviour:
         ]  # fmt: skip
 
     def test_denoiser_is_told(self, device, monkeypatch):
-        made = Ball(device, views=1)
+        made = ball(device, views=1)
         monkeypatch.setattr(denoising, "_open_image_denoise", lambda: None)
         found = made.decompose(denoiser="auto")
         (note,) = found.notes

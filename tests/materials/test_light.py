@@ -4,6 +4,7 @@ What the points show is computed here, in float64 over every texel of the light,
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -88,6 +89,17 @@ class Ball:
         )
 
 
+@pytest.fixture(scope="module")
+def ball():
+    return Ball.of()
+
+
+@pytest.fixture(scope="module")
+def shown(ball):
+    """What the ball shows under each light."""
+    return {name: ball.evidence(light) for name, light in LIGHTS.items()}
+
+
 def mirror(light):
     return EnvironmentMap(light.radiance[:, ::-1])
 
@@ -96,14 +108,9 @@ def codes(check):
     return [finding.code for finding in check.findings]
 
 
-@pytest.fixture(scope="module")
-def ball():
-    return Ball.of()
-
-
 @pytest.mark.parametrize("name", LIGHTS)
-def test_the_right_light_is_not_blamed(ball, name):
-    check = judge_light(ball.evidence(LIGHTS[name]), LIGHTS[name])
+def test_the_right_light_is_not_blamed(shown, name):
+    check = judge_light(shown[name], LIGHTS[name])
     assert check.findings == ()
     assert abs(check.best_rotation_degrees) <= CELL / 2
     assert not check.is_mirrored
@@ -113,9 +120,9 @@ def test_the_right_light_is_not_blamed(ball, name):
 
 @pytest.mark.parametrize("name", LIGHTS)
 @pytest.mark.parametrize("degrees", [30.0, 180.0])
-def test_a_turned_light_is_told_with_its_turn(ball, name, degrees):
+def test_a_turned_light_is_told_with_its_turn(shown, name, degrees):
     """The turn that undoes it is found to within half a cell, which the cells resolve."""
-    check = judge_light(ball.evidence(LIGHTS[name]), LIGHTS[name].rotated(degrees))
+    check = judge_light(shown[name], LIGHTS[name].rotated(degrees))
     assert codes(check) == ["environment-turned"]
     assert check.misfit_as_given > CLEARLY_BETTER
     off = (check.best_rotation_degrees + degrees + 180.0) % 360.0 - 180.0
@@ -124,10 +131,10 @@ def test_a_turned_light_is_told_with_its_turn(ball, name, degrees):
 
 
 @pytest.mark.parametrize("name", ["studio", "stage"])
-def test_a_mirrored_light_is_told(ball, name):
+def test_a_mirrored_light_is_told(shown, name):
     """Lights of several sources: a lone sun is its own mirror image."""
     light, degrees = LIGHTS[name], 120.0
-    check = judge_light(ball.evidence(light), mirror(light.rotated(degrees)))
+    check = judge_light(shown[name], mirror(light.rotated(degrees)))
     assert codes(check) == ["environment-turned"]
     assert check.is_mirrored
     assert "mirrored" in str(check.findings[0])
@@ -142,9 +149,9 @@ def test_other_roughness_does_not_matter(roughness):
     assert codes(judge_light(evidence, LIGHTS["studio"].rotated(90.0))) == ["environment-turned"]
 
 
-def test_without_gloss_shading_alone_tells(ball):
+def test_without_gloss_shading_alone_tells(shown):
     """Colours without change from view to view, as Gaussians of degree 0 have them."""
-    evidence = ball.evidence(LIGHTS["sunset"])
+    evidence = shown["sunset"]
     flat = replace(evidence, colors=np.broadcast_to(evidence.colors.mean(axis=0), evidence.colors.shape))
     right, turned = (judge_light(flat, LIGHTS["sunset"].rotated(degrees)) for degrees in (0.0, 90.0))
     assert right.findings == ()
@@ -153,16 +160,16 @@ def test_without_gloss_shading_alone_tells(ball):
 
 
 @pytest.mark.parametrize("stated", ["sunset", "stage"])
-def test_another_light_is_told(ball, stated):
-    check = judge_light(ball.evidence(LIGHTS["studio"]), LIGHTS[stated])
+def test_another_light_is_told(shown, stated):
+    check = judge_light(shown["studio"], LIGHTS[stated])
     assert check.findings
     assert check.findings[0].code in ("environment-unexplained", "environment-turned")
 
 
-def test_scale_of_the_light(ball):
+def test_scale_of_the_light(shown):
     """Stops are proposed that bring base colours back; the turn is found whatever the scale."""
     light = LIGHTS["studio"]
-    evidence = ball.evidence(light)
+    evidence = shown["studio"]
     dim = judge_light(evidence, light.exposed(-3.0))
     assert codes(dim) == ["environment-exposure"]
     assert abs(dim.exposure_stops - 3.0) < 1.0
@@ -183,9 +190,15 @@ def test_uniform_light_has_no_turn(ball):
     assert check.misfit_as_given < 1e-3
 
 
+@cache
+def traced_ball(device):
+    """A path traced ball as Gaussians, and its photographs."""
+    return MaterialStudio(device, camera_count=6, size=40, samples=16, subdivisions=3).plain
+
+
 def photographed(device, images=True):
-    """A path traced ball as Gaussians on a device, and what photographs show of them."""
-    stress = MaterialStudio(device, camera_count=6, size=40, samples=16, subdivisions=3).plain
+    """The ball as Gaussians on a device, and what photographs show of them."""
+    stress = traced_ball(device)
     cameras = [view.camera for view in stress.views]
     views = view_evidence(stress.cloud, cameras, stress.views if images else None, device=device)
     scene = Scene.from_gaussians(stress.cloud, device)
@@ -211,9 +224,9 @@ def test_images_are_needed(device):
         check_light(scene, points, views, light, subset=0)
 
 
-def test_what_cannot_be_judged_is_said(ball):
+def test_what_cannot_be_judged_is_said(shown):
     """Few points; few views, for many lights look alike from one side; no light."""
-    whole = ball.evidence(LIGHTS["studio"])
+    whole = shown["studio"]
     points = judge_light(Ball.of(LEAST_POINTS // 2).evidence(LIGHTS["studio"]), LIGHTS["studio"])
     assert codes(points) == ["light-unchecked"]
     assert points.point_count < LEAST_POINTS

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 from support.estimates import require_honest, require_zero_mean
+from support.flat_scenes import brdf_twin
 from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles
 
 from beam_warp import Camera, Scene
 from beam_warp.errors import InvalidOptionError
-from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, smith_lambda, specular_albedo
+from beam_warp.light.ggx import DIELECTRIC_F0, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.residues import surface_residues, view_surfaces
 from beam_warp.raster.sources import upload_gaussians
@@ -136,15 +137,9 @@ class TestEvenLight:
 
 def quadrature(scene, found, environment, roughness, offset, cuts):
     """Both residues by midpoints of every texel, cut into ``cuts`` x ``cuts``: another way to the same integrals."""
-    height, width = environment.height * cuts, environment.width * cuts
-    edges = np.cos(np.linspace(0.0, np.pi, height + 1))
-    z = 0.5 * (edges[1:] + edges[:-1])
-    phi = np.pi - (np.arange(width) + 0.5) * (2.0 * np.pi / width)
-    radius = np.sqrt(1.0 - z * z)[:, None]
-    w = np.stack([radius * np.cos(phi), radius * np.sin(phi), np.broadcast_to(z[:, None], (height, width))], axis=-1)
-    angle = np.broadcast_to((edges[:-1] - edges[1:])[:, None] * (2.0 * np.pi / width), (height, width)).ravel()
-    w = w.reshape(-1, 3)
-    radiance = environment.radiance.repeat(cuts, axis=0).repeat(cuts, axis=1).reshape(-1, 3).astype(np.float64)
+    fine = EnvironmentMap(environment.radiance.repeat(cuts, axis=0).repeat(cuts, axis=1))
+    w = fine.directions().reshape(-1, 3)
+    power = (fine.radiance * fine.solid_angles()[..., None]).reshape(-1, 3).astype(np.float64)
     diffuse, specular = [], []
     for x, n, v in zip(
         *(getattr(found.rows, k).numpy().astype(np.float64) for k in ("positions", "normals", "to_camera")), strict=True
@@ -153,15 +148,12 @@ def quadrature(scene, found, environment, roughness, offset, cuts):
         up = cosine > 0.0
         origins = np.tile((x + offset * n).astype(np.float32), (up.sum(), 1))
         seen = visibility(scene, origins, w[up].astype(np.float32))
-        arriving = radiance[up] * (seen * cosine[up] * angle[up])[:, None]
+        arriving = power[up] * (seen * cosine[up])[:, None]
         h = w[up] + v
         h /= np.linalg.norm(h, axis=1, keepdims=True)
         fresnel = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (1.0 - h @ v) ** 5
-        alpha = roughness**2
-        shadowing = 1.0 / (1.0 + smith_lambda(n @ v, alpha) + smith_lambda(cosine[up], alpha))
-        lobe = ggx_distribution(h @ n, alpha) * shadowing * fresnel / (4.0 * (n @ v) * cosine[up])
-        diffuse.append(((1.0 - fresnel)[:, None] * arriving).sum(axis=0) / np.pi)
-        specular.append((lobe[:, None] * arriving).sum(axis=0))
+        diffuse.append((1.0 - fresnel) @ arriving / np.pi)
+        specular.append(brdf_twin(n, v, w[up], roughness) @ arriving)
     return np.array(diffuse), np.array(specular)
 
 

@@ -150,11 +150,6 @@ def tiny():
     return RelightingBench(RelightStudio(size=4, spacing=0.3, samples=1), "cpu", seeds=2)
 
 
-def stress_of(bench, build=None, **demands):
-    shot = SMALL[NAMES.index("a leaking front before a dark inside")].build(bench.studio).shots
-    return RelightStress(shots=shot, demands=(demand(**demands),))
-
-
 def test_refusals_and_crashes_are_told(tiny):
     def refuse(drawn):
         raise InvalidArrayError("positions must be finite")
@@ -162,11 +157,13 @@ def test_refusals_and_crashes_are_told(tiny):
     def crash(drawn):
         raise ZeroDivisionError("division by zero")
 
+    shots = SMALL[NAMES.index("a leaking front before a dark inside")].build(tiny.studio).shots
     for measure, fault in (
         (refuse, "refused: positions must be finite"),
         (crash, "ended with ZeroDivisionError: division by zero"),
     ):
-        outcome = run_relighting_case(tiny, "trial", stress_of(tiny, measure=measure), PATH)
+        stress = RelightStress(shots=shots, demands=(demand(measure=measure),))
+        outcome = run_relighting_case(tiny, "trial", stress, PATH)
         assert outcome.faults == (fault,)
         assert not outcome.passed
 

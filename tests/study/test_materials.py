@@ -1,10 +1,12 @@
 """The materials study: its plan, what errors are against, and that both kinds of reference say what they should."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import beam_warp.study.materials as study_of_materials
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.study.materials import SHARP, MaterialsSubject, materials_study, without_color
@@ -106,13 +108,11 @@ class TestStudy:
     @pytest.fixture(scope="class")
     @staticmethod
     def subject(tiny_capture):
-        light = EnvironmentMap.read(tiny_capture.environment_path)
-        whole = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu")
-        rows = np.arange(0, len(whole.cloud), 4)
-        cloud = whole.cloud.select(rows)
-        return MaterialsSubject(
-            cloud.with_arrays(scales=2.0 * cloud.scales), whole.views[:3], light, SHARP, tiny_capture, 0, "tiny"
-        )
+        light = EnvironmentMap.read(tiny_capture.environment_path).resized(16, 32)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(study_of_materials, "GAUSSIANS", {False: 1000, True: 1000})
+            whole = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu")
+        return replace(whole, views=whole.views[:3])
 
     def test_errors_are_against_the_truth_where_there_is_one(self, subject, tmp_path):
         study = materials_study(subject, SMALL, device="cpu")
@@ -130,12 +130,9 @@ class TestStudy:
         assert all(row.cost.value > 0.0 for row in table.rows)
 
     def test_without_truth_errors_fall_with_rays(self, subject, tiny_capture):
-        training = type(tiny_capture)(
-            folder=tiny_capture.folder, records=tiny_capture.select(split="train"), environment_path=None
-        )
-        bare = MaterialsSubject(subject.cloud, subject.views, subject.environment, SHARP, training, 0, "without truth")
-        plan = MaterialsPlan(**{**vars(SMALL), "reference_rays": 1024})
-        study = materials_study(bare, plan, device="cpu")
+        training = replace(tiny_capture, records=tiny_capture.select(split="train"))
+        plan = replace(SMALL, reference_rays=1024)
+        study = materials_study(replace(subject, capture=training), plan, device="cpu")
         assert "1,024 rays" in study.subject.notes["Reference"]
         default = plan.settings()[0]
         few, many = (study.measure({**default, "rays": rays}) for rays in (4, 256))

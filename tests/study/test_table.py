@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -278,14 +279,12 @@ class TestImage:
             assert image.width >= 1200
         assert [path.name for path in tmp_path.iterdir()] == ["toy.png"]
 
-    @pytest.mark.parametrize("rows", [TABLE.rows[:1], TABLE.rows[:5]])
-    def test_draws_an_unfinished_table(self, tmp_path, rows):
-        write_image(Table(TABLE.subject, rows), tmp_path / "toy.png")
-
-    def test_draws_errors_of_zero(self, tmp_path):
+    @pytest.mark.parametrize("count", [1, 5])
+    def test_draws_an_unfinished_table_and_errors_of_zero(self, tmp_path, count):
         nothing = Interval(0.0, 0.0, 0.0)
-        rows = tuple(replace(row, errors={"error": nothing, "shift": nothing}) for row in TABLE.rows)
-        write_image(Table(TABLE.subject, rows), tmp_path / "toy.png")
+        rows = tuple(replace(row, errors={"error": nothing, "shift": nothing}) for row in TABLE.rows[:count])
+        for drawn in (TABLE.rows[:count], rows):
+            write_image(Table(TABLE.subject, drawn), tmp_path / "toy.png")
 
     def test_needs_a_row(self, tmp_path):
         with pytest.raises(InvalidOptionError, match="table must have at least one row"):
@@ -324,38 +323,35 @@ class Loaded(HTMLParser):
             self.data += data
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    path = tmp_path_factory.mktemp("page") / "toy.html"
-    write_page(TABLE, path)
-    return path
-
-
 class TestPage:
-    def test_loads_nothing(self, page):
-        found = Loaded()
-        found.feed(page.read_text(encoding="utf-8"))
-        assert found.links == []
-        assert not {"link", "iframe", "img", "object", "base"} & set(found.tags)
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def text(tmp_path_factory):
+        path = tmp_path_factory.mktemp("page") / "toy.html"
+        write_page(TABLE, path)
+        return path.read_text(encoding="utf-8")
 
-    def test_holds_the_data_whatever_it_says(self, page):
+    @pytest.fixture
+    @staticmethod
+    def loaded(text):
         found = Loaded()
-        found.feed(page.read_text(encoding="utf-8"))
-        data = json.loads(found.data)
+        found.feed(text)
+        return found
+
+    def test_loads_nothing(self, loaded):
+        assert loaded.links == []
+        assert not {"link", "iframe", "img", "object", "base"} & set(loaded.tags)
+
+    def test_holds_the_data_whatever_it_says(self, loaded):
+        data = json.loads(loaded.data)
         assert data["subject"]["title"] == SUBJECT.title
         assert len(data["rows"]) == len(PLAN)
         assert data["rows"][0]["cost"] == [3.0, 3.0, 6.0]
 
-    def test_script_finds_the_same_frontier(self, page, tmp_path):
-        try:
-            subprocess.run(["node", "--version"], check=True, capture_output=True)
-        except (OSError, subprocess.CalledProcessError):
-            pytest.skip("node is not installed")
-        text = page.read_text(encoding="utf-8")
-        found = Loaded()
-        found.feed(text)
+    @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+    def test_script_finds_the_same_frontier(self, text, loaded, tmp_path):
         script = text[text.rindex("<script>") + 8 : text.rindex("</script>")].removesuffix("build();\n")
-        (tmp_path / "data.json").write_text(found.data, encoding="utf-8")
+        (tmp_path / "data.json").write_text(loaded.data, encoding="utf-8")
         (tmp_path / "check.js").write_text(
             "const document = { getElementById: () => ({ textContent: "
             f"require('fs').readFileSync({str(tmp_path / 'data.json')!r}, 'utf8') }}) }};\n"
