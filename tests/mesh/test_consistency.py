@@ -1,12 +1,14 @@
 """Consistency of depth images: closed forms of a sphere, a shifted view, hidden points, and what enters a fusion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from support.depth_scenes import around, plane_view, sphere_view
+from support.depth_scenes import around, plane_view, points_of, sphere_view
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.mesh.consistency import depth_consistency
-from beam_warp.mesh.depths import DepthImages, DepthView
+from beam_warp.mesh.depths import DepthImages
 from beam_warp.mesh.fusion import fuse_depths
 
 RADIUS = 0.5
@@ -18,8 +20,7 @@ def part(images, index):
 
 def moved(view, by):
     """The same view, wrong by a length along the optical axis."""
-    depth = np.where(view.depth > 0.0, view.depth + by, 0.0).astype(np.float32)
-    return DepthView(camera=view.camera, depth=depth, alpha=view.alpha)
+    return replace(view, depth=np.where(view.depth > 0.0, view.depth + by, 0.0).astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -57,18 +58,13 @@ def test_a_plane_hidden_by_a_sphere_is_not_contradicted():
     found = depth_consistency(images)
     # Of the floor, the view from above sees the sphere in front, or nothing: where it sees nothing it objects.
     rows = part(images, 1)
-    points = above.project(_points(floor))
+    points = above.project(points_of(floor).reshape(-1, 3))
     hidden = sphere_at(above, points[:, :2])
     usable = images.pixels.numpy()[rows, 2] > 0.0
     inside = usable & hidden
     assert inside.sum() > 100
     assert not found.contradicted.numpy()[rows][inside].any()
     assert not found.confirmed.numpy()[rows][inside].any()  # 0, not -1: they count
-
-
-def _points(view):
-    rays = view.camera.directions() / (view.camera.directions() @ view.camera.forward)[..., None]
-    return (view.camera.position + rays * view.depth[..., None]).reshape(-1, 3)
 
 
 def sphere_at(camera, pixels):

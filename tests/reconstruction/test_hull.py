@@ -111,14 +111,14 @@ class TestBall:
     def test_converges_to_the_ball(self, device):
         volume = 4.0 / 3.0 * np.pi * RADIUS**3
         excess = []
-        for count in (6, 12, 24, 48):
+        for count in (6, 12, 24):
             views = ball_views(count)
             hull = visual_hull(views, resolution=64, device=device)
             bound = (np.minimum(widest(views, directions(4000)), 3.0) ** 3).mean()
             thickness = 3.0 * (slack(hull, views) + 0.5 * hull.voxel) / RADIUS  # relative volume of the slack's shell
             assert 1.0 - thickness <= hull.mesh.volume / volume <= bound + thickness
             excess.append(hull.mesh.volume / volume - 1.0)
-        assert excess[0] > excess[1] > excess[2] > excess[3]
+        assert excess[0] > excess[1] > excess[2]
 
     def test_is_sharper_than_its_pixels(self, device):
         views = ball_views(24, size=48)
@@ -128,9 +128,9 @@ class TestBall:
         assert abs(lowest - RADIUS) <= slack(hull, views) + 0.1 * hull.voxel
 
     def test_large_masks_are_reduced_to_what_voxels_tell(self, device):
-        views = ball_views(9, size=200)  # a voxel of 1 / 16 of the ball is 6 pixels
+        views = ball_views(9, size=140)  # a voxel of 1 / 16 of the ball is 4 pixels
         hull = visual_hull(views, resolution=16, quorum=9, device=device)
-        require_between_the_ball_and_its_planes(hull, views, [view.reduced(3) for view in views])
+        require_between_the_ball_and_its_planes(hull, views, [view.reduced(2) for view in views])
 
     def test_off_center(self, device):
         center = np.array([40.0, -30.0, 7.0])
@@ -192,11 +192,9 @@ class TestRefusals:
                 visual_hull(ball_views(3), device="cpu", **options)
 
 
-def test_walker_contains_the_truth(data_dir, device):
-    walker = Capture.read(data_dir / "captures" / "walker")
-    views = [record.view() for record in walker.select(split="train", frames=[0])]
-    hull = visual_hull(views, resolution=128, device=device)
-    surface = read_truth_mesh(walker, 0)
+def test_walker_contains_the_truth(data_dir, walker_views, device):
+    hull = visual_hull(walker_views, resolution=128, device=device)
+    surface = read_truth_mesh(Capture.read(data_dir / "captures" / "walker"), 0)
     assert hull.mesh.is_watertight
 
     def depths(mesh, points):
@@ -218,7 +216,7 @@ def test_walker_contains_the_truth(data_dir, device):
     chamfer = 0.5 * (outward + np.abs(depths(hull.mesh, back)).mean())
     print(f"walker: Chamfer {1e3 * chamfer:.2f} mm, truth at most {-1e3 * inside.min():.2f} mm outside")
     # A pixel is 6.1 mm at the subject: what 24 silhouettes leave undecided is less than that.
-    assert chamfer < 2.7 / views[0].camera.focal_x
+    assert chamfer < 2.7 / walker_views[0].camera.focal_x
 
 
 @wp.kernel(enable_backward=False)

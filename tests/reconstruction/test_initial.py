@@ -8,7 +8,6 @@ import trimesh
 from scipy.spatial import cKDTree
 from support.capture_scenes import ball_view, ball_views, cameras_around
 
-from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
@@ -105,7 +104,7 @@ class TestDiscs:
 
     def test_outliers_are_outvoted(self, device):
         # A point of the ball is seen by some seven of 24 views; these two are on opposite sides of it.
-        views = ball_views(24)
+        views = list(ball_views(24))
         for i in (0, 23):
             views[i] = replace(views[i], color=5.0 * np.repeat(views[i].alpha[..., None], 3, axis=2))
         cloud = initial_gaussians(views, 800, device=device)
@@ -115,14 +114,14 @@ class TestDiscs:
         assert np.quantile(error, 0.95) < 5.0 * (spread / 5.0) ** 2
 
     def test_same_seed_same_bits_for_any_threads(self, monkeypatch):
-        clouds = []
-        for threads in ("1", "4"):
+        def cloud(threads, seed):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            clouds.append(initial_gaussians(ball_views(6), 700, device="cpu", seed=3))
-        for name, array in clouds[0].arrays().items():
-            np.testing.assert_array_equal(array, clouds[1].arrays()[name])
-        other = initial_gaussians(ball_views(6), 700, device="cpu", seed=4)
-        assert (other.positions != clouds[0].positions).any()
+            return initial_gaussians(ball_views(6), 700, device="cpu", seed=seed)
+
+        one, other = cloud("1", 3), cloud("4", 3)
+        for name, array in one.arrays().items():
+            np.testing.assert_array_equal(array, other.arrays()[name])
+        assert (cloud("1", 4).positions != one.positions).any()
 
 
 class TestPoints:
@@ -186,9 +185,8 @@ class TestRefusals:
             initial_gaussians(views, 5, point_colors=np.zeros((3, 3)), device="cpu")
 
 
-def test_walker_is_opaque_and_of_its_colors(data_dir, device):
-    records = Capture.read(data_dir / "captures" / "walker").select(split="train", frames=[0])
-    views = [record.view().reduced(2) for record in records]
+def test_walker_is_opaque_and_of_its_colors(walker_views, device):
+    views = [view.reduced(2) for view in walker_views]
     cloud = initial_gaussians(views, 6000, device=device)
     for view in views[:3]:
         drawn = rasterize(cloud, view.camera, channels=("radiance",), device=device)

@@ -1,5 +1,7 @@
 """Views of a ball whose masks are known exactly: what tests of reconstruction's first steps start from."""
 
+from functools import cache
+
 import numpy as np
 
 from beam_warp.capture.views import CapturedView
@@ -41,6 +43,7 @@ def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0
     return CapturedView(name=name, camera=camera, color=alpha[..., None] * np.float32(color), alpha=alpha)
 
 
+@cache
 def ball_views(count, **options):
     """Views of a ball of radius 0.5 around the origin."""
-    return [ball_view(f"view_{i}", camera) for i, camera in enumerate(cameras_around(count, **options))]
+    return tuple(ball_view(f"view_{i}", camera) for i, camera in enumerate(cameras_around(count, **options)))
