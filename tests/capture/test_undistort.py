@@ -333,7 +333,7 @@ class TestImage:
         The photograph is blurred by a pixel, as by any real lens: where a box filter puts the level of 1/2 between
         two pixels says nothing finer than a sixth of a pixel about an edge.
         """
-        n = 6  # samples per pixel and axis: with the blur they place an edge to a hundredth of a pixel
+        n = 4  # samples per pixel and axis: with the blur they place an edge to a hundredth of a pixel
         fine = PHOTOGRAPH._replace(
             width=160 * n, height=120 * n, focal_x=150.0 * n, focal_y=140.0 * n, center_x=83.0 * n, center_y=58.0 * n
         )

@@ -30,7 +30,7 @@ def cloud():
 
 @pytest.fixture(scope="module")
 def mesh(cloud):
-    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=96), color="base_color", device="cpu")
+    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=72), color="base_color", device="cpu")
 
 
 def test_ball_of_discs(mesh):
@@ -70,7 +70,7 @@ def test_radiance(cloud):
 
 @pytest.mark.parametrize("depth", ["median", "mean"])
 def test_depth_modes(cloud, depth, device):
-    cameras = surrounding_cameras(cloud, side=64)
+    cameras = surrounding_cameras(cloud, side=48)
     options = RasterOptions(depth="exact")
     found = mesh_of_gaussians(cloud, cameras, voxel=0.03, depth=depth, options=options, device=device)
     assert mesh_report(found).parts == 1

@@ -26,6 +26,13 @@ OPTIONS = TrackOptions(
     joint_count=40, joints=JointOptions(levels=(4, 2, 1), iterations=(20, 20, 30)), refinement=REFINEMENT
 )
 
+FEWER = replace(
+    OPTIONS,
+    joints=JointOptions(levels=(4, 2, 1), iterations=(8, 8, 12)),
+    refinement=replace(REFINEMENT, normal_iterations=15),
+)
+"""Steps enough to find out that a motion is not found."""
+
 BRIEF = replace(
     OPTIONS, joints=JointOptions(levels=(2, 1), iterations=(3, 3)), refinement=replace(REFINEMENT, normal_iterations=4)
 )
@@ -95,12 +102,12 @@ class TestLost:
             replace(view, color=rng.permutation(view.color.reshape(-1, 3)).reshape(view.color.shape))
             for view in ball_views(CAMERAS)
         ]
-        _, report = advance_track(key_track(device), views, OPTIONS, device=device)
+        _, report = advance_track(key_track(device), views, FEWER, device=device)
         assert report["lost"].startswith("PSNR fell from")
 
     def test_a_jump_beyond_reach(self, device):
         """Nearly a diameter: some of the subject is not covered, and views are named in which."""
-        _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), OPTIONS, device=device)
+        _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), FEWER, device=device)
         assert "of the subject are not covered in view" in report["lost"]
 
     def test_nothing_is_lost_where_everything_is_allowed(self, device):
@@ -128,7 +135,7 @@ class TestCaptures:
         assert len(track.cloud) == len(track.joints) == count
         assert np.isfinite([report[name] for name in ("psnr", "gap", "torn")]).all()
 
-    @pytest.mark.parametrize("size", [1, 3, 40])
+    @pytest.mark.parametrize("size", [1, 3])
     def test_images_that_cannot_be_reduced_so_far(self, device, size):
         """Levels stop at a pixel."""
         views = ball_views(rig(1, size))
