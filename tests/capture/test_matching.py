@@ -2,17 +2,15 @@
 
 import numpy as np
 import pytest
+from support.shapes import aligned
 
 from beam_warp.capture.matching import match_frames, scored_frames
 from beam_warp.errors import InvalidOptionError
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 
 
 def sequence(frame_count, **metadata):
-    cloud = GaussianCloud(
-        positions=np.zeros((1, 3)), orientations=[[0, 0, 0, 1]], scales=np.ones((1, 3)), opacities=np.ones(1)
-    )
-    return GaussianSequence.from_clouds([cloud] * frame_count, metadata=metadata)
+    return GaussianSequence.from_clouds([aligned(np.zeros((1, 3)))] * frame_count, metadata=metadata)
 
 
 def test_frames_are_counted_stated_or_given():

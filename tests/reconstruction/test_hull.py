@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from support.capture_scenes import EDGE_ERROR, ball_view, ball_views, cameras_around, directions
+from support.capture_scenes import EDGE_ERROR, ball_view, ball_views, cameras_around
+from support.shapes import sphere_points
 
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -18,11 +19,10 @@ RADIUS = 0.5
 
 
 def distances(alpha, device, limit=40.0):
-    shape = alpha.shape
     out = wp.empty(alpha.size, dtype=float, device=device)
-    gaps = [wp.empty(shape, dtype=float, device=device) for _ in range(2)]
+    gaps = [wp.empty(alpha.shape, dtype=float, device=device) for _ in range(2)]
     launch_measure_silhouette(wp.array(alpha, dtype=float, device=device), limit, *gaps, 0, out, device)
-    return out.numpy().reshape(shape)
+    return out.numpy().reshape(alpha.shape)
 
 
 class TestSilhouettes:
@@ -114,7 +114,7 @@ class TestBall:
         for count in (6, 12, 24):
             views = ball_views(count)
             hull = visual_hull(views, resolution=64, device=device)
-            bound = (np.minimum(widest(views, directions(4000)), 3.0) ** 3).mean()
+            bound = (np.minimum(widest(views, sphere_points(4000)[0]), 3.0) ** 3).mean()
             thickness = 3.0 * (slack(hull, views) + 0.5 * hull.voxel) / RADIUS  # relative volume of the slack's shell
             assert 1.0 - thickness <= hull.mesh.volume / volume <= bound + thickness
             excess.append(hull.mesh.volume / volume - 1.0)
