@@ -12,7 +12,9 @@ FLOAT32_STEP = 2.0**-23
 
 SMALL = {"width": 64, "height": 64, "vertical_fov": 40.0}
 
-ABOVE = Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), **SMALL)
+
+def above(vertical_fov=40.0):
+    return Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), **{**SMALL, "vertical_fov": vertical_fov})
 
 
 def dome(distance=4.0, elevations=(-50.0, 0.0, 50.0)):
@@ -26,6 +28,10 @@ def dome(distance=4.0, elevations=(-50.0, 0.0, 50.0)):
 def square(z=0.0, side=2.0):
     vertices = 0.5 * side * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) + [0.0, 0.0, z]
     return trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def tree_of(mesh, device="cpu"):
+    return SurfaceTree(mesh.vertices, mesh.faces, device=device)
 
 
 def twin_distances(points, corners):
@@ -59,9 +65,7 @@ class TestClosest:
         np.testing.assert_allclose(found.weights.sum(axis=1), 1.0, atol=4.0 * FLOAT32_STEP)
 
     def test_no_points_are_no_distances(self, device):
-        assert (
-            SurfaceTree(square().vertices, square().faces, device=device).closest(np.zeros((0, 3))).distances.size == 0
-        )
+        assert tree_of(square(), device).closest(np.zeros((0, 3))).distances.size == 0
 
 
 class TestSampling:
@@ -79,8 +83,7 @@ class TestSampling:
 
 class TestSeen:
     def test_the_far_side_of_a_sphere_is_not_seen(self, device):
-        sphere = trimesh.creation.icosphere(subdivisions=3)
-        tree = SurfaceTree(sphere.vertices, sphere.faces, device=device)
+        tree = tree_of(trimesh.creation.icosphere(subdivisions=3), device)
         camera = Camera.orbit((0, 0, 0), 4.0, 90.0, 0.0, **SMALL)  # from +x
         faces, weights = tree.sample(4000)
         seen = tree.seen_by([camera], faces, weights, least_cosine=0.0)
@@ -90,20 +93,17 @@ class TestSeen:
         assert not seen[x < 0.25 - 0.1].any()
 
     def test_what_is_behind_something_is_not_seen(self, device):
-        both = trimesh.util.concatenate([square(0.0), square(1.0, side=4.0)])
-        tree = SurfaceTree(both.vertices, both.faces, device=device)
+        tree = tree_of(trimesh.util.concatenate([square(0.0), square(1.0, side=4.0)]), device)
         faces, weights = tree.sample(1000)
-        above = Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), width=64, height=64, vertical_fov=80.0)
-        seen = tree.seen_by([above], faces, weights)
+        seen = tree.seen_by([above(80.0)], faces, weights)
         assert np.array_equal(seen, faces >= 2)
 
     def test_what_is_beside_the_image_is_not_seen(self, device):
-        tree = SurfaceTree(square().vertices, square().faces, device=device)
+        tree = tree_of(square(), device)
         faces, weights = tree.sample(2000)
         fov = np.degrees(2.0 * np.arctan(0.5 / 5.0))  # the middle metre
-        above = Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), width=64, height=64, vertical_fov=fov)
         inside = (np.abs(tree.at(faces, weights)[:, :2]) < 0.5).all(axis=1)
-        assert np.array_equal(tree.seen_by([above], faces, weights), inside)
+        assert np.array_equal(tree.seen_by([above(fov)], faces, weights), inside)
 
 
 class TestSurfaceDistances:
@@ -125,7 +125,7 @@ class TestSurfaceDistances:
     def test_what_is_missing_counts_from_the_truth_only(self, device):
         half = square()
         half = trimesh.Trimesh(half.vertices * (0.5, 1.0, 1.0) - (0.5, 0.0, 0.0), half.faces, process=False)
-        found = surface_distances(half, square(), [ABOVE], sample_count=20_000, device=device)
+        found = surface_distances(half, square(), [above()], sample_count=20_000, device=device)
         assert found.to_truth_mm < 1e3 * 10.0 * FLOAT32_STEP
         # Half of the square is missing, 0.5 m away in the mean: 250 mm; a standard error of 2 mm over 20,000 points.
         assert found.to_reconstruction_mm == pytest.approx(250.0, abs=10.0)
@@ -134,7 +134,7 @@ class TestSurfaceDistances:
         box = trimesh.creation.box((1.0, 1.0, 1.0))
         lid = box.vertices[:, 2] > 0.0
         wrong_below = trimesh.Trimesh(np.where(lid[:, None], box.vertices, box.vertices - (0, 0, 0.4)), box.faces)
-        found = surface_distances(wrong_below, box, [ABOVE], sample_count=5000, device=device)
+        found = surface_distances(wrong_below, box, [above()], sample_count=5000, device=device)
         assert found.seen_share == pytest.approx(1.0 / 6.0, abs=0.01)
         assert found.chamfer_mm < 1e3 * 10.0 * FLOAT32_STEP
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from support.depth_scenes import around, plane_view, points_of, sphere_view
+from support.threads import require_same_on_any_threads
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.mesh import fusion
@@ -145,13 +146,11 @@ def test_small_parts_are_left_out(coarse):
 
 
 def test_same_bits_on_any_number_of_threads(device, coarse, monkeypatch):
-    meshes = []
-    for threads in ("1", "3", "3"):
-        monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-        meshes.append(fuse_depths(coarse[::2], voxel=0.03, device=device))
-    for mesh in meshes[1:]:
-        assert np.array_equal(mesh.vertices, meshes[0].vertices)
-        assert np.array_equal(mesh.faces, meshes[0].faces)
+    def run():
+        mesh = fuse_depths(coarse[::2], voxel=0.03, device=device)
+        return mesh.vertices, mesh.faces
+
+    require_same_on_any_threads(monkeypatch, run, ("1", "3", "3"))
 
 
 def test_noisy_depth_stays_manifold(rng):

@@ -8,6 +8,7 @@ from reference import skinning as twin
 from reference.image_losses import slope
 from scipy.spatial.transform import Rotation
 from support.float32 import EPSILON, relative_error, require_same_in_a_graph, single, vectors, zeros
+from support.threads import require_same_on_any_threads
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.reconstruction.joints.skinning import Anchors, Skin
@@ -150,18 +151,13 @@ class TestWarp:
     def test_same_bits_for_every_number_of_threads(self, device, rng, blend, monkeypatch):
         rest, rotations, positions = scene(rng, 3500, 1500, 4)
         to_positions, to_orientations = rng.standard_normal((3500, 3)), rng.standard_normal((3500, 4))
-        found = []
-        for threads in ("1", "3"):
-            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+
+        def run():
             skin = make(rest, blend, device)
-            found.append(
-                [
-                    *warped(skin, rotations, positions),
-                    *gradients(skin, rotations, positions, to_positions, to_orientations),
-                ]
-            )
-        for one, other in zip(*found, strict=True):
-            assert (one == other).all()
+            moved = warped(skin, rotations, positions)
+            return *moved, *gradients(skin, rotations, positions, to_positions, to_orientations)
+
+        require_same_on_any_threads(monkeypatch, run)
 
     @pytest.mark.parametrize("count", [1, 32, 33, 65])
     def test_runs_of_one_joint(self, device, rng, blend, count):
