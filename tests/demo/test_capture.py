@@ -125,8 +125,6 @@ class TestImages:
         assert np.array_equal(first, image("b", 3))
         assert not np.array_equal(first, image("c", 4))
 
-
-class TestTruthMeshes:
     def test_topology_is_constant_and_the_figure_moves(self, tiny_capture):
         first, second = (truth_mesh(tiny_capture, frame) for frame in (0, 1))
         assert np.array_equal(first.faces, second.faces)

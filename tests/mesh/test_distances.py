@@ -52,7 +52,7 @@ def twin_distances(points, corners):
     return np.where(inside, plane, best).min(axis=1)
 
 
-class TestClosest:
+class TestTree:
     @pytest.mark.parametrize("count", [1, 255, 257])
     def test_distances_are_those_of_brute_force(self, device, rng, count):
         mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
@@ -67,13 +67,9 @@ class TestClosest:
     def test_no_points_are_no_distances(self, device):
         assert tree_of(square(), device).closest(np.zeros((0, 3))).distances.size == 0
 
-
-class TestSampling:
-    def test_points_are_uniform_by_area(self):
-        tree = SurfaceTree(
-            [[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [8, 0, 0], [5, 3, 0]], [[0, 1, 2], [3, 4, 5]], device="cpu"
-        )
-        faces, weights = tree.sample(10_000)
+    def test_samples_are_uniform_by_area(self):
+        corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [8, 0, 0], [5, 3, 0]]
+        faces, weights = SurfaceTree(corners, [[0, 1, 2], [3, 4, 5]], device="cpu").sample(10_000)
         # Stratified over triangles: of 9 to 1 in area, all but the one stratum that they share fall as they must.
         assert abs(np.count_nonzero(faces == 0) - 1000) <= 1
         np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)

@@ -78,9 +78,9 @@ class TestSplit:
         split(rows, np.array([0]), np.array([1]))
         parameters.set_rows(rows)
         camera = Camera.orbit((0, 0, 0), 2.0, 0.0, 0.0, width=128, height=96, vertical_fov=40.0)
-        clouds = disc, parameters.cloud()
         one, two = images = [
-            rasterize(cloud, camera, channels=(), device=device).alpha.astype(float) for cloud in clouds
+            rasterize(cloud, camera, channels=(), device=device).alpha.astype(float)
+            for cloud in (disc, parameters.cloud())
         ]
         assert one.sum() < two.sum() <= 2.0 * SPLIT_SHRINK * one.sum()
         for axis in range(2):

@@ -1,7 +1,6 @@
 """Findings about a frame: each is met and missed once, with tracking made up."""
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,23 +27,18 @@ def cloud(views):
 
 @pytest.fixture
 def advanced(monkeypatch, views, cloud):
-    """The report of a frame of which tracking makes what it is called with."""
-    return partial(_advanced, monkeypatch, views, cloud)
+    """A function that returns the report of a frame of which tracking makes what it is called with."""
 
+    def report_of(before=0.0, after=0.0, gap=0.0, lost=""):
+        joints, baseline = cloud.positions[:3], np.array([30.0, 0.01])
+        track = SimpleNamespace(cloud=cloud, joints=joints, previous_joints=joints - before, baseline=baseline)
+        track.normals = lambda: np.zeros((len(cloud), 3))
+        following = SimpleNamespace(cloud=cloud, joints=joints + after)
+        report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
+        monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
+        return STEPS.advance(track, views, no_progress)[1]
 
-def _advanced(monkeypatch, views, cloud, *, before=0.0, after=0.0, gap=0.0, lost=""):
-    joints = cloud.positions[:3]
-    track = SimpleNamespace(
-        cloud=cloud,
-        joints=joints,
-        previous_joints=joints - before,
-        baseline=np.array([30.0, 0.01]),
-        normals=lambda: np.zeros((len(cloud), 3)),
-    )
-    following = SimpleNamespace(cloud=cloud, joints=joints + after)
-    report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
-    monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
-    return STEPS.advance(track, views, no_progress)[1]
+    return report_of
 
 
 class TestTrackedFrames:

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from support.shapes import cloud_of, sphere_points, tiles
+from support.shapes import cloud_of, colored, sphere_points, tiles
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.panels import BACKGROUND, MARGIN, TITLE_HEIGHT
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.reconstruction.preview import (
@@ -21,17 +20,13 @@ GRAY = round(255 * BACKGROUND)
 
 
 def camera(azimuth=0.0, size=40):
-    return Camera.orbit(
-        (0.0, 0.0, 0.0), 4.0, azimuth=azimuth, elevation=0.0, vertical_fov=40.0, width=size + size // 2, height=size
-    )
+    return Camera.orbit((0, 0, 0), 4.0, azimuth, 0.0, width=size + size // 2, height=size, vertical_fov=40.0)
 
 
 @pytest.fixture(scope="module")
 def ball():
     points, spacing = sphere_points(400)
-    return cloud_of(
-        tiles(points, points, spacing), radiance=np.full((400, 1, 3), -0.5), radiance_color_space=LINEAR_REC709
-    )
+    return colored(cloud_of(tiles(points, points, spacing)), np.full((400, 3), 0.36))
 
 
 def photograph(ball, where, *, factor=1.0, alpha=True):

@@ -21,22 +21,19 @@ CAMERAS = rig()
 PIXEL = 2.5 / CAMERAS[0].focal_x
 """Width of a pixel at the ball [m]."""
 
-REFINEMENT = replace(TrackOptions().refinement, normal_iterations=40, samples=1)
 
-OPTIONS = TrackOptions(
-    joint_count=40, joints=JointOptions(levels=(4, 2, 1), iterations=(20, 20, 30)), refinement=REFINEMENT
-)
+def track_options(levels, iterations, normal_iterations):
+    refinement = replace(TrackOptions().refinement, normal_iterations=normal_iterations, samples=1)
+    joints = JointOptions(levels=levels, iterations=iterations)
+    return TrackOptions(joint_count=40, joints=joints, refinement=refinement)
 
-FEWER = replace(
-    OPTIONS,
-    joints=JointOptions(levels=(4, 2, 1), iterations=(8, 8, 12)),
-    refinement=replace(REFINEMENT, normal_iterations=15),
-)
+
+OPTIONS = track_options((4, 2, 1), (20, 20, 30), 40)
+
+FEWER = track_options((4, 2, 1), (8, 8, 12), 15)
 """Steps enough to find out that a motion is not found."""
 
-BRIEF = replace(
-    OPTIONS, joints=JointOptions(levels=(2, 1), iterations=(3, 3)), refinement=replace(REFINEMENT, normal_iterations=4)
-)
+BRIEF = track_options((2, 1), (3, 3), 4)
 
 
 @cache
@@ -97,11 +94,9 @@ class TestLost:
     """Each of the three reasons, and what causes it."""
 
     def test_scrambled_photographs(self, device):
-        rng = np.random.default_rng(0)
-        views = [
-            replace(view, color=rng.permutation(view.color.reshape(-1, 3)).reshape(view.color.shape))
-            for view in ball_views(CAMERAS)
-        ]
+        rng, views = np.random.default_rng(0), ball_views(CAMERAS)
+        colors = [rng.permutation(view.color.reshape(-1, 3)).reshape(view.color.shape) for view in views]
+        views = [replace(view, color=color) for view, color in zip(views, colors, strict=True)]
         _, report = advance_track(key_track(device), views, FEWER, device=device)
         assert report["lost"].startswith("PSNR fell from")
 
