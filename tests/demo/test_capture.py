@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import dome_cameras, write_demo_capture
 from beam_warp.demo.lights import studio
 from beam_warp.errors import MissingFileError, OutputError
@@ -146,11 +145,6 @@ def test_dome_looks_at_the_middle_from_one_distance():
         assert ((seen[:, :2] > 0) & (seen[:, :2] < (64, 48))).all()
     azimuths = np.sort([np.arctan2(*(e.camera.position - center)[:2]) for e in dome if e.split == "train"])
     np.testing.assert_allclose(np.diff(azimuths), np.pi / 4.0)
-
-
-def test_read_takes_the_folder(tiny_capture):
-    again = Capture.read(tiny_capture.folder)
-    assert [record.name for record in again.records] == [record.name for record in tiny_capture.records]
 
 
 class TestRelit:

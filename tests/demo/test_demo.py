@@ -66,18 +66,9 @@ def test_lights_are_maps_of_the_same_exposure(lights):
 def small_demo(tmp_path_factory):
     """The whole demo at a twentieth of its size: its folder, its options and its result."""
     out = tmp_path_factory.mktemp("small") / "demo"
-    images = FromImagesOptions(
-        size=64,
-        frame_count=2,
-        camera_count=8,
-        test_camera_count=1,
-        samples=4,
-        gaussian_count=1500,
-        color_iterations=30,
-        normal_iterations=30,
-        joint_iterations=20,
-        track_iterations=10,
-    )
+    sizes = {"size": 64, "frame_count": 2, "camera_count": 8, "test_camera_count": 1, "samples": 4}
+    steps = {"color_iterations": 30, "normal_iterations": 30, "joint_iterations": 20, "track_iterations": 10}
+    images = FromImagesOptions(gaussian_count=1500, **sizes, **steps)
     options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu", images=images)
     return out, options, run_demo(out, options)
 

@@ -30,7 +30,7 @@ def cloud():
 
 @pytest.fixture(scope="module")
 def mesh(cloud):
-    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=72), color="base_color", device="cpu")
+    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=64), color="base_color", device="cpu")
 
 
 def test_ball_of_discs(mesh):

@@ -98,15 +98,12 @@ def test_report_of_a_box_with_holes(mesh):
     assert (report.boundary_edges, report.holes) == (6, 2)
 
 
-def test_report_of_a_fin():
-    """Three triangles on one edge."""
+def test_reports_of_a_fin_and_of_nothing():
+    """Three triangles on one edge, and none at all."""
     fin = trimesh.Trimesh(
         [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]], process=False
     )
     report = mesh_report(fin)
     assert (report.nonmanifold_edges, report.boundary_edges, report.parts) == (1, 6, 1)
-
-
-def test_report_of_nothing():
     report = mesh_report(trimesh.Trimesh())
     assert (report.vertices, report.faces, report.parts, report.holes) == (0, 0, 0, 0)

@@ -199,8 +199,8 @@ def test_walker_contains_the_truth(data_dir, walker_views, device):
             wp.array(mesh.faces.ravel(), dtype=int, device=device),
         )
         out = wp.empty(len(points), dtype=float, device=device)
-        inputs = [shape.id, wp.array(points, dtype=wp.vec3, device=device)]
-        wp.launch(signed_depth_kernel, len(points), inputs=inputs, outputs=[out], device=device)
+        places = wp.array(points, dtype=wp.vec3, device=device)
+        wp.launch(signed_depth_kernel, len(points), inputs=[shape.id, places], outputs=[out], device=device)
         return out.numpy()
 
     inside = depths(hull.mesh, surface.vertices)

@@ -231,6 +231,22 @@ class TestResuming:
             assert found.report["resumed_frames"] == min((done + 2) // 3, 3)
             require_same_results(tmp_path / "whole", out)
 
+    def test_an_interrupt_changes_no_byte_either(self, followed, capture, tmp_path, monkeypatch):
+        """An interrupt, unlike a kill, ends the threads and unwinds the writers: here before the second preview."""
+        writes = []
+
+        def interrupt():
+            writes.append("begun")
+            if len(writes) == 5:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            before_each_write(patch, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                reconstruct(capture, tmp_path / "out", FakeSteps())
+        assert reconstruct(capture, tmp_path / "out", FakeSteps()).report["resumed_frames"] == 2
+        require_same_results(followed[1], tmp_path / "out")
+
     @pytest.mark.slow
     def test_sigkill(self, folder, capture, tmp_path):
         """A process killed while it works."""

@@ -147,9 +147,7 @@ class TestSurface:
         moved = 1e3 * np.linalg.norm(truth.vertices - later.vertices, axis=1)
         assert 0.3 < found.surface.chamfer_mm < moved.mean()
 
-    def test_truth_frames_are_those_with_exact_channels(self, tiny_capture):
+    def test_frames_have_exact_channels_and_a_mesh(self, tiny_capture):
         assert truth_frames(tiny_capture) == (0, 1)
-
-    def test_a_frame_without_a_mesh_is_named(self, tiny_capture):
         with pytest.raises(MissingFileError, match="truth must have a mesh for every frame scored"):
             read_truth_mesh(tiny_capture, 7)

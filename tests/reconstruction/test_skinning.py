@@ -44,13 +44,8 @@ def warped(skin, rotations, positions):
 def gradients(skin, rotations, positions, to_positions, to_orientations):
     count = len(rotations)
     out = zeros(count, 4, skin.device), zeros(count, 3, skin.device)
-    skin.add_gradients(
-        vectors(rotations, skin.device),
-        vectors(positions, skin.device),
-        None if to_positions is None else vectors(to_positions, skin.device),
-        None if to_orientations is None else vectors(to_orientations, skin.device),
-        *out,
-    )
+    forces = (None if force is None else vectors(force, skin.device) for force in (to_positions, to_orientations))
+    skin.add_gradients(vectors(rotations, skin.device), vectors(positions, skin.device), *forces, *out)
     return out[0].numpy().astype(float), out[1].numpy().astype(float)
 
 
