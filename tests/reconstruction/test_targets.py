@@ -191,7 +191,7 @@ def test_the_gradient_of_a_step_is_that_of_its_loss(device, samples, weights):
     1e-5 of every gradient's length is the goal that all gradients here have; 3.5e-6 was the most in twelve scenes.
     """
     rng = np.random.default_rng(3)
-    view = random_view(rng, camera_of(19, 14))
+    view = random_view(rng, camera_of(17, 11))
     targets, parameters = set_up([view], near_cloud(rng), device, samples, ViewTargets, sh_degree=1)
     filters = rng.uniform(0.0, 0.1, 6).astype(np.float32)
     parameters.filters.assign(filters)

@@ -28,7 +28,7 @@ def track_options(levels, iterations, normal_iterations):
     return TrackOptions(joint_count=40, joints=joints, refinement=refinement)
 
 
-OPTIONS = track_options((4, 2, 1), (20, 20, 30), 40)
+OPTIONS = track_options((4, 2, 1), (16, 16, 24), 30)
 
 FEWER = track_options((4, 2, 1), (8, 8, 12), 15)
 """Steps enough to find out that a motion is not found."""
@@ -39,7 +39,7 @@ BRIEF = track_options((2, 1), (3, 3), 4)
 @cache
 def key_track(device):
     """A ball of 400 Gaussians, well fitted."""
-    options = FitOptions(gaussian_count=400, color_iterations=0, normal_iterations=80, refine_every=0, samples=1)
+    options = FitOptions(gaussian_count=400, color_iterations=0, normal_iterations=60, refine_every=0, samples=1)
     views = ball_views(CAMERAS)
     cloud = fit_gaussians(views, ball_cloud(400), options, device=device).cloud
     return begin_track(cloud, views, OPTIONS, device=device)
