@@ -311,10 +311,8 @@ def test_the_common_volume_is_what_is_seen():
 
 
 def test_parallel_cameras_have_a_volume_in_front():
-    cameras = [
-        Camera.look_at((0.1 * k, 0.0, 1.0), (0.1 * k, 5.0, 1.0), width=40, height=30, vertical_fov=40.0)
-        for k in range(4)
-    ]
+    ends = [((0.1 * k, 0.0, 1.0), (0.1 * k, 5.0, 1.0)) for k in range(4)]
+    cameras = [Camera.look_at(eye, target, width=40, height=30, vertical_fov=40.0) for eye, target in ends]
     low, high = frustum_volume(cameras)
     assert high[1] > 0.5
     assert low[1] > 0.0

@@ -118,12 +118,8 @@ def test_bad_input(cloud):
 
 def test_preview(device):
     """A triangle that faces the camera is as bright as its colour under the camera's light and the sky's half."""
-    square = trimesh.Trimesh(
-        [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]],
-        [[0, 1, 2], [0, 2, 3]],
-        vertex_colors=np.tile([255, 0, 0, 255], (4, 1)).astype(np.uint8),
-        process=False,
-    )
+    corners, red = [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], np.tile(np.uint8([255, 0, 0, 255]), (4, 1))
+    square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], vertex_colors=red, process=False)
     front = Camera.orbit((0, 0, 0), 4.0, 0.0, 0.0, width=33, height=33, vertical_fov=60.0)
     image = shaded_image(square, front, device)
     assert image.dtype == np.uint8

@@ -54,9 +54,8 @@ def test_glb_is_y_up(mesh, tmp_path):
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
 def test_texture_coordinates(suffix, tmp_path):
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [0.25, 0.75]])
-    flat = trimesh.Trimesh(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], visual=trimesh.visual.TextureVisuals(uv=uv), process=False
-    )
+    visual = trimesh.visual.TextureVisuals(uv=uv)
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], visual=visual, process=False)
     write_mesh(flat, tmp_path / f"flat.{suffix}")
     assert np.abs(read_mesh(tmp_path / f"flat.{suffix}").visual.uv - uv).max() < PRECISION
 
@@ -100,10 +99,8 @@ def test_report_of_a_box_with_holes(mesh):
 
 def test_reports_of_a_fin_and_of_nothing():
     """Three triangles on one edge, and none at all."""
-    fin = trimesh.Trimesh(
-        [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]], process=False
-    )
-    report = mesh_report(fin)
+    corners = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0]]
+    report = mesh_report(trimesh.Trimesh(corners, [[0, 1, 2], [0, 1, 3], [0, 1, 4]], process=False))
     assert (report.nonmanifold_edges, report.boundary_edges, report.parts) == (1, 6, 1)
     report = mesh_report(trimesh.Trimesh())
     assert (report.vertices, report.faces, report.parts, report.holes) == (0, 0, 0, 0)

@@ -194,12 +194,9 @@ def test_walker_contains_the_truth(data_dir, walker_views, device):
 
     def depths(mesh, points):
         """Signed distance to a mesh, positive inside."""
-        shape = wp.Mesh(
-            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
-            wp.array(mesh.faces.ravel(), dtype=int, device=device),
-        )
+        corners, places = (wp.array(array, dtype=wp.vec3, device=device) for array in (mesh.vertices, points))
+        shape = wp.Mesh(corners, wp.array(mesh.faces.ravel(), dtype=int, device=device))
         out = wp.empty(len(points), dtype=float, device=device)
-        places = wp.array(points, dtype=wp.vec3, device=device)
         wp.launch(signed_depth_kernel, len(points), inputs=[shape.id, places], outputs=[out], device=device)
         return out.numpy()
 

@@ -22,10 +22,6 @@ from beam_warp.reconstruction.temporal import TemporalTerms
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def value(loss):
-    return float(loss.numpy()[0])
-
-
 def rigidity(graph, poses, device, weight=1.0):
     """Value and gradients of rotations and positions."""
     count = len(poses[0])
@@ -33,7 +29,7 @@ def rigidity(graph, poses, device, weight=1.0):
     found = RigidityLoss(graph, device=device)(
         *(vectors(pose, device) for pose in poses), weight=weight, rotation_gradients=out[0], position_gradients=out[1]
     )
-    return value(found), out[0].numpy().astype(float), out[1].numpy().astype(float)
+    return float(found.numpy()[0]), out[0].numpy().astype(float), out[1].numpy().astype(float)
 
 
 def turns(rng, count, angle):

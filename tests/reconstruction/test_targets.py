@@ -178,20 +178,20 @@ class Twin:
 
 
 @pytest.mark.parametrize(
-    ("samples", "weights"),
+    ("size", "samples", "weights"),
     [
-        (1, LossWeights(normal=0.3)),
-        (2, LossWeights(normal=0.3)),
-        (1, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0)),
+        ((19, 14), 1, LossWeights(normal=0.3)),
+        ((17, 11), 2, LossWeights(normal=0.3)),
+        ((17, 11), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0)),
     ],
 )
-def test_the_gradient_of_a_step_is_that_of_its_loss(device, samples, weights):
+def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weights):
     """Encoding, samples, four terms, rasteriser and activation at once: from photographs to the parameters.
 
     1e-5 of every gradient's length is the goal that all gradients here have; 3.5e-6 was the most in twelve scenes.
     """
     rng = np.random.default_rng(3)
-    view = random_view(rng, camera_of(17, 11))
+    view = random_view(rng, camera_of(*size))
     targets, parameters = set_up([view], near_cloud(rng), device, samples, ViewTargets, sh_degree=1)
     filters = rng.uniform(0.0, 0.1, 6).astype(np.float32)
     parameters.filters.assign(filters)
