@@ -182,7 +182,7 @@ class Twin:
     [
         ((19, 14), 1, LossWeights(normal=0.3)),
         ((17, 11), 2, LossWeights(normal=0.3)),
-        ((17, 11), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0)),
+        ((19, 14), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0)),
     ],
 )
 def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weights):
