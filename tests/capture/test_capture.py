@@ -23,9 +23,7 @@ def opengl_pose(eye):
 
 
 def write_capture(folder, records, **content):
-    path = folder / "transforms.json"
-    path.write_text(json.dumps({**INTRINSICS, "frames": records, **content}))
-    return path
+    (folder / "transforms.json").write_text(json.dumps({**INTRINSICS, "frames": records, **content}))
 
 
 def record(**changes):
@@ -33,9 +31,18 @@ def record(**changes):
     return {**fields, **changes}
 
 
+def captured(folder, records, **content):
+    write_capture(folder, records, **content)
+    return Capture.read(folder)
+
+
+def photographs(*images):
+    """A record of each image, of the cameras a, b, c and so on."""
+    return [record(file_path=image, camera=name) for image, name in zip(images, "abcdef", strict=False)]
+
+
 def test_pose_turns_from_opengl_to_opencv(tmp_path):
-    write_capture(tmp_path, [record()])
-    camera = Capture.read(tmp_path).records[0].camera
+    camera = captured(tmp_path, [record()]).records[0].camera
     np.testing.assert_array_equal(camera.position, (1, -2, 3))
     np.testing.assert_array_equal(camera.forward, (0, 1, 0))
     x, y, depth = camera.project([[1.5, 0, 4]])[0]  # half a metre to the right, one up, two ahead
@@ -46,12 +53,8 @@ def test_fields_of_a_performance(tmp_path):
     truth = {"truth": "truth/a_0004.exr", "relit": {"studio": "truth/studio/a_0004.exr"}}
     own = {"fl_x": 20.0, "k1": 0.1, "p2": -0.02}
     (tmp_path / "environment.exr").touch()
-    write_capture(
-        tmp_path,
-        [record(split="train"), record(frame=4, time=0.5, split="test", **own, **truth)],
-        fps=24,
-        environment="environment.exr",
-    )
+    records = [record(split="train"), record(frame=4, time=0.5, split="test", **own, **truth)]
+    write_capture(tmp_path, records, fps=24, environment="environment.exr")
     capture = Capture.read(tmp_path / "transforms.json")
     first, second = capture.records
     assert capture.frames == (0, 4)
@@ -74,10 +77,8 @@ def test_fields_of_a_performance(tmp_path):
 
 def test_plain_nerfstudio_file(tmp_path):
     entry = {"file_path": "./images/frame_01.png", "transform_matrix": opengl_pose((0, 0, 0))}
-    write_capture(
-        tmp_path, [entry, {**entry, "file_path": "images/frame_02.png"}], test_filenames=["images/frame_02.png"]
-    )
-    capture = Capture.read(tmp_path)
+    other = "images/frame_02.png"
+    capture = captured(tmp_path, [entry, {**entry, "file_path": other}], test_filenames=[other])
     assert [(r.name, r.split) for r in capture.records] == [
         ("images_frame_01_0000", "train"),
         ("images_frame_02_0000", "test"),
@@ -87,8 +88,7 @@ def test_plain_nerfstudio_file(tmp_path):
 
 
 def test_images_are_read_when_asked_for(tmp_path):
-    write_capture(tmp_path, [record(), record(frame=1, file_path="images/a/0001.exr")])
-    capture = Capture.read(tmp_path)
+    capture = captured(tmp_path, [record(), record(frame=1, file_path="images/a/0001.exr")])
     with pytest.raises(MissingFileError):
         capture.records[0].image()
     (tmp_path / "images/a").mkdir(parents=True)
@@ -155,9 +155,7 @@ def test_a_broken_file_is_one_line(tmp_path, text, message):
 
 
 def test_missing_files(tmp_path):
-    with pytest.raises(
-        MissingFileError, match=r"capture must be a folder with transforms\.json, a COLMAP model .*, got"
-    ):
+    with pytest.raises(MissingFileError, match=r"must be a folder with transforms\.json, a COLMAP model .*, got"):
         Capture.read(tmp_path)
     with pytest.raises(MissingFileError, match="capture must be a folder"):
         Capture.read(tmp_path / "nowhere")
@@ -170,8 +168,7 @@ def test_a_bent_photograph_is_read_undistorted(tmp_path):
     (tmp_path / "images/a").mkdir(parents=True)
     ramp = np.broadcast_to(np.arange(8, dtype=np.float32), (6, 8))
     write_exr(tmp_path / "images/a/0000.exr", {"R": ramp, "G": ramp, "B": ramp, "depth": ramp})
-    write_capture(tmp_path, [record(truth="images/a/0000.exr")], k1=0.1, camera_model="RADIAL")
-    bent = Capture.read(tmp_path).records[0]
+    bent = captured(tmp_path, [record(truth="images/a/0000.exr")], k1=0.1, camera_model="RADIAL").records[0]
     assert bent.mask().all()
     image = bent.image()
     np.testing.assert_array_equal(image.channels["R"], bent.truth().channels["R"])
@@ -202,20 +199,14 @@ def test_a_view_is_linear_and_premultiplied(tmp_path):
     (tmp_path / "images").mkdir()
     write_exr(tmp_path / "images/x.exr", {"R": 0.5 * half, "G": half, "B": 4 * half, "A": half})
     write_pair(tmp_path, "images/y.png", (128, 0, 255), alpha=51)
-    write_capture(
-        tmp_path,
-        [
-            record(file_path="images/x.exr", camera="x"),
-            record(file_path="images/y.png", camera="y"),
-            record(file_path="images/y.png", camera="z", color_space="linear"),
-        ],
-    )
-    x, y, z = (row.view() for row in Capture.read(tmp_path).records)
+    records = photographs("images/x.exr", "images/y.png", "images/y.png")
+    records[2]["color_space"] = "linear"
+    x, y, z = (row.view() for row in captured(tmp_path, records).records)
     np.testing.assert_array_equal(x.color[3, 4], (0.25, 0.5, 2.0))
     np.testing.assert_array_equal(x.alpha, half)
     np.testing.assert_allclose(y.color[0, 0], (0.2158605 * 0.2, 0, 0.2), atol=1e-6)  # sRGB 128 is 0.2158605 of white
     np.testing.assert_allclose(z.color[0, 0], (128 / 255 * 0.2, 0, 0.2), atol=1e-7)
-    assert (y.name, y.camera.focal_x, y.color.dtype, y.alpha.dtype) == ("y_0000", 10.0, np.float32, np.float32)
+    assert (y.name, y.camera.focal_x, y.color.dtype, y.alpha.dtype) == ("b_0000", 10.0, np.float32, np.float32)
     np.testing.assert_allclose(y.alpha, 0.2, atol=1e-7)
 
 
@@ -223,17 +214,15 @@ def test_masks_named_and_beside(tmp_path):
     mask = np.zeros((6, 8), np.uint8)
     mask[2:, :4] = 255
     mask[0, 0] = 51
-    for image in ("images/a/0.png", "images/b/0.png", "images/c.png", "images/d.png", "other/e.png"):
-        write_pair(tmp_path, image, (255, 255, 255))
-    write_pair(tmp_path, "images/f.png", (255, 255, 255), alpha=128)
+    images = ("images/a/0.png", "images/b/0.png", "images/c.png", "images/d.png", "other/e.png", "images/f.png")
+    for image in images:
+        write_pair(tmp_path, image, (255, 255, 255), alpha=128 if image == images[-1] else None)
     for name in ("masks/a/0.png", "masks/b/0.png.png", "masks/other/e.png", "masks/f.png", "elsewhere.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         PillowImage.fromarray(mask).save(tmp_path / name)
-    images = ("images/a/0.png", "images/b/0.png", "images/c.png", "images/d.png", "other/e.png", "images/f.png")
-    records = [record(file_path=image, camera=name) for image, name in zip(images, "abcdef", strict=True)]
+    records = photographs(*images)
     records[2]["mask_path"] = "elsewhere.png"
-    write_capture(tmp_path, records)
-    views = [row.view() for row in Capture.read(tmp_path).records]
+    views = [row.view() for row in captured(tmp_path, records).records]
     expected = mask.astype(np.float32) / np.float32(255)
     for index in (0, 1, 2, 4):
         np.testing.assert_array_equal(views[index].alpha, expected)
@@ -244,14 +233,13 @@ def test_masks_named_and_beside(tmp_path):
 
 
 def test_a_mask_is_undistorted_with_its_image(tmp_path):
-    ramp = np.linspace(0.0, 255.0, 8).astype(np.uint8)
+    ramp = np.tile(np.linspace(0.0, 255.0, 8).astype(np.uint8), (6, 1))
     write_pair(tmp_path, "images/a.png", (255, 255, 255))
-    write_pair(tmp_path, "images/b.png", (255, 255, 255), alpha=np.broadcast_to(ramp, (6, 8)))
+    write_pair(tmp_path, "images/b.png", (255, 255, 255), alpha=ramp)
     (tmp_path / "masks").mkdir()
-    PillowImage.fromarray(np.ascontiguousarray(np.broadcast_to(ramp, (6, 8)))).save(tmp_path / "masks/a.png")
-    records = [record(file_path="images/a.png", camera="a"), record(file_path="images/b.png", camera="b")]
-    write_capture(tmp_path, records, k1=0.1)
-    masked, cut = (row.view() for row in Capture.read(tmp_path).records)
+    PillowImage.fromarray(ramp).save(tmp_path / "masks/a.png")
+    records = photographs("images/a.png", "images/b.png")
+    masked, cut = (row.view() for row in captured(tmp_path, records, k1=0.1).records)
     np.testing.assert_array_equal(masked.alpha, cut.alpha)
     np.testing.assert_array_equal(masked.color, cut.color)
 
@@ -266,18 +254,10 @@ def test_views_that_cannot_be_read(tmp_path):
     write_exr(tmp_path / "images/rounded.exr", {"R": one, "G": one, "B": one, "A": one * np.float32(1 + 2**-11)})
     write_pair(tmp_path, "images/good.png", (9, 9, 9))
     PillowImage.fromarray(np.zeros((6, 9), np.uint8)).save(tmp_path / "narrow.png")
-    good = record(file_path="images/good.png")
-    write_capture(
-        tmp_path,
-        [
-            record(file_path="images/nan.exr", camera="a"),
-            record(file_path="images/alpha.exr", camera="b"),
-            {**good, "camera": "c", "mask_path": "narrow.png"},
-            {**good, "camera": "d", "mask_path": "nowhere.png"},
-            record(file_path="images/rounded.exr", camera="e"),
-        ],
-    )
-    nan, alpha, narrow, nowhere, rounded = Capture.read(tmp_path).records
+    good = "images/good.png"
+    records = photographs("images/nan.exr", "images/alpha.exr", good, good, "images/rounded.exr")
+    records[2]["mask_path"], records[3]["mask_path"] = "narrow.png", "nowhere.png"
+    nan, alpha, narrow, nowhere, rounded = captured(tmp_path, records).records
     with pytest.raises(AssetFormatError, match=r"image must be finite, got NaN or infinity in 1 pixels at .*nan\.exr"):
         nan.view()
     with pytest.raises(AssetFormatError, match=r"alpha must lie in \[0, 1\], got 2 to 2 at .*alpha\.exr"):
@@ -292,8 +272,7 @@ def test_views_that_cannot_be_read(tmp_path):
 def test_sparse_points(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {n}\n" for n in "xyz")
     colors = "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
-    write_capture(tmp_path, [record()], ply_file_path="points.ply")
-    capture = Capture.read(tmp_path)
+    capture = captured(tmp_path, [record()], ply_file_path="points.ply")
     with pytest.raises(MissingFileError):
         capture.points()
     (tmp_path / "points.ply").write_text(f"{header}{colors}end_header\n1 2 3 255 0 128\n0 0 0.5 1 1 1\n")
@@ -305,5 +284,4 @@ def test_sparse_points(tmp_path):
     (tmp_path / "points.ply").write_text(f"{header}end_header\n1 2 3\n0 nan 0.5\n")
     with pytest.raises(AssetFormatError, match="points must be finite"):
         capture.points()
-    write_capture(tmp_path, [record()])
-    assert Capture.read(tmp_path).points() is None
+    assert captured(tmp_path, [record()]).points() is None

@@ -27,12 +27,9 @@ POINTS_2D = [(1.5, 2.5, -1), (3.0, 4.0, 17)]
 
 def poses():
     """An image of each camera: a unit quaternion, w first, and a translation, rounded to what text keeps exactly."""
-    rng = np.random.default_rng(4)
-    found = []
-    for camera in CAMERAS:
-        quaternion = rng.normal(size=4)
-        found.append((quaternion / np.linalg.norm(quaternion), rng.normal(size=3), camera, f"cam {camera}/a.png"))
-    return found
+    numbers = np.random.default_rng(4).normal(size=(len(CAMERAS), 7))
+    drawn = zip(CAMERAS, numbers[:, :4], numbers[:, 4:], strict=True)
+    return [(q / np.linalg.norm(q), t, camera, f"cam {camera}/a.png") for camera, q, t in drawn]
 
 
 def write_text(folder):

@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy import ndimage
+from support.shapes import quaternions_from_normals
 
 from beam_warp.capture.capture import Capture
 from beam_warp.image.metrics import angles_between, block_means
@@ -32,12 +33,10 @@ def surface_discs(vertices, faces, rng):
     area = 0.5 * np.linalg.norm(cross, axis=1)
     face = rng.choice(len(area), SAMPLES, p=area / area.sum())
     normals = cross[face] / (2.0 * area[face, None])
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)  # straight down
     spacing = np.sqrt(area.sum() / SAMPLES)
     return GaussianCloud(
         positions=np.einsum("ni,nij->nj", rng.dirichlet([1, 1, 1], SAMPLES), corners[face]),
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        orientations=quaternions_from_normals(normals),
         scales=np.tile([spacing, spacing, 0.0], (SAMPLES, 1)),
         opacities=np.ones(SAMPLES),
         normals=normals,

@@ -2,17 +2,15 @@
 
 import numpy as np
 import pytest
+from support.shapes import aligned
 
 from beam_warp.capture.matching import match_frames, scored_frames
 from beam_warp.errors import InvalidOptionError
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 
 
 def sequence(frame_count, **metadata):
-    cloud = GaussianCloud(
-        positions=np.zeros((1, 3)), orientations=[[0, 0, 0, 1]], scales=np.ones((1, 3)), opacities=np.ones(1)
-    )
-    return GaussianSequence.from_clouds([cloud] * frame_count, metadata=metadata)
+    return GaussianSequence.from_clouds([aligned(np.zeros((1, 3)))] * frame_count, metadata=metadata)
 
 
 def test_frames_are_counted_stated_or_given():
@@ -23,20 +21,16 @@ def test_frames_are_counted_stated_or_given():
 
 
 @pytest.mark.parametrize(
-    ("stated", "said"),
+    ("stated", "given", "said"),
     [
-        ("0 1", "capture_frames must be a number for each of 3 frames, got 2"),
-        ("0 2 2", "capture-frames must name each frame of the capture once, got 0 2 2"),
+        ("0 1", None, "capture_frames must be a number for each of 3 frames, got 2"),
+        ("0 2 2", None, "capture-frames must name each frame of the capture once, got 0 2 2"),
+        ("0 1 2", (0, 1), "one number for each of 3 frames of the asset, got 2"),
     ],
 )
-def test_numbers_that_are_none_are_refused(stated, said):
+def test_numbers_that_are_none_are_refused(stated, given, said):
     with pytest.raises(InvalidOptionError, match=said):
-        match_frames(sequence(3, capture_frames=stated))
-
-
-def test_as_many_numbers_are_given_as_there_are_frames():
-    with pytest.raises(InvalidOptionError, match="one number for each of 3 frames of the asset, got 2"):
-        match_frames(sequence(3), (0, 1))
+        match_frames(sequence(3, capture_frames=stated), given)
 
 
 def test_frames_with_truth_that_are_shown(tiny_capture):

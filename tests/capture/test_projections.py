@@ -49,9 +49,10 @@ def test_decomposition_gives_the_camera_back(sign):
         assert part.negated == (sign < 0)
 
 
-@pytest.mark.parametrize("scale", [1, 3, 8])
-def test_the_scale_is_found(tmp_path, scale):
-    write(tmp_path, [matrix_of(camera, scale) for camera in rig()])
+@pytest.mark.parametrize(("scale", "sign"), [(1, 1), (1, -1), (3, -1), (8, 1)])
+def test_the_scale_is_found_whatever_the_signs(tmp_path, scale, sign):
+    """A sign of -1 is that of every other matrix."""
+    write(tmp_path, [matrix_of(camera, scale) * sign**index for index, camera in enumerate(rig())])
     capture = Capture.read(tmp_path)
     assert len(capture.notes) == (scale != 1)
     for record, camera in zip(capture.records, rig(), strict=True):
@@ -71,12 +72,6 @@ def test_the_scale_and_the_pixel_centres_are_stated(tmp_path):
     assert record.view().color[0, 0, 0] == np.float32(9) / np.float32(255)
 
 
-def test_signs_may_be_mixed(tmp_path):
-    write(tmp_path, [matrix_of(camera) * (-1) ** index for index, camera in enumerate(rig())])
-    for record, camera in zip(Capture.read(tmp_path).records, rig(), strict=True):
-        np.testing.assert_allclose(record.camera.camera_to_world, camera.camera_to_world, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("pixels_by", "world_by"),
     [(np.eye(3), np.diag([1.0, 1, -1, 1])), (np.array([[1.0, 0, 0], [0, -1, 40], [0, 0, 1]]), np.eye(4))],
@@ -88,30 +83,19 @@ def test_mirrors_are_refused(tmp_path, pixels_by, world_by):
         Capture.read(tmp_path)
 
 
-def flat(matrix):
-    matrix[1] = 2 * matrix[0]
-
-
-def skewed(matrix):
-    matrix[0] += 0.02 * (matrix[1] - 20.0 * matrix[2])
-
-
-def zero(matrix):
-    matrix[2] = 0.0
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("pixels_by", "message"),
     [
-        (flat, "matrix must not be singular, got singular values .*000_P.txt"),
-        (zero, "matrix must be finite with three rows that are not 0"),
-        (skewed, "matrix must have no skew, got .*, which moves pixels by up to 0.4, at .*000_P.txt"),
+        ([[1, 0, 0], [2, 0, 0], [0, 0, 1]], "matrix must not be singular, got singular values .*000_P.txt"),
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 0]], "matrix must be finite with three rows that are not 0"),
+        (
+            [[1, 0.02, -0.4], [0, 1, 0], [0, 0, 1]],
+            "matrix must have no skew, got .*, which moves pixels by up to 0.4, at .*000_P.txt",
+        ),
     ],
 )
-def test_what_is_no_pinhole_is_refused(tmp_path, change, message):
-    matrix = matrix_of(rig()[0])
-    change(matrix)
-    write(tmp_path, [matrix])
+def test_what_is_no_pinhole_is_refused(tmp_path, pixels_by, message):
+    write(tmp_path, [pixels_by @ matrix_of(rig()[0])])
     with pytest.raises(AssetFormatError, match=message):
         Capture.read(tmp_path)
 

@@ -13,6 +13,7 @@ from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb
 from beam_warp.image.files import Image
 
 PHOTOGRAPH = Intrinsics(160, 120, 150.0, 140.0, 83.0, 58.0)
+SHIFTED = PHOTOGRAPH._replace(center_x=PHOTOGRAPH.center_x + 0.5)
 BARREL = Lens((-0.25, 0.08, -0.01, 0.002, 0.001, -0.0015))
 PINCUSHION = Lens((0.2, -0.03, 0.01, 0.0, -0.002, 0.001))
 FISHEYE = Lens((-0.03, 0.005, -0.002, 0.0003, 0.0, 0.0), "OPENCV_FISHEYE")
@@ -232,7 +233,6 @@ class TestImage:
 
     def test_cubic_keeps_detail_that_averaging_neighbours_loses(self):
         # Half a pixel off, the cubic leaves 0.884 of a wave of four pixels and linear interpolation 0.707.
-        shifted = PHOTOGRAPH._replace(center_x=PHOTOGRAPH.center_x + 0.5)
         for samples, swing in (
             # Samples of 1.5 + 0.7071 cos at odd eighths. The cubic would go to 9/8 of the half swing, but nothing
             # leaves the range of what was read.
@@ -240,7 +240,7 @@ class TestImage:
             ([0.0, 1.0, 0.0, -1.0], 2 * 0.625),
         ):
             wave = np.tile(samples, 40) * np.ones((120, 1))
-            result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, shifted).image(image_of({**grey(wave), "x": wave}))
+            result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, SHIFTED).image(image_of({**grey(wave), "x": wave}))
             assert np.ptp(result.channels["x"][60, 4:-4]) == pytest.approx(1.0, abs=1e-4)
             assert np.ptp(result.channels["R"][60, 4:-4]) == pytest.approx(swing, abs=1e-4)
 
@@ -269,10 +269,9 @@ class TestImage:
 
     def test_display_colour_is_mixed_as_light(self):
         # Half of black and half of white is half the light, not half the code.
-        shifted = PHOTOGRAPH._replace(center_x=PHOTOGRAPH.center_x + 0.5)
         step = np.where(np.arange(160) < 80, 0.0, 1.0) * np.ones((120, 1))
         photo = image_of({"Y": step}, color_space=DISPLAY_SRGB, premultiplied=False)
-        result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, shifted).image(photo)
+        result = Undistortion(NEARLY_STRAIGHT, PHOTOGRAPH, SHIFTED).image(photo)
         assert result.channels["Y"][60, 80] == pytest.approx(float(linear_to_srgb(0.5)), abs=1e-5)
 
     def test_data_are_means_over_what_is_covered(self):
@@ -333,7 +332,7 @@ class TestImage:
         The photograph is blurred by a pixel, as by any real lens: where a box filter puts the level of 1/2 between
         two pixels says nothing finer than a sixth of a pixel about an edge.
         """
-        n = 6  # samples per pixel and axis: with the blur they place an edge to a hundredth of a pixel
+        n = 4  # samples per pixel and axis: with the blur they place an edge to a hundredth of a pixel
         fine = PHOTOGRAPH._replace(
             width=160 * n, height=120 * n, focal_x=150.0 * n, focal_y=140.0 * n, center_x=83.0 * n, center_y=58.0 * n
         )

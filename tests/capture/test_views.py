@@ -10,11 +10,10 @@ from beam_warp.world.camera import Camera
 CAMERA = Camera(7, 5, 6.0, 5.0, 3.2, 2.4, np.eye(4))
 
 
-def view(rng=None) -> CapturedView:
-    rng = rng or np.random.default_rng(0)
-    return CapturedView(
-        name="a", camera=CAMERA, color=rng.random((5, 7, 3), np.float32), alpha=rng.random((5, 7), np.float32)
-    )
+def view() -> CapturedView:
+    rng = np.random.default_rng(0)
+    color, alpha = rng.random((5, 7, 3), np.float32), rng.random((5, 7), np.float32)
+    return CapturedView(name="a", camera=CAMERA, color=color, alpha=alpha)
 
 
 def test_a_point_of_a_crop_is_the_same_pixel():

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import dome_cameras, write_demo_capture
 from beam_warp.demo.lights import studio
 from beam_warp.errors import MissingFileError, OutputError
 from beam_warp.world.environment import EnvironmentMap
+
+ONE_VIEW = {"frame_count": 1, "camera_count": 1, "test_camera_count": 0, "device": "cpu"}
 
 
 def truth_mesh(capture, frame):
@@ -62,9 +63,8 @@ class TestLayout:
             assert set(record.truth().channels) == names
 
     def test_environment_is_the_light_of_the_capture(self, tiny_capture):
-        np.testing.assert_allclose(
-            EnvironmentMap.read(tiny_capture.environment_path).radiance, studio().radiance, rtol=1e-6
-        )
+        light = EnvironmentMap.read(tiny_capture.environment_path)
+        np.testing.assert_allclose(light.radiance, studio().radiance, rtol=1e-6)
 
     def test_a_camera_stays_where_it_is(self, tiny_capture):
         first, second = (tiny_capture.select(split="train", frames=[frame]) for frame in (0, 1))
@@ -74,7 +74,7 @@ class TestLayout:
     def test_folder_with_content_is_refused_and_left_alone(self, tmp_path):
         (tmp_path / "mine.txt").write_text("mine")
         with pytest.raises(OutputError, match="folder must be new or empty"):
-            write_demo_capture(tmp_path, frame_count=1, camera_count=1, test_camera_count=0, size=8, device="cpu")
+            write_demo_capture(tmp_path, **ONE_VIEW, size=8)
         assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
     def test_what_stops_half_way_leaves_nothing(self, tmp_path):
@@ -82,9 +82,7 @@ class TestLayout:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            write_demo_capture(
-                tmp_path / "capture", frame_count=1, camera_count=1, size=8, samples=1, device="cpu", progress=stop
-            )
+            write_demo_capture(tmp_path / "capture", **ONE_VIEW, size=8, samples=1, progress=stop)
         assert not list(tmp_path.iterdir())
 
 
@@ -118,16 +116,14 @@ class TestImages:
             assert np.median(cosine) > np.cos(np.radians(15.0))  # a pixel of 40 mm spans that much of most limbs
 
     def test_same_seed_gives_the_same_images_and_another_seed_others(self, tmp_path):
-        sizes = {"frame_count": 1, "camera_count": 1, "test_camera_count": 0, "size": 24, "samples": 4, "device": "cpu"}
-        images = [
-            write_demo_capture(tmp_path / name, seed=seed, **sizes).records[0].image().rgb()
-            for name, seed in (("a", 3), ("b", 3), ("c", 4))
-        ]
-        assert np.array_equal(images[0], images[1])
-        assert not np.array_equal(images[0], images[2])
+        def image(name, seed):
+            capture = write_demo_capture(tmp_path / name, **ONE_VIEW, size=24, samples=4, seed=seed)
+            return capture.records[0].image().rgb()
 
+        first = image("a", 3)
+        assert np.array_equal(first, image("b", 3))
+        assert not np.array_equal(first, image("c", 4))
 
-class TestTruthMeshes:
     def test_topology_is_constant_and_the_figure_moves(self, tiny_capture):
         first, second = (truth_mesh(tiny_capture, frame) for frame in (0, 1))
         assert np.array_equal(first.faces, second.faces)
@@ -151,24 +147,12 @@ def test_dome_looks_at_the_middle_from_one_distance():
     np.testing.assert_allclose(np.diff(azimuths), np.pi / 4.0)
 
 
-def test_read_takes_the_folder(tiny_capture):
-    again = Capture.read(tiny_capture.folder)
-    assert [record.name for record in again.records] == [record.name for record in tiny_capture.records]
-
-
 class TestRelit:
     def test_the_light_of_the_capture_gives_its_own_image(self, tmp_path):
         """The same paths under the same light: but for the half floats of images, 2^-11 of a value."""
-        capture = write_demo_capture(
-            tmp_path / "capture",
-            frame_count=1,
-            camera_count=1,
-            test_camera_count=1,
-            size=32,
-            samples=2,
-            relit={"same": studio(), "dark": EnvironmentMap.constant((0.0, 0.0, 0.0))},
-            device="cpu",
-        )
+        lights = {"same": studio(), "dark": EnvironmentMap.constant((0.0, 0.0, 0.0))}
+        sizes = {**ONE_VIEW, "test_camera_count": 1, "size": 32, "samples": 2}
+        capture = write_demo_capture(tmp_path / "capture", **sizes, relit=lights)
         train, test = capture.records
         assert train.relit_paths == {}
         assert test.relit_paths["dark"] == capture.folder / "truth/relit_dark/test_00_0000.exr"

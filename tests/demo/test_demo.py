@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import trimesh
 from PIL import Image
 
 from beam_warp.cli.demo import Demo
+from beam_warp.decomposition.job import OverviewOptions
+from beam_warp.demo.capture import FIGURE_SPACINGS, demo_figure_for
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.from_images import PANEL_HEIGHT, FromImages, FromImagesOptions, demo_capture, demo_from_images
 from beam_warp.demo.job import DemoOptions, run_demo
@@ -19,7 +22,13 @@ from beam_warp.jobs.progress import no_progress
 
 @pytest.fixture(scope="module")
 def figure():
-    return build_figure(0.014)
+    return build_figure(FIGURE_SPACINGS[1])
+
+
+@pytest.fixture(scope="module")
+def lights():
+    """The lights of the demo, smaller: what is made of them costs less."""
+    return {name: light.resized(16, 32) for name, light in demo_environments().items()}
 
 
 def test_figure_is_closed_and_its_points_persist(figure):
@@ -27,6 +36,7 @@ def test_figure_is_closed_and_its_points_persist(figure):
     assert trimesh.Trimesh(first.vertices, first.faces, process=False).is_watertight
     assert np.array_equal(first.faces, later.faces)
     assert np.array_equal(first.base_color, later.base_color)
+    assert np.array_equal(later.vertices, demo_figure_for(size=64).at(0.3).vertices)  # the same figure every time
     moved = np.linalg.norm(first.vertices - later.vertices, axis=1)
     assert 0.05 < moved.max() < 1.0
     assert 1.5 < np.ptp(first.vertices[:, 2]) < 1.9
@@ -46,8 +56,7 @@ def test_figure_is_concave(figure):
     assert mesh.volume < 0.4 * mesh.convex_hull.volume
 
 
-def test_lights_are_maps_of_the_same_exposure():
-    lights = demo_environments()
+def test_lights_are_maps_of_the_same_exposure(lights):
     assert set(lights) == {"studio", "sunset", "stage"}
     brightest = [light.irradiance_map(16, 32).max() for light in lights.values()]
     assert max(brightest) < 1.5 * min(brightest)
@@ -57,30 +66,17 @@ def test_lights_are_maps_of_the_same_exposure():
 def small_demo(tmp_path_factory):
     """The whole demo at a twentieth of its size: its folder, its options and its result."""
     out = tmp_path_factory.mktemp("small") / "demo"
-    images = FromImagesOptions(
-        size=64,
-        frame_count=2,
-        camera_count=8,
-        test_camera_count=1,
-        samples=4,
-        gaussian_count=1500,
-        color_iterations=30,
-        normal_iterations=30,
-        joint_iterations=20,
-        track_iterations=10,
-    )
+    sizes = {"size": 64, "frame_count": 2, "camera_count": 8, "test_camera_count": 1, "samples": 4}
+    steps = {"color_iterations": 30, "normal_iterations": 30, "joint_iterations": 20, "track_iterations": 10}
+    images = FromImagesOptions(gaussian_count=1500, **sizes, **steps)
     options = DemoOptions(frame_count=2, gaussian_count=4000, image_height=96, device="cpu", images=images)
     return out, options, run_demo(out, options)
 
 
 def test_command_and_function_have_the_same_sizes():
     command, options = Demo(), DemoOptions()
-    assert (command.frames, command.gaussians, command.height, command.seed) == (
-        options.frame_count,
-        options.gaussian_count,
-        options.image_height,
-        options.seed,
-    )
+    names = {"frames": "frame_count", "gaussians": "gaussian_count", "height": "image_height", "seed": "seed"}
+    assert [getattr(command, one) for one in names] == [getattr(options, other) for other in names.values()]
 
 
 @pytest.mark.slow
@@ -149,11 +145,12 @@ def test_demo_takes_up_its_capture_and_refuses_another(tmp_path):
             demo_capture(tmp_path, other, "cpu", seed, no_progress)
 
 
-def test_demo_writes_what_it_says(figure, tmp_path, monkeypatch):
+def test_demo_writes_what_it_says(figure, lights, tmp_path, monkeypatch):
     """The first half at its smallest, the second made up: files and report. Slow tests say whether scores are good."""
     monkeypatch.setattr("beam_warp.demo.job.build_figure", lambda: figure)
-    lights = {name: light.resized(16, 32) for name, light in demo_environments().items()}
-    monkeypatch.setattr("beam_warp.demo.job.demo_environments", lambda: lights)
+    one_light = dict.fromkeys(lights, lights["studio"])
+    monkeypatch.setattr("beam_warp.demo.job.demo_environments", lambda: one_light)
+    monkeypatch.setattr("beam_warp.demo.job.OverviewOptions", partial(OverviewOptions, height=64))
     made_up = FromImages(tmp_path / "reconstruction.png", None, {"frames": []})
     monkeypatch.setattr("beam_warp.demo.job.demo_from_images", lambda *args, **options: made_up)
     stages = []

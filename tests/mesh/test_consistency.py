@@ -1,12 +1,15 @@
 """Consistency of depth images: closed forms of a sphere, a shifted view, hidden points, and what enters a fusion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from support.depth_scenes import around, plane_view, sphere_view
+from support.depth_scenes import around, plane_view, points_of, sphere_view
+from support.threads import require_same_on_any_threads
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.mesh.consistency import depth_consistency
-from beam_warp.mesh.depths import DepthImages, DepthView
+from beam_warp.mesh.depths import DepthImages
 from beam_warp.mesh.fusion import fuse_depths
 
 RADIUS = 0.5
@@ -18,8 +21,7 @@ def part(images, index):
 
 def moved(view, by):
     """The same view, wrong by a length along the optical axis."""
-    depth = np.where(view.depth > 0.0, view.depth + by, 0.0).astype(np.float32)
-    return DepthView(camera=view.camera, depth=depth, alpha=view.alpha)
+    return replace(view, depth=np.where(view.depth > 0.0, view.depth + by, 0.0).astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -57,24 +59,14 @@ def test_a_plane_hidden_by_a_sphere_is_not_contradicted():
     found = depth_consistency(images)
     # Of the floor, the view from above sees the sphere in front, or nothing: where it sees nothing it objects.
     rows = part(images, 1)
-    points = above.project(_points(floor))
-    hidden = sphere_at(above, points[:, :2])
+    places = above.project(points_of(floor).reshape(-1, 3))[:, :2]
+    disc = RADIUS * above.focal_x / np.sqrt(4.0 - RADIUS**2)
+    from_middle = np.hypot(*(places - (above.center_x, above.center_y)).T)
     usable = images.pixels.numpy()[rows, 2] > 0.0
-    inside = usable & hidden
+    inside = usable & (from_middle < disc - 2.0)  # well inside, where places are rounded to pixels
     assert inside.sum() > 100
     assert not found.contradicted.numpy()[rows][inside].any()
     assert not found.confirmed.numpy()[rows][inside].any()  # 0, not -1: they count
-
-
-def _points(view):
-    rays = view.camera.directions() / (view.camera.directions() @ view.camera.forward)[..., None]
-    return (view.camera.position + rays * view.depth[..., None]).reshape(-1, 3)
-
-
-def sphere_at(camera, pixels):
-    """Whether places on an image, rounded to pixels, are well inside the sphere's disc."""
-    disc = RADIUS * camera.focal_x / np.sqrt(4.0 - RADIUS**2)
-    return np.hypot(pixels[:, 0] - camera.center_x, pixels[:, 1] - camera.center_y) < disc - 2.0
 
 
 def test_occluded_views_say_nothing():
@@ -110,13 +102,12 @@ def test_mask_keeps_what_is_wrong_out_of_the_fusion(views):
 
 def test_same_bits_on_any_number_of_threads(device, views, monkeypatch):
     images = DepthImages.of(views[:6], device=device)
-    results = []
-    for threads in ("1", "3"):
-        monkeypatch.setenv("BEAM_WARP_THREADS", threads)
+
+    def run():
         found = depth_consistency(images)
-        results.append([array.numpy() for array in (found.confirmed, found.contradicted, found.residuals)])
-    for one, other in zip(*results, strict=True):
-        assert np.array_equal(one, other)
+        return [array.numpy() for array in (found.confirmed, found.contradicted, found.residuals)]
+
+    require_same_on_any_threads(monkeypatch, run)
 
 
 def test_bad_options(views):

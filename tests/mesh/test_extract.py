@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
+from support.moving_ball import RADIUS, ball_cloud
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.mesh.extract import draw_depths, mesh_of_gaussians, surrounding_cameras
@@ -11,47 +11,34 @@ from beam_warp.mesh.preview import shaded_image
 from beam_warp.mesh.topology import mesh_report
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 
-RADIUS = 0.5
 COUNT = 6000
 SPACING = float(np.sqrt(4.0 * np.pi * RADIUS**2 / COUNT))
 
 
-def ball(color=(0.8, 0.4, 0.2), **changes):
-    """Flat, opaque discs on a sphere, as wide as they are apart."""
-    index = np.arange(COUNT) + 0.5
-    z = 1.0 - 2.0 * index / COUNT
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * index
-    normals = np.stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn), z], axis=1)
-    rotations = [Rotation.align_vectors([n], [[0.0, 0.0, 1.0]])[0].as_quat() for n in normals]
-    fields = {
-        "positions": RADIUS * normals,
-        "orientations": np.array(rotations),
-        "scales": np.tile([0.7 * SPACING, 0.7 * SPACING, 0.05 * SPACING], (COUNT, 1)),
-        "opacities": np.full(COUNT, 0.98),
-        "base_color": np.tile(color, (COUNT, 1)),
-        **changes,
-    }
-    return GaussianCloud(**fields)
-
-
 @pytest.fixture(scope="module")
 def cloud():
-    return ball()
+    """Flat, opaque discs on a sphere, as wide as they are apart."""
+    return ball_cloud(COUNT).with_arrays(
+        scales=np.tile([0.7 * SPACING, 0.7 * SPACING, 0.05 * SPACING], (COUNT, 1)),
+        opacities=np.full(COUNT, 0.98),
+        base_color=np.tile((0.8, 0.4, 0.2), (COUNT, 1)),
+        radiance=None,
+        radiance_color_space=None,
+    )
 
 
 @pytest.fixture(scope="module")
 def mesh(cloud):
-    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=96), color="base_color", device="cpu")
+    return mesh_of_gaussians(cloud, surrounding_cameras(cloud, side=64), color="base_color", device="cpu")
 
 
 def test_ball_of_discs(mesh):
     """Closed, and as near to the ball as its discs are.
 
     Discs are tangent planes that reach out to where their alpha is 1/255, 3.3 deviations: they are above the ball by
-    at most that squared over twice the radius; the fusion adds what `test_depth_fusion` derives for a voxel and a
-    pixel of that width seen at 60 degrees, and a disc's thickness.
+    at most that squared over twice the radius; the fusion adds what its `test_sphere` derives for a voxel and a pixel
+    of that width seen at 60 degrees, and a disc's thickness.
     """
     report = mesh_report(mesh)
     assert report.closed
@@ -83,7 +70,7 @@ def test_radiance(cloud):
 
 @pytest.mark.parametrize("depth", ["median", "mean"])
 def test_depth_modes(cloud, depth, device):
-    cameras = surrounding_cameras(cloud, side=64)
+    cameras = surrounding_cameras(cloud, side=48)
     options = RasterOptions(depth="exact")
     found = mesh_of_gaussians(cloud, cameras, voxel=0.03, depth=depth, options=options, device=device)
     assert mesh_report(found).parts == 1
@@ -131,12 +118,8 @@ def test_bad_input(cloud):
 
 def test_preview(device):
     """A triangle that faces the camera is as bright as its colour under the camera's light and the sky's half."""
-    square = trimesh.Trimesh(
-        [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]],
-        [[0, 1, 2], [0, 2, 3]],
-        vertex_colors=np.tile([255, 0, 0, 255], (4, 1)).astype(np.uint8),
-        process=False,
-    )
+    corners, red = [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], np.tile(np.uint8([255, 0, 0, 255]), (4, 1))
+    square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], vertex_colors=red, process=False)
     front = Camera.orbit((0, 0, 0), 4.0, 0.0, 0.0, width=33, height=33, vertical_fov=60.0)
     image = shaded_image(square, front, device)
     assert image.dtype == np.uint8

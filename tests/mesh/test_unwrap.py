@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from support.shapes import aligned, unit
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, MissingPackageError
 from beam_warp.materials.roughness_source import texel_positions, textured_roughness
 from beam_warp.mesh.files import write_mesh
 from beam_warp.mesh.unwrap import unwrapped
-from beam_warp.world.gaussians import GaussianCloud
 
 RESOLUTION = 256
 
@@ -73,18 +73,11 @@ def test_painted_roughness_reaches_every_gaussian(suffix, tmp_path, rng):
     Image.fromarray(image.reshape(RESOLUTION, RESOLUTION)).save(tmp_path / "roughness.png")
     write_mesh(flat, tmp_path / f"canonical.{suffix}")
 
-    directions = rng.normal(size=(2000, 3))
-    points = 0.5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    points = 0.5 * unit(rng.normal(size=(2000, 3)))
     spacing = np.sqrt(np.pi / len(texels))
     clear = np.abs(points[:, 2] / 0.2 - np.rint(points[:, 2] / 0.2)) * 0.2 > 3.0 * spacing
     points = points[clear]
-    cloud = GaussianCloud(
-        positions=points,
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)),
-        scales=np.full((len(points), 3), 0.01),
-        opacities=np.ones(len(points)),
-    )
-    found = textured_roughness(cloud, tmp_path / "roughness.png", tmp_path / f"canonical.{suffix}")
+    found = textured_roughness(aligned(points), tmp_path / "roughness.png", tmp_path / f"canonical.{suffix}")
     assert len(points) > 1000
     assert np.array_equal(np.rint(found * 255.0), stripes(points))
 

@@ -6,13 +6,12 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from support.float32 import EPSILON
 from support.moving_ball import ball_cloud
+from support.shapes import aligned, colored
 
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.reconstruction.densify import SPLIT_OFFSET, SPLIT_SHRINK, hidden, largest_gradients, prune, split
 from beam_warp.reconstruction.parameters import DEAD_LOGIT, GaussianParameters
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 
 
 def rows_of(rng, count):
@@ -47,6 +46,7 @@ class TestSplit:
         found = rows["positions"][np.argsort(rows["positions"][:, 1])]
         np.testing.assert_allclose(found, [[1, 2 - 0.5 * SPLIT_OFFSET, 3], [1, 2 + 0.5 * SPLIT_OFFSET, 3]], rtol=1e-6)
         np.testing.assert_allclose(np.exp(rows["log_scales"]), [[0.5 * SPLIT_SHRINK, 0.1, 0.01]] * 2, rtol=1e-6)
+        assert pytest.approx(0.8, abs=0.02) == SPLIT_OFFSET**2 + SPLIT_SHRINK**2  # of the variance along that axis
 
     def test_mean_position_stays_and_nothing_else_changes(self, rng):
         rows = rows_of(rng, 30)
@@ -63,9 +63,6 @@ class TestSplit:
         for name, array in rows.items():
             np.testing.assert_array_equal(array[others], before[name][others])
 
-    def test_variance_along_the_axis_is_four_fifths(self):
-        assert pytest.approx(0.8, abs=0.02) == SPLIT_OFFSET**2 + SPLIT_SHRINK**2
-
     @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
     def test_the_image_of_a_disc_hardly_changes(self, device, opacity):
         """The image keeps its middle and its height; it gets up to 1.3 times as bright: halves hold 2 x 0.65 of it.
@@ -73,24 +70,16 @@ class TestSplit:
         Where they overlap, in the middle, one hides a part of the other: less light, and more of it outside. So the
         variance is at least that of their sum, offset^2 + shrink^2 of what it was, and below what it was.
         """
-        disc = GaussianCloud(
-            positions=[[0.0, 0.0, 0.0]],
-            orientations=[[0.0, 0.0, 0.0, 1.0]],
-            scales=[[0.2, 0.1, 0.1]],
-            opacities=[opacity],
-            radiance=np.ones((1, 1, 3)),
-            radiance_color_space=LINEAR_REC709,
-        )
+        disc = colored(aligned([[0.0, 0.0, 0.0]], opacity, [0.2, 0.1, 0.1]), np.ones((1, 3)))
         parameters = GaussianParameters(disc, wp.get_device(device), row_count=2)
         rows = copied(parameters.rows())
         split(rows, np.array([0]), np.array([1]))
         parameters.set_rows(rows)
         camera = Camera.orbit((0, 0, 0), 2.0, 0.0, 0.0, width=128, height=96, vertical_fov=40.0)
-        images = [
-            rasterize(cloud, camera, channels=("radiance",), device=device).alpha.astype(np.float64)
+        one, two = images = [
+            rasterize(cloud, camera, channels=(), device=device).alpha.astype(float)
             for cloud in (disc, parameters.cloud())
         ]
-        one, two = images
         assert one.sum() < two.sum() <= 2.0 * SPLIT_SHRINK * one.sum()
         for axis in range(2):
             (middle, spread), (split_middle, split_spread) = (moments(image.sum(axis=axis)) for image in images)
@@ -102,36 +91,36 @@ class TestSplit:
                 assert 0.99 <= split_spread / spread <= 1.15
 
 
+SHARES = [50.0, 1.0, 10.0, 2.0, 36.0, 1.0]
+
+
 class TestHidden:
-    def test_those_that_show_least(self):
-        """Those that show least, at most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14."""
-        shares = np.array([50.0, 1.0, 10.0, 2.0, 36.0, 1.0])
-        assert np.flatnonzero(hidden(shares, 0.05)).tolist() == [1, 3, 5]
-        assert np.flatnonzero(hidden(shares, 0.01)).tolist() == [1]  # of the equal ones, the first
+    @pytest.mark.parametrize(
+        ("shares", "part", "dropped"),
+        [
+            (SHARES, 0.05, [1, 3, 5]),  # at most 5 of 100: 1 + 1 + 2 are 4, and the next would make it 14
+            (SHARES, 0.01, [1]),  # of the equal ones, the first
+            ([0.0, 3.0, 0.0], 0.0, [0, 2]),  # what shows nothing is hidden at once
+            ([1.0, np.nan, 2.0], 0.5, []),  # what is not a number hides nothing
+        ],
+    )
+    def test_those_that_show_least(self, shares, part, dropped):
+        assert np.flatnonzero(hidden(np.array(shares), part)).tolist() == dropped
 
     def test_never_more_than_the_part(self, rng):
         shares = rng.gamma(0.2, 1.0, 1000)
         for part in (0.0, 0.01, 0.5, 1.0):
             assert shares[hidden(shares, part)].sum() <= part * shares.sum() * (1.0 + 1e-12)
 
-    def test_what_shows_nothing_is_hidden_at_once(self):
-        assert hidden(np.array([0.0, 3.0, 0.0]), 0.0).tolist() == [True, False, True]
 
-    def test_what_is_not_a_number_hides_nothing(self):
-        assert not hidden(np.array([1.0, np.nan, 2.0]), 0.5).any()
-
-
-class TestLargestGradients:
-    def test_largest_first_ties_by_row(self):
-        gradients = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0])
-        everyone = np.ones(6, bool)
-        assert largest_gradients(gradients, everyone, 4).tolist() == [1, 3, 2, 4]
-        assert largest_gradients(gradients, everyone, 0).tolist() == []
-        assert len(largest_gradients(gradients, everyone, 100)) == 6
-
-    def test_only_the_eligible_with_gradients(self):
-        gradients = np.array([0.0, 9.0, np.nan, 2.0])
-        assert largest_gradients(gradients, np.array([True, False, True, True]), 4).tolist() == [3]
+def test_largest_gradients_come_first_and_ties_by_row():
+    gradients, everyone = np.array([1.0, 5.0, 3.0, 5.0, 3.0, 3.0]), np.ones(6, bool)
+    assert largest_gradients(gradients, everyone, 4).tolist() == [1, 3, 2, 4]
+    assert largest_gradients(gradients, everyone, 0).tolist() == []
+    assert len(largest_gradients(gradients, everyone, 100)) == 6
+    # Only the eligible, and those that have a gradient.
+    gradients = np.array([0.0, 9.0, np.nan, 2.0])
+    assert largest_gradients(gradients, np.array([True, False, True, True]), 4).tolist() == [3]
 
 
 def test_pruned_rows_are_no_gaussians(device):

@@ -4,31 +4,27 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.shapes import aligned
 
 from beam_warp.errors import InvalidArrayError
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 
 FLOAT32_STEP = 2.0**-23
 
 ROUNDING_MM = 1e3 * 20.0 * FLOAT32_STEP * 2.0
 """Some twenty roundings of float32 coordinates and quaternions of at most 2 m."""
 
+IDS = np.arange(500)
+
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
 
 
-def cloud(positions, turn=None, ids=None, **changes):
+def cloud(positions, turn=None, ids=None, opacities=0.9):
     count = len(positions)
-    quaternion = (turn or Rotation.identity()).as_quat()
-    fields = {
-        "positions": positions,
-        "orientations": np.tile(quaternion, (count, 1)),
-        "scales": np.full((count, 3), 0.02),
-        "opacities": np.full(count, 0.9),
-        "ids": np.arange(count) if ids is None else ids,
-    }
-    return GaussianCloud(**(fields | changes))
+    orientations = np.tile((turn or Rotation.identity()).as_quat(), (count, 1))
+    found = aligned(positions, opacities, 0.02, ids=np.arange(count) if ids is None else ids)
+    return found.with_arrays(orientations=orientations)
 
 
 def drift(clouds, meshes=None, device="cpu", **options):
@@ -91,9 +87,7 @@ class TestDrift:
     def test_far_and_faint_gaussians_do_not_count(self, points):
         away = points.copy()
         away[:100] *= 2.0
-        opacities = np.full(500, 0.9)
-        opacities[-50:] = 0.01
-        start = cloud(away, opacities=opacities)
+        start = cloud(away, opacities=np.where(np.arange(500) < 450, 0.9, 0.01))
         found = drift([start, start])[1]
         assert found.gaussians.count == 350
 
@@ -108,12 +102,8 @@ class TestErrors:
         ("shift", "ids", "match"),
         [
             (0.0, [None], "clouds must have ids, got none in frame 0"),
-            (
-                0.0,
-                [np.arange(500), np.arange(500) + 500],
-                "clouds must keep ids of the first frame, got none in frame 1",
-            ),
-            (9.0, [np.arange(500)], "clouds must start within"),
+            (0.0, [IDS, IDS + 500], "clouds must keep ids of the first frame, got none in frame 1"),
+            (9.0, [IDS], "clouds must start within"),
         ],
     )
     def test_clouds_that_cannot_be_followed_are_refused(self, points, shift, ids, match):

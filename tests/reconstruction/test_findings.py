@@ -20,69 +20,80 @@ def views(tiny_capture):
     return [record.view() for record in tiny_capture.select(split="train", frames=[0])]
 
 
-def advanced(monkeypatch, views, *, before, after, gap=0.0, lost=""):
-    """Return the report of a frame that tracking makes this of."""
-    cloud = initial_gaussians(views, 200, device="cpu")
-    joints = cloud.positions[:3]
-    track = SimpleNamespace(
-        cloud=cloud,
-        joints=joints,
-        previous_joints=joints - before,
-        baseline=np.array([30.0, 0.01]),
-        normals=lambda: np.zeros((len(cloud), 3)),
-    )
-    following = SimpleNamespace(cloud=cloud, joints=joints + after)
-    report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
-    monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
-    return STEPS.advance(track, views, no_progress)[1]
+@pytest.fixture(scope="module")
+def cloud(views):
+    return initial_gaussians(views, 200, device="cpu")
+
+
+@pytest.fixture
+def advanced(monkeypatch, views, cloud):
+    """A function that returns the report of a frame of which tracking makes what it is called with."""
+
+    def report_of(before=0.0, after=0.0, gap=0.0, lost=""):
+        joints, baseline = cloud.positions[:3], np.array([30.0, 0.01])
+        track = SimpleNamespace(cloud=cloud, joints=joints, previous_joints=joints - before, baseline=baseline)
+        track.normals = lambda: np.zeros((len(cloud), 3))
+        following = SimpleNamespace(cloud=cloud, joints=joints + after)
+        report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
+        monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
+        return STEPS.advance(track, views, no_progress)[1]
+
+    return report_of
 
 
 class TestTrackedFrames:
-    def test_nothing_is_said_of_a_sound_one(self, monkeypatch, views):
-        report = advanced(monkeypatch, views, before=0.0, after=0.0)
+    def test_nothing_is_said_of_a_sound_one(self, advanced):
+        report = advanced()
         assert report["findings"] == []
         assert report["motion"] == {"median": 0.0, "largest": 0.0}
         assert report["surprise"] == 0.0
         assert report["exposure_spread"] < 0.3
 
-    def test_motion_that_goes_on_is_no_surprise(self, monkeypatch, views):
+    def test_motion_that_goes_on_is_no_surprise(self, advanced):
         step = np.float32([0.0, 0.0, 1.0])  # a metre a frame: a third of the image
-        report = advanced(monkeypatch, views, before=step, after=step)
+        report = advanced(before=step, after=step)
         assert report["motion"]["median"] > 15.0
         assert report["surprise"] < 1e-3  # rounding of positions to float32, of some metres
         assert report["findings"] == []
 
-    @pytest.mark.parametrize(("part", "said"), [(0.9, False), (1.1, True)])
-    def test_motion_beyond_the_reach_of_tracking_is_said(self, monkeypatch, views, part, said):
+    def test_motion_beyond_the_reach_of_tracking_is_said(self, advanced):
         """Reach: some pixels of the most reduced images."""
         reach = STRUCTURE_REACH * max(STEPS.tracking.joints.levels)
         step = np.float32([0.0, 0.0, 0.1])
-        pixels = advanced(monkeypatch, views, before=0.0, after=step)["surprise"]
-        report = advanced(monkeypatch, views, before=0.0, after=step * (reach * part / pixels))
-        assert [finding["code"] for finding in report["findings"]] == (["fast-motion"] if said else [])
+        pixels = advanced(after=step)["surprise"]
+        for part, codes in ((0.9, []), (1.1, ["fast-motion"])):
+            report = advanced(after=step * (reach * part / pixels))
+            assert [finding["code"] for finding in report["findings"]] == codes
 
-    def test_a_loss_is_of_new_surface_or_of_track(self, monkeypatch, views):
+    def test_a_loss_is_of_new_surface_or_of_track(self, advanced):
         """The key frame's gap was 0.01, and 0.03 more may be."""
         for gap, code in ((0.039, "tracking-lost"), (0.041, "new-surface"), (np.nan, "new-surface")):
-            report = advanced(monkeypatch, views, before=0.0, after=0.0, gap=gap, lost="so")
+            report = advanced(gap=gap, lost="so")
             assert [(f["code"], f["what"]) for f in report["findings"]] == [(code, "tracking is lost: so")]
 
 
+@pytest.fixture(scope="module")
+def sound(views):
+    """The key frame of sound views: its track and its report."""
+    return STEPS.begin(views, no_progress)
+
+
 class TestKeyFrames:
-    def test_cameras_too_few_for_the_surface_are_said(self, views):
-        _, report = STEPS.begin(views, no_progress)
+    def test_cameras_too_few_for_the_surface_are_said(self, views, sound):
+        _, report = sound
         assert report["findings"] == []
         assert report["unpaired"] <= MOST_UNPAIRED
         _, report = STEPS.begin(views[::3], no_progress)  # two, on opposite sides
         assert [finding["code"] for finding in report["findings"]] == ["few-cameras"]
         assert report["unpaired"] > 0.9
 
-    def test_a_fit_with_a_matched_view_is_nearer_to_the_sound_one(self, monkeypatch, views):
+    def test_a_fit_with_a_matched_view_is_nearer_to_the_sound_one(self, monkeypatch, views, sound):
         wrong = list(views)
         wrong[2] = replace(wrong[2], color=wrong[2].color * np.float32(2.0))
-        (sound, _), (mended, report) = STEPS.begin(views, no_progress), STEPS.begin(wrong, no_progress)
+        mended, report = STEPS.begin(wrong, no_progress)
         assert [(f["code"], f["where"]) for f in report["findings"]] == [("camera-exposure", views[2].name)]
         monkeypatch.setattr(steps, "matched", lambda views, gains: list(views))
         naive, _ = STEPS.begin(wrong, no_progress)
-        apart, naively = (np.abs(t.cloud.radiance - sound.cloud.radiance)[:, 0].mean() for t in (mended, naive))
+        true = sound[0].cloud.radiance
+        apart, naively = (np.abs(track.cloud.radiance - true)[:, 0].mean() for track in (mended, naive))
         assert apart < naively

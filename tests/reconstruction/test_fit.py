@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import warp as wp
 from support.moving_ball import ball_cloud, ball_view, ball_views, rig
+from support.threads import require_same_on_any_threads
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.reconstruction import fit as fit_module
 from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, fit_gaussians
+from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
 
@@ -26,6 +28,10 @@ def few_steps(**changes):
     return FitOptions(**{**kept, **changes})
 
 
+def fitted(views, start, device, progress=no_progress, **changes):
+    return fit_gaussians(views, start, few_steps(**changes), device=device, progress=progress)
+
+
 def fitter_of(views, cloud, options, device):
     return Fitter(views, cloud, options, wp.get_device(device))
 
@@ -33,39 +39,35 @@ def fitter_of(views, cloud, options, device):
 class TestProgress:
     def test_a_grey_ball_takes_on_its_paint(self, device, views):
         """8 dB is two and a half times closer; 6 dB, twice, in views that no step saw."""
-        fitter = fitter_of(
-            views, ball_cloud(300, painted=False), few_steps(color_iterations=30, normal_iterations=50), device
-        )
+        grey, options = ball_cloud(300, painted=False), few_steps(color_iterations=30, normal_iterations=50)
+        fitter = fitter_of(views, grey, options, device)
         before = fitter.psnr()
         fitter.run()
         assert (fitter.psnr() > before + 8.0).all()
         assert (fitter.gaps() == 0.0).all()
         between = [ball_view(camera) for camera in rig(6, size=44, vertical_fov=35.0)]
-        unseen = [
-            fitter_of(between, cloud, few_steps(), device).psnr()
-            for cloud in (ball_cloud(300, painted=False), fitter.parameters.cloud())
-        ]
-        assert (unseen[1] > unseen[0] + 6.0).all()
+        at_first, now = (
+            fitter_of(between, cloud, few_steps(), device).psnr() for cloud in (grey, fitter.parameters.cloud())
+        )
+        assert (now > at_first + 6.0).all()
 
     def test_the_hull_is_where_it_begins(self, device, tiny_capture):
         """The demo figure: 60 steps make of its hull's discs what is a third closer to the photographs, 3.5 dB."""
         views = [record.view() for record in tiny_capture.select(split="train", frames=[0])]
         start = initial_gaussians(views, 400, device=device)
         before = fitter_of(views, start, few_steps(), device).psnr()
-        options = few_steps(gaussian_count=400, color_iterations=30, normal_iterations=30, refine_every=20)
-        fit = fit_gaussians(views, start, options, device=device)
+        steps = {"color_iterations": 30, "normal_iterations": 30, "refine_every": 20}
+        fit = fitted(views, start, device, gaussian_count=400, **steps)
         assert fit.report["psnr"] > before.mean() + 3.5
         assert fit.report["view_psnr"] > before.min() + 3.5
 
     def test_everybody_hears_of_it(self, device, views):
         heard = []
-        fit_gaussians(
-            views,
-            ball_cloud(60),
-            few_steps(normal_iterations=60, refine_every=20),
-            device=device,
-            progress=lambda done, total, facts: heard.append((done, total, dict(facts))),
-        )
+
+        def listen(done, total, facts):
+            heard.append((done, total, dict(facts)))
+
+        fitted(views, ball_cloud(60), device, listen, normal_iterations=60, refine_every=20)
         assert [done for done, _, _ in heard] == [0, 50, 60]
         assert {total for _, total, _ in heard} == {60}
         assert heard[0][2] == {"gaussians": 60.0}
@@ -73,38 +75,41 @@ class TestProgress:
 
     def test_without_steps_nothing_moves(self, device, views):
         start = ball_cloud(60)
-        fit = fit_gaussians(views, start, few_steps(normal_iterations=0, sampling_filter=False), device=device)
+        fit = fitted(views, start, device, normal_iterations=0, sampling_filter=False)
         np.testing.assert_array_equal(fit.cloud.positions, start.positions)
         assert fit.report["iterations"] == 0
 
     def test_positions_come_to_rest(self, device, views):
         """Late steps move them far less than early ones, with a last rate far below the first."""
         rates = LearningRates(1e-3, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0)
-        options = few_steps(normal_iterations=200, rates=rates, sampling_filter=False)
+        options = few_steps(normal_iterations=100, rates=rates, sampling_filter=False)
         fitter = fitter_of(views, ball_cloud(40), options, device)
         places = []
         fitter.run(lambda done, total, facts: places.append(fitter.parameters.positions.numpy().copy()))
-        moved = [np.abs(b - a).max() for a, b in pairwise(places)]
-        assert len(moved) == 4
-        assert moved[-1] < 0.02 * moved[0]
+        early, late = (np.abs(b - a).max() for a, b in pairwise(places))
+        assert late < 0.02 * early
+
+
+OFTEN = {"refine_every": 6, "refine_until": 1.0}
+
+UNSPLIT = {"gaussian_count": 60, "split_fraction": 0.0, **OFTEN}
 
 
 class TestBudget:
     def test_it_is_filled_and_never_exceeded(self, device, views):
         """Splits of 20 % a time: 60 Gaussians become 90 and no more."""
         counts = []
-        fit = fit_gaussians(
-            views,
-            ball_cloud(60),
-            few_steps(gaussian_count=90, normal_iterations=60, refine_every=6, refine_until=1.0, hidden_share=0.0),
-            device=device,
-            progress=lambda done, total, facts: counts.append(facts["gaussians"]),
-        )
+
+        def count(done, total, facts):
+            counts.append(facts["gaussians"])
+
+        changes = {"gaussian_count": 90, "normal_iterations": 60, "hidden_share": 0.0, **OFTEN}
+        fit = fitted(views, ball_cloud(60), device, count, **changes)
         assert fit.report["gaussians"] == len(fit.cloud) == 90
         assert max(counts) <= 90
 
     def test_a_start_that_is_too_large_is_thinned_evenly(self, device, views):
-        fit = fit_gaussians(views, ball_cloud(200), few_steps(gaussian_count=50, normal_iterations=0), device=device)
+        fit = fitted(views, ball_cloud(200), device, gaussian_count=50, normal_iterations=0)
         assert len(fit.cloud) == 50
         np.testing.assert_array_equal(fit.cloud.positions[[0, -1]], ball_cloud(200).positions[[0, -1]])
 
@@ -112,27 +117,18 @@ class TestBudget:
         """High above every image; its row is then free for a split."""
         start = ball_cloud(60)
         start = start.with_arrays(positions=np.where(np.arange(60)[:, None] < 5, (0.0, 0.0, 50.0), start.positions))
-        options = few_steps(gaussian_count=60, refine_every=6, refine_until=1.0, split_fraction=0.0, hidden_share=1e-9)
-        assert len(fit_gaussians(views, start, options, device=device).cloud) == 55
-        options = replace(options, split_fraction=1.0)
-        fit = fit_gaussians(views, start, options, device=device)
-        assert len(fit.cloud) == 60
-        assert np.abs(fit.cloud.positions).max() < 1.0
+        assert len(fitted(views, start, device, hidden_share=1e-9, **UNSPLIT).cloud) == 55
+        cloud = fitted(views, start, device, hidden_share=1e-9, **{**UNSPLIT, "split_fraction": 1.0}).cloud
+        assert len(cloud) == 60
+        assert np.abs(cloud.positions).max() < 1.0
 
     def test_what_is_faint_is_dropped(self, device, views):
-        opacities = np.where(np.arange(60) < 5, 0.005, 0.8)
-        options = few_steps(
-            gaussian_count=60, normal_iterations=6, refine_every=6, refine_until=1.0, split_fraction=0.0
-        )
-        options = replace(options, hidden_share=0.0, rates=LearningRates(opacities=0.0))
-        assert (
-            len(fit_gaussians(views, ball_cloud(60).with_arrays(opacities=opacities), options, device=device).cloud)
-            == 55
-        )
+        start = ball_cloud(60).with_arrays(opacities=np.where(np.arange(60) < 5, 0.005, 0.8))
+        changes = {"hidden_share": 0.0, "rates": LearningRates(opacities=0.0), **UNSPLIT}
+        assert len(fitted(views, start, device, normal_iterations=6, **changes).cloud) == 55
 
     def test_nobody_is_dropped_if_all_would_be(self, device, views):
-        options = few_steps(gaussian_count=60, refine_every=6, refine_until=1.0, dead_opacity=1.0, split_fraction=0.0)
-        assert len(fit_gaussians(views, ball_cloud(60), options, device=device).cloud) == 60
+        assert len(fitted(views, ball_cloud(60), device, dead_opacity=1.0, **UNSPLIT).cloud) == 60
 
 
 class TestRowsWithoutAGaussian:
@@ -166,22 +162,19 @@ class TestRowsWithoutAGaussian:
         assert len(fitter.parameters.cloud()) == 150 - dead.sum()
 
 
-def fitted_bits(views, options, device):
-    cloud = fit_gaussians(views, ball_cloud(60, painted=False), options, device=device).cloud
-    return b"".join(array.tobytes() for array in cloud.arrays().values())
+def fitted_arrays(views, device, **changes):
+    return fitted(views, ball_cloud(60, painted=False), device, **changes).cloud.arrays().values()
 
 
 class TestBits:
     def test_same_bits_every_time_for_every_number_of_threads(self, device, monkeypatch):
         views = ball_views(rig(2, 48))  # 9,216 samples, 1,100 rows: several chunks of every kernel
-        options = few_steps(gaussian_count=1100, normal_iterations=4, refine_every=2, refine_until=1.0, samples=2)
-        expected = fitted_bits(views, options, device)
-        for threads in ("1", "3"):
-            monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            assert fitted_bits(views, options, device) == expected
+        changes = {"gaussian_count": 1100, "normal_iterations": 4, "refine_every": 2, "refine_until": 1.0, "samples": 2}
+        require_same_on_any_threads(monkeypatch, lambda: fitted_arrays(views, device, **changes))
 
     def test_another_seed_is_another_order(self, device, views):
-        assert fitted_bits(views, few_steps(), device) != fitted_bits(views, few_steps(seed=1), device)
+        pairs = zip(fitted_arrays(views, device), fitted_arrays(views, device, seed=1), strict=True)
+        assert any((one != other).any() for one, other in pairs)
 
 
 class TestTarget:
@@ -190,16 +183,13 @@ class TestTarget:
         monkeypatch.setattr(fit_module, "FEWEST_GAUSSIANS", 40)
 
     def test_it_is_met_at_once(self, device, views):
-        report = fit_gaussians(
-            views, ball_cloud(160), few_steps(target_psnr=5.0, gaussian_count=160), device=device
-        ).report
+        report = fitted(views, ball_cloud(160), device, target_psnr=5.0, gaussian_count=160).report
         assert [entry["gaussians"] for entry in report["growth"]] == [40]
         assert report["psnr"] >= 5.0
 
     def test_the_budget_ends_it(self, device, views, monkeypatch):
         monkeypatch.setattr(fit_module, "LEAST_GAIN", -100.0)
-        options = few_steps(target_psnr=100.0, gaussian_count=150)
-        fit = fit_gaussians(views, ball_cloud(150, painted=False), options, device=device)
+        fit = fitted(views, ball_cloud(150, painted=False), device, target_psnr=100.0, gaussian_count=150)
         assert [entry["gaussians"] for entry in fit.report["growth"]] == [40, 80, 150]
         assert len(fit.cloud) == fit.report["gaussians"] == 150
         # all steps for the first, half of them for what is split from there
@@ -207,12 +197,11 @@ class TestTarget:
 
     def test_what_does_not_pay_is_not_gone_on_with(self, device, views, monkeypatch):
         monkeypatch.setattr(fit_module, "LEAST_GAIN", 100.0)
-        options = few_steps(target_psnr=100.0, gaussian_count=300)
-        report = fit_gaussians(views, ball_cloud(300), options, device=device).report
+        report = fitted(views, ball_cloud(300), device, target_psnr=100.0, gaussian_count=300).report
         assert [entry["gaussians"] for entry in report["growth"]] == [40, 80]
 
     def test_fewer_at_the_start_than_it_begins_with(self, device, views):
-        report = fit_gaussians(views, ball_cloud(20), few_steps(target_psnr=5.0), device=device).report
+        report = fitted(views, ball_cloud(20), device, target_psnr=5.0).report
         assert [entry["gaussians"] for entry in report["growth"]] == [20]
 
 
@@ -227,26 +216,27 @@ CAPTURES = {
 
 
 class TestCaptures:
-    @pytest.mark.parametrize("name", CAPTURES)
-    @pytest.mark.parametrize("count", [1, 40])
+    @pytest.mark.parametrize(
+        ("name", "count"), [*((name, 40) for name in CAPTURES), ("one view", 1), ("of a pixel", 1)]
+    )
     def test_nothing_but_finite_comes_out(self, device, name, count):
         """`GaussianCloud` refuses what is not; the report is finite too."""
-        options = few_steps(gaussian_count=count + 10, refine_every=5, refine_until=1.0, samples="auto")
-        fit = fit_gaussians(CAPTURES[name](), ball_cloud(count), options, device=device)
+        changes = {"gaussian_count": count + 10, "samples": "auto", **OFTEN}
+        fit = fitted(CAPTURES[name](), ball_cloud(count), device, **changes)
         assert 1 <= len(fit.cloud) <= count + 10
         assert np.isfinite([fit.report["psnr"], fit.report["view_psnr"]]).all()
 
     def test_a_start_without_extent(self, device, views):
         """Gaussians that are points: samples as fine as there are."""
         start = ball_cloud(20).with_arrays(scales=np.zeros((20, 3)))
-        fit = fit_gaussians(views, start, few_steps(samples="auto", normal_iterations=2), device=device)
+        fit = fitted(views, start, device, samples="auto", normal_iterations=2)
         assert fit.report["samples"] == MOST_SAMPLES
 
     def test_black_photographs_make_black_gaussians(self, device, views):
         """Or none that show: an empty mask is met by what does not cover."""
         black = [replace(view, color=0.0 * view.color, alpha=0.0 * view.alpha) for view in views]
-        options = few_steps(normal_iterations=60, refine_every=10, rates=LearningRates(opacities=0.5))
-        fit = fit_gaussians(black, ball_cloud(60), options, device=device)
+        changes = {"normal_iterations": 60, "refine_every": 10, "rates": LearningRates(opacities=0.5)}
+        fit = fitted(black, ball_cloud(60), device, **changes)
         assert len(fit.cloud) >= 1
         assert fit.report["psnr"] > 40.0
 
@@ -272,27 +262,19 @@ OUT_OF_RANGE = {
 
 
 class TestOptions:
-    @pytest.mark.parametrize(
-        ("options", "name", "value"),
-        [
-            (options, name, value)
-            for options, refused in OUT_OF_RANGE.items()
-            for name, values in refused.items()
-            for value in values
-        ],
-    )
-    def test_what_is_out_of_range_is_refused(self, options, name, value):
-        with pytest.raises(InvalidOptionError, match=f"{name} must be"):
-            options(**{name: value})
+    @pytest.mark.parametrize("options", OUT_OF_RANGE)
+    def test_what_is_out_of_range_is_refused(self, options):
+        for name, values in OUT_OF_RANGE[options].items():
+            for value in values:
+                with pytest.raises(InvalidOptionError, match=f"{name} must be"):
+                    options(**{name: value})
 
     @pytest.mark.parametrize("preset", PRESETS)
     def test_presets_and_what_is_changed_of_them(self, preset):
         options = FitOptions.of_preset(preset, gaussian_count=7, seed=3)
         assert (options.gaussian_count, options.seed) == (7, 3)
-        expected = {"fast": (1_000, 2_000), "draft": (150, 300), "paper": (7_000, 5_000), "rade": (6_000, 6_000)}[
-            preset
-        ]
-        assert (options.color_iterations, options.normal_iterations) == expected
+        expected = {"fast": (1_000, 2_000), "draft": (150, 300), "paper": (7_000, 5_000), "rade": (6_000, 6_000)}
+        assert (options.color_iterations, options.normal_iterations) == expected[preset]
         assert FitOptions.of_preset("fast") == FitOptions()
 
     def test_an_unknown_preset(self):
@@ -303,6 +285,6 @@ class TestOptions:
 class TestRefusals:
     def test_nothing_to_fit(self, device, views):
         with pytest.raises(InvalidArrayError, match="got 0 views and 60 Gaussians"):
-            fit_gaussians([], ball_cloud(60), few_steps(), device=device)
+            fitted([], ball_cloud(60), device)
         with pytest.raises(InvalidArrayError, match="got 6 views and 0 Gaussians"):
-            fit_gaussians(views, ball_cloud(60).select(np.zeros(0, int)), few_steps(), device=device)
+            fitted(views, ball_cloud(60).select(np.zeros(0, int)), device)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from support.capture_scenes import EDGE_ERROR, ball_view, ball_views, cameras_around, directions
+from scipy.spatial import cKDTree
+from support.capture_scenes import EDGE_ERROR, ball_view, ball_views, cameras_around
+from support.shapes import sphere_points
 
 from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -18,11 +20,10 @@ RADIUS = 0.5
 
 
 def distances(alpha, device, limit=40.0):
-    shape = alpha.shape
     out = wp.empty(alpha.size, dtype=float, device=device)
-    gaps = [wp.empty(shape, dtype=float, device=device) for _ in range(2)]
+    gaps = [wp.empty(alpha.shape, dtype=float, device=device) for _ in range(2)]
     launch_measure_silhouette(wp.array(alpha, dtype=float, device=device), limit, *gaps, 0, out, device)
-    return out.numpy().reshape(shape)
+    return out.numpy().reshape(alpha.shape)
 
 
 class TestSilhouettes:
@@ -51,16 +52,12 @@ class TestSilhouettes:
 
     def test_equals_the_nearest_of_all_crossings(self, device, rng):
         alpha = rng.random((23, 31)).astype(np.float32)
-        points = []
-        for y in range(23):
-            for x in range(31):
-                for dy, dx in ((0, 1), (1, 0)):
-                    if y + dy < 23 and x + dx < 31 and (alpha[y, x] >= 0.5) != (alpha[y + dy, x + dx] >= 0.5):
-                        t = (0.5 - float(alpha[y, x])) / (float(alpha[y + dy, x + dx]) - float(alpha[y, x]))
-                        points.append((y + dy * t, x + dx * t))
-        y, x = np.mgrid[:23, :31]
-        points = np.array(points)
-        nearest = np.hypot(y[..., None] - points[:, 0], x[..., None] - points[:, 1]).min(axis=-1)
+        pixels, points = np.moveaxis(np.mgrid[:23, :31], 0, -1), []
+        for step, here, there in (((1, 0), alpha[:-1], alpha[1:]), ((0, 1), alpha[:, :-1], alpha[:, 1:])):
+            crossed = (here >= 0.5) != (there >= 0.5)
+            one, other = here[crossed].astype(float), there[crossed].astype(float)
+            points.append(np.argwhere(crossed) + ((0.5 - one) / (other - one))[:, None] * step)
+        nearest = cKDTree(np.concatenate(points)).query(pixels)[0]
         # The quotient loses digits where neighbours are alike: 1e-6 over the least difference, of random ones 1e-3.
         np.testing.assert_allclose(np.abs(distances(alpha, device)), nearest, rtol=0, atol=1e-3)
 
@@ -111,14 +108,14 @@ class TestBall:
     def test_converges_to_the_ball(self, device):
         volume = 4.0 / 3.0 * np.pi * RADIUS**3
         excess = []
-        for count in (6, 12, 24, 48):
+        for count in (6, 12, 24):
             views = ball_views(count)
             hull = visual_hull(views, resolution=64, device=device)
-            bound = (np.minimum(widest(views, directions(4000)), 3.0) ** 3).mean()
+            bound = (np.minimum(widest(views, sphere_points(4000)[0]), 3.0) ** 3).mean()
             thickness = 3.0 * (slack(hull, views) + 0.5 * hull.voxel) / RADIUS  # relative volume of the slack's shell
             assert 1.0 - thickness <= hull.mesh.volume / volume <= bound + thickness
             excess.append(hull.mesh.volume / volume - 1.0)
-        assert excess[0] > excess[1] > excess[2] > excess[3]
+        assert excess[0] > excess[1] > excess[2]
 
     def test_is_sharper_than_its_pixels(self, device):
         views = ball_views(24, size=48)
@@ -128,9 +125,9 @@ class TestBall:
         assert abs(lowest - RADIUS) <= slack(hull, views) + 0.1 * hull.voxel
 
     def test_large_masks_are_reduced_to_what_voxels_tell(self, device):
-        views = ball_views(9, size=200)  # a voxel of 1 / 16 of the ball is 6 pixels
+        views = ball_views(9, size=140)  # a voxel of 1 / 16 of the ball is 4 pixels
         hull = visual_hull(views, resolution=16, quorum=9, device=device)
-        require_between_the_ball_and_its_planes(hull, views, [view.reduced(3) for view in views])
+        require_between_the_ball_and_its_planes(hull, views, [view.reduced(2) for view in views])
 
     def test_off_center(self, device):
         center = np.array([40.0, -30.0, 7.0])
@@ -152,9 +149,8 @@ class TestMasks:
     def test_empty_and_missing_ones_are_ignored(self, device):
         views = ball_views(10)
         kept = visual_hull(views[2:], resolution=32, device=device)
-        hull = visual_hull(
-            [blackened(views[0]), replace(views[1], alpha=None), *views[2:]], resolution=32, device=device
-        )
+        silent = blackened(views[0]), replace(views[1], alpha=None)
+        hull = visual_hull([*silent, *views[2:]], resolution=32, device=device)
         np.testing.assert_array_equal(hull.mesh.vertices, kept.mesh.vertices)
 
     def test_what_a_view_crops_is_left_to_others(self, device):
@@ -169,10 +165,9 @@ class TestMasks:
 class TestRefusals:
     def test_too_few_masks(self):
         views = ball_views(3)
-        with pytest.raises(
-            InvalidArrayError, match=r"at least two masks that show something, got 1 of 3.*view_1, view_2"
-        ):
-            visual_hull([views[0], *(blackened(view) for view in views[1:])], device="cpu")
+        black = [blackened(view) for view in views[1:]]
+        with pytest.raises(InvalidArrayError, match=r"two masks that show something, got 1 of 3.*view_1, view_2"):
+            visual_hull([views[0], *black], device="cpu")
         with pytest.raises(InvalidArrayError, match="at least two masks that show something, got 0 of 0"):
             visual_hull([], device="cpu")
 
@@ -192,22 +187,17 @@ class TestRefusals:
                 visual_hull(ball_views(3), device="cpu", **options)
 
 
-def test_walker_contains_the_truth(data_dir, device):
-    walker = Capture.read(data_dir / "captures" / "walker")
-    views = [record.view() for record in walker.select(split="train", frames=[0])]
-    hull = visual_hull(views, resolution=128, device=device)
-    surface = read_truth_mesh(walker, 0)
+def test_walker_contains_the_truth(data_dir, walker_views, device):
+    hull = visual_hull(walker_views, resolution=128, device=device)
+    surface = read_truth_mesh(Capture.read(data_dir / "captures" / "walker"), 0)
     assert hull.mesh.is_watertight
 
     def depths(mesh, points):
         """Signed distance to a mesh, positive inside."""
-        shape = wp.Mesh(
-            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
-            wp.array(mesh.faces.ravel(), dtype=int, device=device),
-        )
+        corners, places = (wp.array(array, dtype=wp.vec3, device=device) for array in (mesh.vertices, points))
+        shape = wp.Mesh(corners, wp.array(mesh.faces.ravel(), dtype=int, device=device))
         out = wp.empty(len(points), dtype=float, device=device)
-        inputs = [shape.id, wp.array(points, dtype=wp.vec3, device=device)]
-        wp.launch(signed_depth_kernel, len(points), inputs=inputs, outputs=[out], device=device)
+        wp.launch(signed_depth_kernel, len(points), inputs=[shape.id, places], outputs=[out], device=device)
         return out.numpy()
 
     inside = depths(hull.mesh, surface.vertices)
@@ -218,7 +208,7 @@ def test_walker_contains_the_truth(data_dir, device):
     chamfer = 0.5 * (outward + np.abs(depths(hull.mesh, back)).mean())
     print(f"walker: Chamfer {1e3 * chamfer:.2f} mm, truth at most {-1e3 * inside.min():.2f} mm outside")
     # A pixel is 6.1 mm at the subject: what 24 silhouettes leave undecided is less than that.
-    assert chamfer < 2.7 / views[0].camera.focal_x
+    assert chamfer < 2.7 / walker_views[0].camera.focal_x
 
 
 @wp.kernel(enable_backward=False)

@@ -8,7 +8,6 @@ import trimesh
 from scipy.spatial import cKDTree
 from support.capture_scenes import ball_view, ball_views, cameras_around
 
-from beam_warp.capture.capture import Capture
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.gbuffer import rasterize
@@ -105,7 +104,7 @@ class TestDiscs:
 
     def test_outliers_are_outvoted(self, device):
         # A point of the ball is seen by some seven of 24 views; these two are on opposite sides of it.
-        views = ball_views(24)
+        views = list(ball_views(24))
         for i in (0, 23):
             views[i] = replace(views[i], color=5.0 * np.repeat(views[i].alpha[..., None], 3, axis=2))
         cloud = initial_gaussians(views, 800, device=device)
@@ -115,42 +114,40 @@ class TestDiscs:
         assert np.quantile(error, 0.95) < 5.0 * (spread / 5.0) ** 2
 
     def test_same_seed_same_bits_for_any_threads(self, monkeypatch):
-        clouds = []
-        for threads in ("1", "4"):
+        def cloud(threads, seed):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            clouds.append(initial_gaussians(ball_views(6), 700, device="cpu", seed=3))
-        for name, array in clouds[0].arrays().items():
-            np.testing.assert_array_equal(array, clouds[1].arrays()[name])
-        other = initial_gaussians(ball_views(6), 700, device="cpu", seed=4)
-        assert (other.positions != clouds[0].positions).any()
+            return initial_gaussians(ball_views(6), 700, device="cpu", seed=seed)
+
+        one, other = cloud("1", 3), cloud("4", 3)
+        for name, array in one.arrays().items():
+            np.testing.assert_array_equal(array, other.arrays()[name])
+        assert (cloud("1", 4).positions != one.positions).any()
+
+
+GRID = np.stack(np.meshgrid(*[np.arange(5) * 0.1 - 0.2] * 3), axis=-1).reshape(-1, 3)
 
 
 class TestPoints:
-    def grid(self):
-        return np.stack(np.meshgrid(*[np.arange(5) * 0.1 - 0.2] * 3), axis=-1).reshape(-1, 3)
-
     def test_balls_as_large_as_the_distance(self, device):
-        points = self.grid()
-        colors = np.linspace(0.0, 2.0, points.size).reshape(-1, 3)
-        cloud = initial_gaussians(ball_views(3), 125, points=points, point_colors=colors, device=device)
-        np.testing.assert_allclose(cloud.positions, points, rtol=0, atol=1e-7)
+        colors = np.linspace(0.0, 2.0, GRID.size).reshape(-1, 3)
+        cloud = initial_gaussians(ball_views(3), 125, points=GRID, point_colors=colors, device=device)
+        np.testing.assert_allclose(cloud.positions, GRID, rtol=0, atol=1e-7)
         np.testing.assert_allclose(cloud.scales, 0.1, rtol=1e-5)
         np.testing.assert_allclose(colors_of(cloud), colors, rtol=0, atol=1e-6)
         assert (cloud.opacities == np.float32(BALL_OPACITY)).all()
 
     def test_fewer_and_more(self, device):
-        points = self.grid()
-        fewer = initial_gaussians(ball_views(3), 40, points=points, device=device)
+        fewer = initial_gaussians(ball_views(3), 40, points=GRID, device=device)
         assert len(np.unique(fewer.positions, axis=0)) == 40
-        assert cKDTree(points).query(fewer.positions)[0].max() < 1e-6
-        more = initial_gaussians(ball_views(3), 300, points=points, device=device)
-        np.testing.assert_allclose(more.positions[:125], points, rtol=0, atol=1e-7)
+        assert cKDTree(GRID).query(fewer.positions)[0].max() < 1e-6
+        more = initial_gaussians(ball_views(3), 300, points=GRID, device=device)
+        np.testing.assert_allclose(more.positions[:125], GRID, rtol=0, atol=1e-7)
         assert len(np.unique(more.positions, axis=0)) == 300
-        assert np.linalg.norm(more.positions[125:250] - points, axis=1).max() < 5.0 * 0.05 * np.sqrt(3.0)
+        assert np.linalg.norm(more.positions[125:250] - GRID, axis=1).max() < 5.0 * 0.05 * np.sqrt(3.0)
 
     def test_colors_come_from_the_views(self, device):
         views = [ball_view(f"v{i}", camera, color=(0.2, 0.5, 0.7)) for i, camera in enumerate(cameras_around(6))]
-        cloud = initial_gaussians(views, 125, points=self.grid(), device=device)
+        cloud = initial_gaussians(views, 125, points=GRID, device=device)
         np.testing.assert_allclose(colors_of(cloud), np.tile([0.2, 0.5, 0.7], (125, 1)), rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((7, 3))])
@@ -176,19 +173,18 @@ class TestRefusals:
                 initial_gaussians(views, count, device="cpu")
         with pytest.raises(InvalidArrayError, match="views must be at least one, got none"):
             initial_gaussians([], 5, device="cpu")
-        with pytest.raises(InvalidArrayError, match="points must be at least one, got none"):
-            initial_gaussians(views, 5, points=np.zeros((0, 3)), device="cpu")
-        with pytest.raises(InvalidArrayError, match="points must be finite"):
-            initial_gaussians(views, 5, points=[[0.0, np.nan, 0.0]], device="cpu")
-        with pytest.raises(InvalidArrayError, match="point_colors must have as many rows as points"):
-            initial_gaussians(views, 5, points=np.zeros((2, 3)), point_colors=np.zeros((3, 3)), device="cpu")
-        with pytest.raises(InvalidArrayError, match="point_colors need points"):
-            initial_gaussians(views, 5, point_colors=np.zeros((3, 3)), device="cpu")
+        for points, colors, message in (
+            (np.zeros((0, 3)), None, "points must be at least one, got none"),
+            ([[0.0, np.nan, 0.0]], None, "points must be finite"),
+            (np.zeros((2, 3)), np.zeros((3, 3)), "point_colors must have as many rows as points"),
+            (None, np.zeros((3, 3)), "point_colors need points"),
+        ):
+            with pytest.raises(InvalidArrayError, match=message):
+                initial_gaussians(views, 5, points=points, point_colors=colors, device="cpu")
 
 
-def test_walker_is_opaque_and_of_its_colors(data_dir, device):
-    records = Capture.read(data_dir / "captures" / "walker").select(split="train", frames=[0])
-    views = [record.view().reduced(2) for record in records]
+def test_walker_is_opaque_and_of_its_colors(walker_views, device):
+    views = [view.reduced(2) for view in walker_views]
     cloud = initial_gaussians(views, 6000, device=device)
     for view in views[:3]:
         drawn = rasterize(cloud, view.camera, channels=("radiance",), device=device)

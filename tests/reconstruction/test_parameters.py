@@ -88,8 +88,6 @@ class TestRowsWithoutAGaussian:
         parameters.set_rows({"logits": np.full(3, DEAD_LOGIT, np.float32)})
         assert len(parameters.cloud()) == 0
 
-
-class TestGradients:
     def test_sums_begin_anew_and_go_on(self, device, rng):
         parameters = parameters_of(ball_cloud(9), device)
         one, other = random_gradients(rng, parameters), random_gradients(rng, parameters)
@@ -127,9 +125,7 @@ class TestRefusals:
         """Colours of another space would be fitted from as if they were light: they are refused, not converted."""
         with pytest.raises(InvalidArrayError, match="start must have radiance in lin_rec709_scene, got none"):
             parameters_of(ball_cloud(3).with_arrays(radiance=None, radiance_color_space=None), device)
-        with pytest.raises(
-            InvalidArrayError, match=f"start must have radiance in lin_rec709_scene, got {DISPLAY_SRGB}"
-        ):
+        with pytest.raises(InvalidArrayError, match=f"must have radiance in lin_rec709_scene, got {DISPLAY_SRGB}"):
             parameters_of(ball_cloud(3).with_arrays(radiance_color_space=DISPLAY_SRGB), device)
 
     def test_counts(self, device):

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from support.shapes import cloud_of, sphere_points, tiles
+from support.shapes import cloud_of, colored, sphere_points, tiles
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.panels import BACKGROUND, MARGIN, TITLE_HEIGHT
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.reconstruction.preview import (
@@ -21,17 +20,13 @@ GRAY = round(255 * BACKGROUND)
 
 
 def camera(azimuth=0.0, size=40):
-    return Camera.orbit(
-        (0.0, 0.0, 0.0), 4.0, azimuth=azimuth, elevation=0.0, vertical_fov=40.0, width=size + size // 2, height=size
-    )
+    return Camera.orbit((0, 0, 0), 4.0, azimuth, 0.0, width=size + size // 2, height=size, vertical_fov=40.0)
 
 
 @pytest.fixture(scope="module")
 def ball():
     points, spacing = sphere_points(400)
-    return cloud_of(
-        tiles(points, points, spacing), radiance=np.full((400, 1, 3), -0.5), radiance_color_space=LINEAR_REC709
-    )
+    return colored(cloud_of(tiles(points, points, spacing)), np.full((400, 3), 0.36))
 
 
 def photograph(ball, where, *, factor=1.0, alpha=True):
@@ -42,19 +37,12 @@ def photograph(ball, where, *, factor=1.0, alpha=True):
     return CapturedView(name="view", camera=where, color=color, alpha=covered if alpha else None)
 
 
-def panels(picture, rows, columns):
-    """Cut a picture into its panels."""
-    height, width = ((side - MARGIN) // count for side, count in zip(picture.shape, (rows, columns), strict=False))
-    return [
-        [
-            picture[
-                row * height + MARGIN + TITLE_HEIGHT : (row + 1) * height,
-                column * width + MARGIN : (column + 1) * width,
-            ]
-            for column in range(columns)
-        ]
-        for row in range(rows)
-    ]
+def panels_of(cloud, views, columns=4, **options):
+    """The preview of a cloud beside photographs, cut into its panels, row by row."""
+    picture = reconstruction_preview(cloud, views, device="cpu", **options)
+    height, width = (picture.shape[0] - MARGIN) // len(views), (picture.shape[1] - MARGIN) // columns
+    rows = [picture[row * height :][MARGIN + TITLE_HEIGHT : height] for row in range(len(views))]
+    return [[row[:, column * width :][:, MARGIN:width] for column in range(columns)] for row in rows]
 
 
 def test_cameras_are_far_apart():
@@ -66,21 +54,18 @@ def test_cameras_are_far_apart():
 
 def test_a_perfect_render_differs_nowhere(ball):
     views = [photograph(ball, camera(azimuth)) for azimuth in (0.0, 180.0)]
-    for row in panels(reconstruction_preview(ball, views, device="cpu"), 2, 4):
-        shown, render, difference, normals = row
+    rows = panels_of(ball, views)
+    for shown, render, difference, normals in rows:
         assert np.abs(shown.astype(int) - render).max() <= 1  # divided by alpha and multiplied again: one rounding
         assert difference.max() <= AMPLIFICATION
         assert (shown[0, 0] == GRAY).all()
-        middle = normals[normals.shape[0] // 2, normals.shape[1] // 2]
-        assert middle.min() < 160
-    front, back = (row[3] for row in panels(reconstruction_preview(ball, views, device="cpu"), 2, 4))
-    y = [int(side[side.shape[0] // 2, side.shape[1] // 2, 1]) for side in (front, back)]
-    assert abs(y[0] - y[1]) > 230  # the surfaces that are seen face away from each other
+        assert normals[normals.shape[0] // 2, normals.shape[1] // 2].min() < 160
+    front, back = (int(side[side.shape[0] // 2, side.shape[1] // 2, 1]) for *_, side in rows)
+    assert abs(front - back) > 230  # the surfaces that are seen face away from each other
 
 
 def test_differences_are_brightened(ball):
-    view = photograph(ball, camera(), factor=1.1)
-    shown, render, difference, _ = panels(reconstruction_preview(ball, [view], device="cpu"), 1, 4)[0]
+    [(shown, render, difference, _)] = panels_of(ball, [photograph(ball, camera(), factor=1.1)])
     middle = (slice(shown.shape[0] // 2, shown.shape[0] // 2 + 1), shown.shape[1] // 2)
     expected = np.abs(shown[middle].astype(int) - render[middle]) * AMPLIFICATION
     assert (difference[middle] == np.minimum(expected, 255)).all()
@@ -88,22 +73,18 @@ def test_differences_are_brightened(ball):
 
 
 def test_without_coverage_only_the_subject_is_compared(ball):
-    view = photograph(ball, camera(), alpha=False)
-    shown, _, difference, _ = panels(reconstruction_preview(ball, [view], device="cpu"), 1, 4)[0]
+    [(shown, _, difference, _)] = panels_of(ball, [photograph(ball, camera(), alpha=False)])
     assert (shown[0, 0] == 0).all()  # the photograph as it is
     assert (difference[0, 0] == 0).all()
 
 
 def test_a_mesh_is_one_more_column(ball):
-    view = photograph(ball, camera())
     shading = np.full((40, 60, 3), 77, np.uint8)
-    picture = reconstruction_preview(ball, [view], shadings=[shading], device="cpu")
-    assert (panels(picture, 1, 5)[0][4] == 77).all()
+    [(*_, mesh)] = panels_of(ball, [photograph(ball, camera())], columns=5, shadings=[shading])
+    assert (mesh == 77).all()
 
 
-@pytest.mark.parametrize("size", [40, 300, 1100])
+@pytest.mark.parametrize("size", [40, 300, 560])
 def test_panels_fit_any_size(ball, size):
-    height = panels(reconstruction_preview(ball, [photograph(ball, camera(size=size))], device="cpu"), 1, 4)[0][
-        0
-    ].shape[0]
-    assert FEWEST_ROWS <= height <= max(MOST_ROWS, 2 * FEWEST_ROWS)
+    [(shown, *_)] = panels_of(ball, [photograph(ball, camera(size=size))])
+    assert FEWEST_ROWS <= len(shown) <= max(MOST_ROWS, 2 * FEWEST_ROWS)

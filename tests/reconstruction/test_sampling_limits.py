@@ -9,8 +9,8 @@ from beam_warp.reconstruction.sampling_limits import FILTER_VARIANCE, IMAGE_MARG
 from beam_warp.world.camera import Camera
 
 
-def limits(positions, cameras, device):
-    out = wp.full(len(positions), -1.0, dtype=float, device=device)
+def limits(positions, cameras, device, count=None):
+    out = wp.full(len(positions) if count is None else count, -1.0, dtype=float, device=device)
     SamplingLimits(cameras, device=device).write(wp.array(positions, dtype=wp.vec3, device=device), out)
     return out.numpy()
 
@@ -78,6 +78,4 @@ def test_refusals():
     with pytest.raises(InvalidOptionError, match="cameras must be at least one"):
         SamplingLimits([], device="cpu")
     with pytest.raises(InvalidArrayError, match="limits must be a warp array"):
-        SamplingLimits([camera()], device="cpu").write(
-            wp.zeros(3, dtype=wp.vec3, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
-        )
+        limits(np.zeros((3, 3)), [camera()], "cpu", count=2)

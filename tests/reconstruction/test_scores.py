@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 from skimage.metrics import structural_similarity
+from support.shapes import colored, quaternions_from_normals
 
 from beam_warp.errors import InvalidArrayError, MissingFileError
-from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
+from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
 from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import SH_C0
 
 DISCS = 20_000
 
@@ -21,19 +21,20 @@ def discs(tiny_capture):
     """Opaque discs on the true surface of frame 0, coloured by where they are."""
     mesh = read_truth_mesh(tiny_capture, 0)
     points, faces = trimesh.sample.sample_surface(mesh, DISCS, seed=5)
-    normals = mesh.face_normals[faces]
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
     spacing = np.sqrt(mesh.area / DISCS)
-    color = 0.1 + 0.3 * (points - mesh.bounds[0]) / np.ptp(mesh.bounds, axis=0)
-    return GaussianCloud(
+    cloud = GaussianCloud(
         positions=points,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        orientations=quaternions_from_normals(mesh.face_normals[faces]),
         scales=np.tile([spacing, spacing, 0.05 * spacing], (DISCS, 1)),
         opacities=np.full(DISCS, 0.99),
-        radiance=((color - 0.5) / SH_C0)[:, None, :],
-        radiance_color_space=LINEAR_REC709,
     )
+    return colored(cloud, 0.1 + 0.3 * (points - mesh.bounds[0]) / np.ptp(mesh.bounds, axis=0))
+
+
+@pytest.fixture
+def records(tiny_capture):
+    """The test view of frame 0."""
+    return tiny_capture.select(split="test", frames=[0])
 
 
 def protocol(record, cloud, device):
@@ -71,23 +72,21 @@ def protocol(record, cloud, device):
 
 
 class TestViews:
-    def test_numbers_are_those_of_the_shared_protocol(self, tiny_capture, discs, device):
-        records = tiny_capture.select(split="test", frames=[0])
+    def test_numbers_are_those_of_the_shared_protocol(self, records, discs, device):
         found = score_frame(discs, records, device=device).as_dict()
         for name, value in protocol(records[0], discs, device).items():
             # The same formulas in float64; in float32 the mean of a normal is off by 1e-7, an angle by 1e-4 degrees.
             assert found[name] == pytest.approx(value, rel=1e-6, abs=1e-4), name
         assert found["views"] == 1
 
-    def test_discs_on_the_surface_have_its_normals_and_depth(self, tiny_capture, discs, device):
-        found = score_frame(discs, tiny_capture.select(split="test", frames=[0]), device=device)
+    def test_discs_on_the_surface_have_its_normals_and_depth(self, records, discs, device):
+        found = score_frame(discs, records, device=device)
         # On a limb of 50 mm radius a pixel of 35 mm spans 0.7 rad: its normal means something to half of that.
         assert found.normals_median_degrees < 20.0
         assert found.views[0].depth_median_mm < 10.0
         assert found.views[0].median_depth_median_mm < 20.0
 
-    def test_a_shift_along_the_axis_is_a_depth_error(self, tiny_capture, discs, device):
-        records = tiny_capture.select(split="test", frames=[0])
+    def test_a_shift_along_the_axis_is_a_depth_error(self, records, discs, device):
         away = discs.with_arrays(positions=discs.positions + 0.1 * records[0].camera.forward)
         found = score_frame(away, records, device=device).views[0]
         still = score_frame(discs, records, device=device).views[0]
@@ -108,13 +107,11 @@ class TestViews:
     def test_training_views_are_scored_by_their_image_alone(self, tiny_capture, discs, device):
         found = score_frame(discs, tiny_capture.select(split="train", frames=[0])[:2], device=device)
         assert found.normals_median_degrees is None
-        assert set(found.as_dict()) == {
-            "psnr", "ssim", "solid_psnr", "whole_psnr", "whole_ssim", "alpha_error", "views",
-        }  # fmt: skip
+        names = "psnr ssim solid_psnr whole_psnr whole_ssim alpha_error views"
+        assert set(found.as_dict()) == set(names.split())
 
-    def test_a_pixel_is_the_mean_of_its_samples(self, tiny_capture, discs, device):
+    def test_a_pixel_is_the_mean_of_its_samples(self, records, discs, device):
         """The mean is taken in linear light, before it is encoded; geometry is measured as without samples."""
-        records = tiny_capture.select(split="test", frames=[0])
         once, fine = (score_frame(discs, records, samples=samples, device=device).as_dict() for samples in (1, 3))
         buffer = rasterize(discs, records[0].camera.supersampled(3), channels=("radiance",), device=device)
         linear = np.maximum(buffer.channels["radiance"].astype(np.float64) * buffer.alpha[..., None], 0.0)
@@ -137,24 +134,20 @@ class TestViews:
 
 
 class TestSurface:
-    def test_the_true_mesh_has_no_distance_from_itself(self, tiny_capture, discs, device):
+    def test_the_true_mesh_has_no_distance_from_itself(self, tiny_capture, records, discs, device):
         truth = read_truth_mesh(tiny_capture, 0)
         seeing = [record.camera for record in tiny_capture.select(split="train", frames=[0])]
-        records = tiny_capture.select(split="test", frames=[0])
         found = score_frame(discs, records, truth, truth_mesh=truth, seeing=seeing, sample_count=4000, device=device)
         assert found.surface.chamfer_mm < 1e-3
         assert 0.5 < found.surface.seen_share < 1.0
 
-    def test_a_frame_later_is_a_frame_of_motion_away(self, tiny_capture, discs, device):
+    def test_a_frame_later_is_a_frame_of_motion_away(self, tiny_capture, records, discs, device):
         truth, later = (read_truth_mesh(tiny_capture, frame) for frame in (0, 1))
-        records = tiny_capture.select(split="test", frames=[0])
         found = score_frame(discs, records, later, truth_mesh=truth, sample_count=4000, device=device)
         moved = 1e3 * np.linalg.norm(truth.vertices - later.vertices, axis=1)
         assert 0.3 < found.surface.chamfer_mm < moved.mean()
 
-    def test_truth_frames_are_those_with_exact_channels(self, tiny_capture):
+    def test_frames_have_exact_channels_and_a_mesh(self, tiny_capture):
         assert truth_frames(tiny_capture) == (0, 1)
-
-    def test_a_frame_without_a_mesh_is_named(self, tiny_capture):
         with pytest.raises(MissingFileError, match="truth must have a mesh for every frame scored"):
             read_truth_mesh(tiny_capture, 7)

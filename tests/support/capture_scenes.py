@@ -1,6 +1,9 @@
 """Views of a ball whose masks are known exactly: what tests of reconstruction's first steps start from."""
 
+from functools import cache
+
 import numpy as np
+from support.shapes import sphere_points
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.metrics import block_means
@@ -14,22 +17,13 @@ EDGE_ERROR = 0.25
 least linear in the distance, 0.1, of the samples 0.125, of the circle's curvature less than the rest."""
 
 
-def directions(count):
-    """Unit vectors evenly over the sphere (spherical Fibonacci)."""
-    i = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * i / count
-    angle = np.pi * (1.0 + np.sqrt(5.0)) * i
-    ring = np.sqrt(1.0 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-
-
 def cameras_around(count, *, distance=2.0, size=64, fov=40.0, center=(0.0, 0.0, 0.0)):
     """Cameras evenly around a point that look at it."""
     middle = np.asarray(center, float)
     lens = {"width": size, "height": size, "vertical_fov": fov}
-    ups = ((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0) for d in directions(count))
-    places = zip(directions(count), ups, strict=True)
-    return [Camera.look_at(middle + distance * d, middle, up=up, **lens) for d, up in places]
+    directions, _ = sphere_points(count)
+    ups = ((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0) for d in directions)
+    return [Camera.look_at(middle + distance * d, middle, up=up, **lens) for d, up in zip(directions, ups, strict=True)]
 
 
 def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0.3, 0.1)):
@@ -41,6 +35,7 @@ def ball_view(name, camera, *, radius=0.5, center=(0.0, 0.0, 0.0), color=(0.6, 0
     return CapturedView(name=name, camera=camera, color=alpha[..., None] * np.float32(color), alpha=alpha)
 
 
+@cache
 def ball_views(count, **options):
     """Views of a ball of radius 0.5 around the origin."""
-    return [ball_view(f"view_{i}", camera) for i, camera in enumerate(cameras_around(count, **options))]
+    return tuple(ball_view(f"view_{i}", camera) for i, camera in enumerate(cameras_around(count, **options)))

@@ -28,6 +28,12 @@ def sphere_view(camera, radius, center=(0.0, 0.0, 0.0)):
     return DepthView(camera=camera, depth=np.where(hit, depth, 0.0).astype(np.float32), alpha=hit.astype(np.float32))
 
 
+def points_of(view):
+    """The point that each pixel shows, (H, W, 3); where there is no depth, the camera's position."""
+    rays = view.camera.directions() / (view.camera.directions() @ view.camera.forward)[..., None]
+    return view.camera.position + rays * view.depth[..., None]
+
+
 def plane_view(camera, height, side=None):
     """The plane z = height, seen from above or below; ``side``: only so many pixels from the middle."""
     rays = camera.directions()

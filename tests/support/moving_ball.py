@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support.shapes import quaternions_from_normals, sphere_points
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
@@ -59,16 +60,12 @@ def block_means(image, side):
 
 def ball_cloud(count=300, *, radius=RADIUS, painted=True):
     """Discs on the ball, evenly along a spiral, local z outward; grey unless they are painted."""
-    z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
-    ring = np.sqrt(1.0 - z**2)
-    normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
-    spacing = radius * np.sqrt(4.0 * np.pi / count)
-    turns = np.stack([-normals[:, 1], normals[:, 0], np.zeros(count), 1.0 + normals[:, 2]], axis=-1)
+    normals, spacing = sphere_points(count)
+    spacing *= radius
     color = paint(normals) if painted else np.full((count, 3), 0.35)
     return GaussianCloud(
         positions=radius * normals,
-        orientations=turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        orientations=quaternions_from_normals(normals),
         scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
         opacities=np.full(count, 0.8),
         radiance=((color - 0.5) / SH_C0)[:, None, :],
