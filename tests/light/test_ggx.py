@@ -47,7 +47,7 @@ def test_known_values_at_grazing():
 
 
 def test_table_interpolates(rng):
-    n_dot_v, roughness = rng.uniform(0.02, 1, 2000), rng.uniform(0.05, 1, 2000)
+    n_dot_v, roughness = rng.uniform(0.02, 1, 600), rng.uniform(0.05, 1, 600)
     a, b = specular_albedo_terms(n_dot_v, roughness)
     np.testing.assert_allclose(specular_albedo(n_dot_v, roughness), DIELECTRIC_F0 * a + b, atol=2e-3)
 

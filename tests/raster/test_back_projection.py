@@ -88,12 +88,12 @@ def test_against_float64(device, rng, length, antialiased):
         pixels = rng.normal(size=(camera.width * camera.height, length)).astype(np.float32)
         pixels[decisions.near_jump.ravel()] = 0.0  # where single precision may decide otherwise
         alphas, _ = pair_terms(scene, see(scene, decisions.splats), decisions)
-        total, passing = np.zeros((COUNT, length)), np.ones(len(pixels))
+        weights, passing = np.zeros((COUNT, len(pixels))), np.ones(len(pixels))
         for splat, pixel, alpha in zip(decisions.splat, decisions.pixel, alphas, strict=True):  # front to back
-            total[splat] += alpha * passing[pixel] * pixels[pixel]
+            weights[splat, pixel] = alpha * passing[pixel]
             passing[pixel] *= 1.0 - alpha
         held.append(pixels)
-        wanted.append(total)
+        wanted.append(weights @ pixels)
     found = back_projected(drawn(made, VIEWS, device, options=options), np.concatenate(held))
     for got, want in zip(found, wanted, strict=True):
         assert np.linalg.norm(got - want) <= TWIN_ERROR * np.linalg.norm(want)

@@ -91,8 +91,8 @@ def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
     clear = ~decisions.near_jump
     assert clear.mean() > 0.9
     upstream = random_upstream(rng, scene, decisions)
-    image, wanted = replay(scene, decisions), gradients(scene, upstream, decisions)
-    wanted |= {name: getattr(image, name)[clear] for name in OUTPUTS}
+    truth, wanted = replay(scene, decisions), gradients(scene, upstream, decisions)
+    wanted |= {name: getattr(truth, name)[clear] for name in OUTPUTS}
     spread = dict.fromkeys(wanted, 0.0)
     for _ in range(3):
         other = rounded(rng, scene)
@@ -108,7 +108,7 @@ def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
         assert np.isfinite(got[key]).all(), key
         limit = factor * (spread[key] + rounding * np.linalg.norm(array))
         assert np.linalg.norm(got[key] - array) <= limit, key
-    np.testing.assert_array_equal(image.last[clear], replay(scene, decisions).last[clear])
+    np.testing.assert_array_equal(image.last[clear], truth.last[clear])
 
 
 @pytest.mark.parametrize("name", INVISIBLE)

@@ -38,17 +38,18 @@ def sky(peak=60.0, height=32, ground=0.05):
 def exact_unshadowed(environment, normals):
     """E / pi by a float64 sum over the texels of a fine grid: closed form but for texels cut by the horizon."""
     fine = environment.resized(256, 512)
-    weights = (fine.radiance.astype(np.float64) * fine.solid_angles()[..., None]).reshape(-1, 3)
-    directions = fine.directions().reshape(-1, 3)
+    lit = fine.radiance.any(axis=-1)
+    weights = (fine.radiance.astype(np.float64) * fine.solid_angles()[..., None])[lit]
+    directions = fine.directions()[lit]
     parts = np.array_split(normals, 20)
-    return np.concatenate([np.maximum(part @ directions.T, 0.0) @ weights for part in parts]) / (np.pi)
+    return np.concatenate([np.maximum(part @ directions.T, 0.0) @ weights for part in parts]) / np.pi
 
 
 @cache
 def arriving():
-    """Normals, and what of the sky arrives at them."""
+    """Normals, what of the sky arrives at them, and how far cells at the horizon may be off."""
     normals = unit(np.random.default_rng(3).normal(size=(600, 3)))
-    return normals, exact_unshadowed(sky(), normals)
+    return normals, exact_unshadowed(sky(), normals), horizon_error(sky(), normals)
 
 
 def horizon_error(environment, normals):
@@ -81,26 +82,29 @@ def gentle_light(device):
     """Light that no density draws badly, and what of it arrives at the points above, to a 20th of 64 rays' noise."""
     light = PreparedEnvironment(sky(8.0, ground=0.4), device)
     scene, points, normals = cluttered(device)
-    return light, irradiance(scene, points, normals, light, sample_count=4096, offset=0.05, seed=5).value
+    return light, irradiance(scene, points, normals, light, sample_count=2048, offset=0.05, seed=5).value
 
 
 @cache
 def openness(device):
     """Ambient occlusion of the points above, to a 20th of 64 rays' noise."""
     scene, points, normals = cluttered(device)
-    return ambient_occlusion(scene, points, normals, offset=0.05, sample_count=4096, seed=5).visibility
+    return ambient_occlusion(scene, points, normals, offset=0.05, sample_count=2048, seed=5).visibility
 
 
 def empty(device):
     return Scene.from_gaussians(random_cloud(np.random.default_rng(0), 3).select(np.arange(0)), device)
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize(
+    ("density", "sampler"), [*((density, "owen") for density in DENSITIES), *(("mis", other) for other in SAMPLERS[1:])]
+)
 class TestUnbiased:
+    """Every density by the default sampler, and every sampler by the density that shares its set between techniques."""
+
     def test_nothing_in_the_way(self, device, density, sampler):
         """The plain estimate against the sum over texels; the ratio estimate is that sum."""
-        normals, truth = arriving()
+        normals, truth, cells = arriving()
         light, points = PreparedEnvironment(sky(), device), np.zeros((600, 3))
         options = {"sample_count": 32, "density": density, "sampler": sampler}
         plain = irradiance(empty(device), points, normals, light, **options, ratio=False)
@@ -111,7 +115,7 @@ class TestUnbiased:
         found = exact.standard_error < 0.4 * exact.value
         assert found.mean() > 0.99
         error = np.abs(exact.value - truth)
-        assert (error <= horizon_error(sky(), normals) + np.where(found, 0.0, exact.standard_error)).all()
+        assert (error <= cells + np.where(found, 0.0, exact.standard_error)).all()
         # V - ratio is a rounding of 1, times f of up to some hundred
         assert exact.standard_error[found].max() < 1e-4 * truth.max()
 
@@ -271,26 +275,27 @@ def draw_light_kernel(
     out_pdf[i] = drawn.pdf
 
 
+def unshadowed(environment, normals, device):
+    """What arrives at normals with nothing in the way, by the sums of moments."""
+    out = wp.empty(len(normals), dtype=wp.vec3, device=device)
+    at = wp.array(normals, dtype=wp.vec3, device=device)
+    launch_sum_unshadowed(len(at), light_moments(environment, wp.get_device(device)), at, out, device)
+    return out.numpy()
+
+
 class TestUnshadowed:
-    @pytest.mark.parametrize("peak", [51.0, 1.6e3, 2e4])
-    @pytest.mark.parametrize("height", [32, 112, 256])
+    @pytest.mark.parametrize(("peak", "height"), [(51.0, 112), (1.6e3, 32), (2e4, 256)])
     def test_against_the_sum_over_texels(self, device, rng, peak, height):
-        environment, normals = sky(peak, height), unit(rng.normal(size=(500, 3)))
-        out = wp.empty(500, dtype=wp.vec3, device=device)
-        at = wp.array(normals, dtype=wp.vec3, device=device)
-        launch_sum_unshadowed(len(at), light_moments(environment, wp.get_device(device)), at, out, device)
+        environment, normals = sky(peak, height), unit(rng.normal(size=(300, 3)))
         truth = exact_unshadowed(environment, normals)
         # the oracle takes fine texels for points: (pi / 256)^2 / 12 of the sun
-        assert (np.abs(out.numpy() - truth) <= horizon_error(environment, normals) + 1.3e-5 * truth.max()).all()
+        allowed = horizon_error(environment, normals) + 1.3e-5 * truth.max()
+        assert (np.abs(unshadowed(environment, normals, device) - truth) <= allowed).all()
 
     def test_even_light(self, device, rng):
         """A hard horizon loses (pi / 32)^2 / 12 = 8e-4, always; spreading the cells' light leaves less than a third."""
         normals = unit(rng.normal(size=(500, 3)))
-        out = wp.empty(500, dtype=wp.vec3, device=device)
-        at = wp.array(normals, dtype=wp.vec3, device=device)
-        moments = light_moments(EnvironmentMap.constant((1.0, 2.0, 0.5)), wp.get_device(device))
-        launch_sum_unshadowed(len(at), moments, at, out, device)
-        relative = out.numpy() / [1.0, 2.0, 0.5] - 1.0
+        relative = unshadowed(EnvironmentMap.constant((1.0, 2.0, 0.5)), normals, device) / [1.0, 2.0, 0.5] - 1.0
         assert np.abs(relative).max() < 8e-4 / 3.0
         assert abs(relative.mean()) < 8e-4 / 30.0
 

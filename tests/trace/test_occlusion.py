@@ -80,13 +80,13 @@ class TestOffset:
 
 @cache
 def cluttered(device):
-    """Soft Gaussians, points in their midst, and their occlusion by 4,096 rays: a 20th of 64 rays' noise."""
+    """Soft Gaussians, points in their midst, and their occlusion by 2,048 rays: a 20th of 64 rays' noise."""
     rng = np.random.default_rng(20260)
     cloud = random_cloud(rng, 800, scale=(-2.5, 0.4), opacity=(0.3, 1.0))
     scene = Scene.from_gaussians(cloud, device)
     n = unit(rng.normal(size=(300, 3)))
     points = cloud.positions[:300]
-    truth = ambient_occlusion(scene, points, n, sample_count=4096, offset=0.1, seed=9).visibility
+    truth = ambient_occlusion(scene, points, n, sample_count=2048, offset=0.1, seed=9).visibility
     return scene, points, n, truth
 
 

@@ -168,14 +168,14 @@ ADVERSARY = np.random.default_rng(5)
 POWERS = 2.0 ** -np.arange(100)[:, None]
 
 ADVERSARIAL = {
-    "coincident": np.zeros((3000, 3)),
+    "coincident": np.zeros((1500, 3)),
     "100,000 duplicates": np.repeat(ADVERSARY.uniform(size=(10, 3)), 10_000, axis=0),
     "2^-k on an axis": POWERS * [1.0, 0.0, 0.0],
     "2^-k on a diagonal": POWERS * [1.0, 1.0, 1.0],
-    "2^-k, each 50 times": np.repeat(POWERS * [1.0, -1.0, 0.5], 50, axis=0),
-    "line": np.linspace(-1.0, 1.0, 3000)[:, None] * [0.0, 0.0, 1.0],
-    "plane": ADVERSARY.uniform(size=(3000, 3)) * [1.0, 1.0, 0.0],
-    "two far clusters": ADVERSARY.normal(size=(3000, 3)) * 1e-5 + (ADVERSARY.uniform(size=(3000, 1)) < 0.5),
+    "2^-k, each 20 times": np.repeat(POWERS * [1.0, -1.0, 0.5], 20, axis=0),
+    "line": np.linspace(-1.0, 1.0, 1500)[:, None] * [0.0, 0.0, 1.0],
+    "plane": ADVERSARY.uniform(size=(1500, 3)) * [1.0, 1.0, 0.0],
+    "two far clusters": ADVERSARY.normal(size=(1500, 3)) * 1e-5 + (ADVERSARY.uniform(size=(1500, 1)) < 0.5),
 }
 
 
