@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from scipy import stats
-from support.estimates import LARGEST_Z, SIGNIFICANCE
+from support.estimates import LARGEST_Z, require_density
 from support.kernel_runs import run_kernel
 from support.split_sum import sunny_sky, texels_of
 
@@ -82,15 +81,8 @@ def test_draws_follow_the_density(device):
     drawn = pdfs[:, 0] > 0.0
     rows, columns = texels_of(direction[drawn], 16)
     counts = np.bincount(rows * 32 + columns, minlength=512)
-    share = (density(device, sky, NORMALS[0]) * sky.solid_angles()).reshape(16, 2, 32, 2).sum(axis=(1, 3)).reshape(-1)
-    expected = share * count
-    enough = expected > 5.0
-    observed = np.append(counts[enough], [counts[~enough].sum() + (~drawn).sum()])
-    wanted = np.append(expected[enough], [count - expected[enough].sum()])
-    if wanted[-1] < 5.0:
-        observed, wanted = observed[:-1], wanted[:-1] * observed[:-1].sum() / wanted[:-1].sum()
-    statistic = ((observed - wanted) ** 2 / wanted).sum()
-    assert stats.chi2.sf(statistic, len(wanted) - 1) > SIGNIFICANCE
+    share = (density(device, sky, NORMALS[0]) * sky.solid_angles()).reshape(16, 2, 32, 2).sum(axis=(1, 3))
+    require_density(np.append(counts, (~drawn).sum()), np.append(share, 1.0 - share.sum()), least=5.0)
 
 
 def test_draws_know_their_density(device):
