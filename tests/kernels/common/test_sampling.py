@@ -5,13 +5,11 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
-from reference.latlong import lookup
-from reference.light_sampling import cosine_hemisphere_to_square, product_to_square, square_to_product_pdf
+from reference.light_sampling import cosine_hemisphere_to_square
 from scipy import stats
 from scipy.stats import qmc
-from support.estimates import SIGNIFICANCE, require_density
+from support.estimates import SIGNIFICANCE
 from support.kernel_runs import run_kernel
-from support.split_sum import sunny_sky, texels_of
 
 from beam_warp.kernels.common.sampling import (
     SampleSet,
@@ -26,14 +24,6 @@ from beam_warp.kernels.common.sampling import (
     unit_float,
 )
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.light.environment_sampling import radiance_over_pdf
-from beam_warp.kernels.light.product_sampling import (
-    EnvironmentBlocks,
-    launch_accumulate_block_weights,
-    square_to_product,
-)
-from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.light.sampled import suited_height
 from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
 from beam_warp.world.environment import EnvironmentMap
 
@@ -84,30 +74,6 @@ def cosine_round_trip_kernel(squares: wp.array[wp.vec2], out: wp.array[wp.vec2],
 def cosine_pdf_kernel(directions: wp.array[wp.vec3], out: wp.array[float]):
     i = wp.tid()
     out[i] = square_to_cosine_hemisphere_pdf(directions[i])
-
-
-@wp.kernel
-def product_kernel(
-    blocks: EnvironmentBlocks,
-    cumulative: wp.array2d[float],
-    squares: wp.array[wp.vec2],
-    out_direction: wp.array[wp.vec3],
-    out_radiance: wp.array[wp.vec3],
-    out_back: wp.array[wp.vec2],
-):
-    i = wp.tid()
-    drawn = square_to_product(blocks, cumulative, 0, squares[i][0], squares[i][1])
-    out_direction[i] = drawn.direction
-    out_radiance[i] = radiance_over_pdf(drawn)
-    out_back[i] = product_to_square(blocks, cumulative, 0, drawn.direction)
-
-
-@wp.kernel
-def product_pdf_kernel(
-    blocks: EnvironmentBlocks, cumulative: wp.array2d[float], directions: wp.array2d[wp.vec3], out: wp.array2d[float]
-):
-    row, column = wp.tid()
-    out[row, column] = square_to_product_pdf(blocks, cumulative, 0, directions[row, column])
 
 
 def owen_points(device, points, count, seed=7):
@@ -243,80 +209,3 @@ def test_cosine_density_integrates_to_one(device):
     density = density.astype(np.float64)
     assert (density * sphere.solid_angles().ravel()).sum() == pytest.approx(1.0, abs=(np.pi / 256) ** 2)
     assert not density[directions[:, 2] < 0.0].any()
-
-
-class TestProduct:
-    normal = np.array([0.6, 0.0, 0.8])
-
-    def prepare(self, device, environment):
-        blocks = PreparedEnvironment(environment, device).blocks
-        normals = wp.array(self.normal[None], dtype=wp.vec3, device=device)
-        cumulative = wp.empty((1, 512), dtype=float, device=device)
-        launch_accumulate_block_weights(len(normals), blocks, normals, cumulative, device)
-        return blocks, cumulative
-
-    def draw(self, device, environment, squares):
-        blocks, cumulative = self.prepare(device, environment)
-        inputs = [blocks, cumulative, (squares, wp.vec2)]
-        return run_kernel(product_kernel, len(squares), inputs, (wp.vec3, wp.vec3, wp.vec2), device)
-
-    def density(self, device, environment):
-        blocks, cumulative = self.prepare(device, environment)
-        inputs = [blocks, cumulative, (environment.directions(), wp.vec3)]
-        return run_kernel(product_pdf_kernel, (environment.height, environment.width), inputs, [float], device)[0]
-
-    def test_density_integrates_to_one(self, device):
-        environment = sunny_sky()
-        total = (self.density(device, environment).astype(np.float64) * environment.solid_angles()).sum()
-        assert total == pytest.approx(1.0, abs=1e-5)
-
-    def test_density_is_positive_wherever_light_arrives(self, device):
-        environment = sunny_sky()
-        arriving = (environment.directions() @ self.normal > 0.0) & (environment.radiance.sum(-1) > 0.0)
-        assert (self.density(device, environment)[arriving] > 0.0).all()
-
-    def test_samples_have_the_density(self, device, rng):
-        environment = sunny_sky(32)
-        squares = rng.random((40_000, 2)).astype(np.float32)
-        directions, _, _ = self.draw(device, environment, squares)
-        expected = self.density(device, environment).astype(np.float64) * environment.solid_angles()
-        row, column = texels_of(directions, 32)
-        counts = np.bincount(row * 64 + column, minlength=32 * 64)
-        # directions within float rounding of a texel's edge may land next door: texels that expect little are one
-        require_density(counts, expected, least=10.0)
-
-    def test_inverse(self, device, rng):
-        """Rebuilt from float32 directions: the square is only as fine as they are, magnified by the density."""
-        squares = rng.random((5000, 2)).astype(np.float32)
-        environment = sunny_sky(32)
-        directions, _, back = self.draw(device, environment, squares)
-        density = lookup(environment, directions).mean(-1)
-        in_sun = density > 100.0
-        assert 0.1 < in_sun.mean() < 0.9
-        gap = np.abs(back - squares).max(axis=1)
-        # A texel is pi / 32 wide, and a direction's rounding 1e-7 of it 1e-6; the map spends up to 1 on the sun's.
-        # Directions within rounding of an edge go back through the texel next door: fewer than 1 in 200.
-        assert (gap < 1e-4).mean() > 0.995
-
-    def test_irradiance_is_unbiased_and_almost_free_of_noise(self, device, rng):
-        environment = sunny_sky()
-        squares = rng.random((20_000, 2)).astype(np.float32)
-        directions, radiance, _ = self.draw(device, environment, squares)
-        terms = radiance.astype(np.float64) * np.maximum(directions @ self.normal, 0.0)[:, None]
-        cosine = np.maximum(environment.directions() @ self.normal, 0.0)
-        truth = (environment.radiance * (cosine * environment.solid_angles())[..., None]).sum((0, 1))
-        z = (terms.mean(0) - truth) / (terms.std(0) / np.sqrt(len(terms)))
-        assert np.abs(z).max() < stats.norm.isf(SIGNIFICANCE / 6)
-        # one draw's deviation; cosine sampling of this sun has about 30 times the mean
-        assert (terms.std(0) < 0.8 * truth).all()
-
-    def test_darkness_draws_nothing(self, device):
-        directions, radiance, _ = self.draw(
-            device, EnvironmentMap.constant((0.0, 0.0, 0.0), height=32), np.zeros((4, 2))
-        )
-        assert not directions.any()
-        assert not radiance.any()
-
-    @pytest.mark.parametrize(("height", "suited"), [(4, 32), (32, 32), (50, 48), (512, 512), (2048, 512)])
-    def test_any_map_is_fitted_to_blocks(self, height, suited):
-        assert suited_height(height) == suited
