@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.harmonics import sh_color
+from reference.rasterizing import RasterImage
+from support.raster_clouds import set_upstream
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize_values
@@ -216,20 +218,9 @@ def test_gradients_have_the_bits_of_the_rasteriser(place, rng, bases):
     own.draw(as_arrays(given, own.device, "values" if bases is None else "radiance"))
     degree = None if bases is None else 2
     renders, alphas, meta = rasterization(**given, **where, sh_degree=degree, return_normals=True)
-    images = (renders, alphas, meta["depth"], meta["median_depth"], meta["normals"])
+    images = (alphas, meta["depth"], meta["median_depth"], renders, meta["normals"])
     upstream = [rng.normal(size=image.shape).astype(np.float32) for image in images]
-    adjoints = own.adjoints()
-    columns = [upstream[4], upstream[0]] if bases is None else [upstream[0], upstream[4]]
-    rows = np.concatenate([c.reshape(-1, c.shape[-1]) for c in columns], axis=1)
-    start = 0
-    for channels in adjoints.channels:
-        padded = np.zeros(channels.shape, np.float32)
-        part = rows[:, start : start + channels.shape[1]]
-        padded[:, : part.shape[1]] = part
-        channels.assign(padded)
-        start += channels.shape[1]
-    for target, array in zip((adjoints.alpha, adjoints.depth, adjoints.median_depth), upstream[1:4], strict=True):
-        target.assign(array.reshape(-1))
+    set_upstream(own, RasterImage(*upstream))
     expected = own.backward()
     torch.autograd.backward(images, [torch.tensor(array, device=place) for array in upstream])
     pairs = {

@@ -203,31 +203,27 @@ def test_every_camera_of_a_batch_sees_what_it_sees_alone(device, rng):
         *(upload(a, kind, device) for a, kind in zip(arrays, (wp.vec3, wp.quat, wp.vec3, float), strict=True)),
         upload(scene.values.astype(np.float32), float, device),
     )
-    together = Rasterizer(len(arrays[0]), cameras, value_count=3, normals=True, device=device)
-    images = together.draw(gaussians)
-    adjoints = together.adjoints()
-    upstream = {
-        "alpha": rng.normal(size=together.first_pixels[-1]).astype(np.float32),
-        "channels": rng.normal(size=images.channels[0].shape).astype(np.float32),
-    }
-    adjoints.alpha.assign(upstream["alpha"])
-    adjoints.channels[0].assign(upstream["channels"])
-    total = {name: getattr(together.backward(), name).numpy().astype(np.float64) for name in scene.arrays()}
+    edges = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+    to_alpha, to_channels = (rng.normal(size=(edges[-1], k)).astype(np.float32) for k in (1, 16))
+
+    def seen(cameras, part):
+        """Images, and gradients of the part of the loss that is theirs."""
+        drawer = Rasterizer(len(arrays[0]), cameras, value_count=3, normals=True, device=device)
+        images, adjoints = drawer.draw(gaussians), drawer.adjoints()
+        adjoints.alpha.assign(to_alpha[part, 0])
+        adjoints.channels[0].assign(np.ascontiguousarray(to_channels[part, : images.channels[0].shape[1]]))
+        shown = (images.alpha, images.depth, images.median_depth, images.channels[0], drawer.gaussian_ids)
+        found = drawer.backward()
+        gradients = {name: getattr(found, name).numpy().astype(np.float64) for name in scene.arrays()}
+        return [array.numpy() for array in shown], gradients
+
+    together, total = seen(cameras, slice(None))
     size = dict.fromkeys(total, 0.0)
-    for i, camera in enumerate(cameras):
-        part = slice(*together.first_pixels[i : i + 2])
-        alone = Rasterizer(len(arrays[0]), [camera], value_count=3, normals=True, device=device)
-        image = alone.draw(gaussians)
-        for name in ("alpha", "depth", "median_depth"):
-            np.testing.assert_array_equal(getattr(images, name).numpy()[part], getattr(image, name).numpy())
-        np.testing.assert_array_equal(images.channels[0].numpy()[part], image.channels[0].numpy())
-        np.testing.assert_array_equal(together.gaussian_ids.numpy()[part], alone.gaussian_ids.numpy())
-        adjoints = alone.adjoints()
-        adjoints.alpha.assign(upstream["alpha"][part])
-        adjoints.channels[0].assign(upstream["channels"][part])
-        found = alone.backward()
-        for name in total:
-            array = getattr(found, name).numpy().astype(np.float64)
+    for camera, part in zip(cameras, map(slice, edges[:-1], edges[1:]), strict=True):
+        alone, found = seen([camera], part)
+        for image, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(image[part], one)
+        for name, array in found.items():
             total[name] -= array
             size[name] += np.abs(array).max()
     for name, rest in total.items():
