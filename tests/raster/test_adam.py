@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
+from support.float32 import EPSILON
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
 
 KINDS = {"position": wp.vec3, "orientation": wp.quat, "opacity": float, "harmonics": (float, 9)}
 RATES = {"position": 1.6e-4, "orientation": 1e-3, "opacity": 0.05, "harmonics": 2.5e-3}

@@ -42,57 +42,43 @@ def reference_scene(made, camera, **more):
 
 
 @pytest.mark.parametrize(
-    ("count", "options"),
+    ("held", "options"),
     [
-        (1, RasterOptions()),
-        (5, RasterOptions()),
-        (9, RasterOptions(antialiased=True)),
-        (17, RasterOptions()),
-        (1, RasterOptions(depth="exact")),
-        (35, RasterOptions(depth="exact")),
+        ({"values": (1,)}, RasterOptions()),
+        ({"values": (5,)}, RasterOptions()),
+        ({"values": (9,)}, RasterOptions(antialiased=True)),
+        ({"values": (17,)}, RasterOptions()),
+        ({"values": (1,)}, RasterOptions(depth="exact")),
+        ({"values": (35,)}, RasterOptions(depth="exact")),
+        ({"radiance": (1, 3)}, RasterOptions()),
+        ({"radiance": (16, 3)}, RasterOptions()),
     ],
+    ids=str,
 )
-def test_gradients_of_any_number_of_channels(device, rng, count, options):
+def test_gradients_of_any_number_of_channels(device, rng, held, options):
+    """Of values or of captured colour, whose gradients go to its coefficients, and to positions by the direction."""
     made, camera = cloud(rng, 60), around(33, 25)
-    values = rng.uniform(0, 1, (60, count)).astype(np.float32)
-    scene = reference_scene(made, camera, values=values, antialiased=options.antialiased, depth_mode=options.depth)
+    colors = {name: rng.normal(0.3, 0.4, (60, *shape)).astype(np.float32) for name, shape in held.items()}
+    scene = reference_scene(made, camera, **colors, antialiased=options.antialiased, depth_mode=options.depth)
     decisions = decide(scene)
     upstream = random_upstream(rng, scene, decisions)
     wanted, image = gradients(scene, upstream, decisions), replay(scene, decisions)
-    drawer = Rasterizer(60, [camera], value_count=count, normals=True, options=options, device=device)
-    images = drawer.draw(upload_gaussians(made, drawer.device, values=values))
-    assert sum(rows.shape[1] for rows in images.channels) >= count + 3
+    kind = {"value_count": held["values"][0]} if "values" in held else {"radiance": True}
+    drawer = Rasterizer(60, [camera], **kind, normals=True, options=options, device=device)
+    images = drawer.draw(upload_gaussians(made, drawer.device, **colors))
+    assert sum(rows.shape[1] for rows in images.channels) >= image.channels.shape[-1] + 3
     clear = ~decisions.near_jump.ravel()
     assert clear.mean() > 0.95
     np.testing.assert_allclose(images.alpha.numpy()[clear], image.alpha.ravel()[clear], atol=1e-5)
     for name in ("depth", "median_depth"):
         got, want = getattr(images, name).numpy()[clear], getattr(image, name).ravel()[clear]
         np.testing.assert_allclose(got, want, rtol=DEPTH_ERROR)
-    assert_gradients(drawer, upstream, wanted)
-
-
-def assert_gradients(drawer, upstream, wanted):
-    """What the way back finds is the oracle's."""
     set_upstream(drawer, upstream)
     found = drawer.backward()
+    assert (found.values is None) == ("radiance" in held)
     for name, array in wanted.items():
         error = np.linalg.norm(getattr(found, name).numpy() - array) / np.linalg.norm(array)
         assert error <= GRADIENT_ERROR, name
-
-
-@pytest.mark.parametrize("bands", [1, 16])
-def test_gradients_of_captured_colour(device, rng, bands):
-    """Gradients to the coefficients, and to positions through the direction."""
-    radiance = rng.normal(0.0, 0.4, (50, bands, 3)).astype(np.float32)
-    made, camera = cloud(rng, 50), around(31, 27)
-    scene = reference_scene(made, camera, radiance=radiance)
-    decisions = decide(scene)
-    upstream = random_upstream(rng, scene, decisions)
-    wanted = gradients(scene, upstream, decisions)
-    drawer = Rasterizer(50, [camera], radiance=True, normals=True, device=device)
-    drawer.draw(upload_gaussians(made, drawer.device, radiance=radiance))
-    assert_gradients(drawer, upstream, wanted)
-    assert drawer.backward().values is None
 
 
 def test_every_draw_may_have_another_number_of_coefficients(device, rng, made):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.visibility import FrozenVisibility
-from support.shapes import aligned, along_x, random_cloud, random_rays, unit
+from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays, unit
 
-from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp import Scene, visibility
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.trace import gradients
 from beam_warp.trace.gradients import visibility_gradients
@@ -37,12 +37,6 @@ def rounding(cloud, gradient):
 
 def relative_error(value, expected):
     return np.linalg.norm(value - expected) / np.linalg.norm(expected)
-
-
-def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), orientation=(0.0, 0.0, 0.0, 1.0), **fields):
-    return GaussianCloud(
-        positions=[[0, 0, 0]], orientations=[orientation], scales=[scales], opacities=[opacity], **fields
-    )
 
 
 def solve(cloud, device, rays, adjoints):

@@ -14,9 +14,10 @@ from beam_warp.trace.sampling import SAMPLERS
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def plane(spacing=0.05, radius=1.0):
-    points = disc_points(radius, spacing)
-    return points, np.tile(UP, (len(points), 1)), tiles(points, np.tile(UP, (len(points), 1)), spacing)
+def plane():
+    points = disc_points(1.0, 0.05)
+    normals = np.tile(UP, (len(points), 1))
+    return points, normals, tiles(points, normals, 0.05)
 
 
 class TestClosedForm:

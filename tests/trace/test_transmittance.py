@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import aligned, along_x, random_cloud, random_rays
+from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays
 
-from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp import Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common import launching
 from beam_warp.trace.reference import visibility_reference
@@ -14,10 +14,6 @@ from beam_warp.trace.transmittance import TraceOptions
 # V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
 # distance over smallest scale (about 1e3 here), on alphas whose slope in the response is at most 1.
 VISIBILITY_TOLERANCE = 2e-4
-
-
-def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), position=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0)):
-    return GaussianCloud(positions=[position], orientations=[orientation], scales=[scales], opacities=[opacity])
 
 
 class TestClosedForm:
