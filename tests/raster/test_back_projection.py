@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from reference.raster_splats import RasterScene, see
 from reference.rasterizing import decide, pair_terms
+from support.float32 import EPSILON
 from support.raster_clouds import around, cloud, drawn
 
 from beam_warp import Camera, GaussianCloud
@@ -14,9 +15,6 @@ from beam_warp.raster import forward
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-
-ROUNDING = 2.0**-24
-"""Relative error of one operation in single precision."""
 
 TWIN_ERROR = 1e-5
 """Relative L2 against float64: coordinates below 64 pixels are rounded by 4e-6 twice, and the slope of alpha is at most
@@ -105,7 +103,7 @@ def test_it_is_the_gradient_of_values(device, rng, depth):
     weighed = summed(drawer, back_projected(drawer, np.abs(pixels)))[:, :count]
     assert np.abs(want).max() > 1.0
     # A product and a quotient, of up to two roundings, for each of at most all splats; two sums.
-    assert (np.abs(got - want) <= (3 * COUNT + 2 * roundings(VIEWS)) * ROUNDING * weighed).all()
+    assert (np.abs(got - want) <= (3 * COUNT + 2 * roundings(VIEWS)) * EPSILON * weighed).all()
     np.testing.assert_array_equal(drawer.backward().values.numpy(), want)  # nothing that it needs was changed
 
 
@@ -120,7 +118,7 @@ def test_bands_change_roundings_only(device, rng, monkeypatch):
         found.append(back_projected(drawer, pixels))
         np.testing.assert_array_equal(back_projected(drawer, pixels), found[-1])
         weighed = back_projected(drawer, np.abs(pixels))
-    assert (np.abs(found[0] - found[1]) <= 2 * roundings(VIEWS) * ROUNDING * weighed).all()
+    assert (np.abs(found[0] - found[1]) <= 2 * roundings(VIEWS) * EPSILON * weighed).all()
 
 
 def test_many_splats_on_a_tile(device, rng):
@@ -135,7 +133,7 @@ def test_many_splats_on_a_tile(device, rng):
     found = back_projected(drawer, np.ones((256, 4)))[0]
     assert 32 < (found[:, 0] > 0.0).sum() < count  # what is behind the last stop gets nothing
     alpha = drawer.images.alpha.numpy().sum(dtype=float)
-    np.testing.assert_allclose(found.sum(axis=0, dtype=float), alpha, rtol=(count + roundings([camera])) * ROUNDING)
+    np.testing.assert_allclose(found.sum(axis=0, dtype=float), alpha, rtol=(count + roundings([camera])) * EPSILON)
 
 
 def test_what_no_view_sees_gets_nothing(device):

@@ -66,10 +66,6 @@ class Drawn:
         return {name: getattr(found, name).numpy() for name in self.scene.arrays()}
 
 
-def draw(scene, device):
-    return Drawn(scene, device).image()
-
-
 def remoteness(scene, decisions):
     """How many images the farthest centre that counts is away: responses and depths are forms about it.
 
@@ -187,7 +183,7 @@ def test_images_of_every_shape(device, rng, width, height):
     scene = make(rng, positions, np.exp(rng.normal(-2.5, 0.5, (80, 3))), camera=camera)
     decisions = decide(scene)
     clear = ~decisions.near_jump
-    got, want = draw(scene, device), replay(scene, decisions)
+    got, want = Drawn(scene, device).image(), replay(scene, decisions)
     for output in ("alpha", "channels"):
         # A pixel coordinate below 80 is rounded by 4e-6 twice, and a response changes by at most 1.1 per pixel.
         np.testing.assert_allclose(getattr(got, output)[clear], getattr(want, output)[clear], atol=1e-5)

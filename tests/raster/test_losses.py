@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from reference import image_losses as twin
 from skimage.metrics import structural_similarity
-from support.float32 import EPSILON
+from support.float32 import EPSILON, relative_error
 from support.kernel_runs import upload_floats as upload
 
 from beam_warp.device.array_checks import pixel_channels
@@ -24,10 +24,6 @@ def zeros(shape, device):
 
 def value(loss):
     return float(loss.numpy()[0])
-
-
-def relative_error(found, expected):
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
 def images(rng, *shape):

@@ -8,6 +8,7 @@ from reference.harmonics import sh_color
 from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
+from support.float32 import relative_error
 from support.raster_clouds import around, cloud, drawn, set_upstream
 
 from beam_warp import GaussianCloud, rasterize
@@ -77,8 +78,7 @@ def test_gradients_of_any_number_of_channels(device, rng, held, options):
     found = drawer.backward()
     assert (found.values is None) == ("radiance" in held)
     for name, array in wanted.items():
-        error = np.linalg.norm(getattr(found, name).numpy() - array) / np.linalg.norm(array)
-        assert error <= GRADIENT_ERROR, name
+        assert relative_error(getattr(found, name).numpy(), array) <= GRADIENT_ERROR, name
 
 
 def test_every_draw_may_have_another_number_of_coefficients(device, rng, made):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.visibility import FrozenVisibility
+from support.float32 import relative_error
 from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays, unit
 
 from beam_warp import Scene, visibility
@@ -33,10 +34,6 @@ def rounding(cloud, gradient):
     return (
         3.0 * 2.0 * np.sqrt(6.0 / 3.0) * 2.0**-24 * np.sqrt(2.0) * np.linalg.norm(size * inverse) / np.linalg.norm(size)
     )
-
-
-def relative_error(value, expected):
-    return np.linalg.norm(value - expected) / np.linalg.norm(expected)
 
 
 def solve(cloud, device, rays, adjoints):

@@ -68,8 +68,7 @@ class TestOffset:
     def test_tilted_neighbours_do_not_shade(self, device, rng):
         """Edges of flat Gaussians stick up where their axes are noisy: here by 9 degrees per axis."""
         points, spacing = sphere_points(8000)
-        tilted = points + 0.15 * rng.normal(size=points.shape)
-        tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+        tilted = unit(points + 0.15 * rng.normal(size=points.shape))
         scene = Scene.from_gaussians(cloud_of(tiles(points, tilted, spacing, opacity=0.9)), device)
         assert ambient_occlusion(scene, points, points).visibility.mean() > 0.99
 

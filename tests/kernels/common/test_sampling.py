@@ -14,14 +14,10 @@ from support.kernel_runs import run_kernel
 from beam_warp.kernels.common.sampling import (
     SampleSet,
     draw_square,
-    owen_sobol_x,
-    owen_sobol_y,
     sobol_second_dimension,
     square_to_cosine_hemisphere,
     square_to_cosine_hemisphere_pdf,
-    stratum,
     stream_of,
-    unit_float,
 )
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
 from beam_warp.trace.sampling import SAMPLERS, sample_set, squarest_grid
@@ -32,16 +28,6 @@ from beam_warp.world.environment import EnvironmentMap
 def plain_sobol_kernel(out: wp.array[wp.uint32]):
     i = wp.tid()
     out[i] = sobol_second_dimension(wp.uint32(i))
-
-
-@wp.kernel
-def owen_kernel(seed: wp.uint32, count: int, bits: wp.vec2i, out: wp.array2d[wp.vec2], out_stratum: wp.array2d[int]):
-    point, sample = wp.tid()
-    stream = stream_of(seed, wp.uint32(0), wp.uint32(point))
-    x = owen_sobol_x(sample, stream)
-    y = owen_sobol_y(sample, stream)
-    out[point, sample] = wp.vec2(unit_float(x), unit_float(y))
-    out_stratum[point, sample] = stratum(x, y, bits[0], bits[1])
 
 
 @wp.kernel
@@ -76,12 +62,6 @@ def cosine_pdf_kernel(directions: wp.array[wp.vec3], out: wp.array[float]):
     out[i] = square_to_cosine_hemisphere_pdf(directions[i])
 
 
-def owen_points(device, points, count, seed=7):
-    bits = count.bit_length() - 1
-    inputs = [wp.uint32(seed), count, wp.vec2i(bits // 2, bits - bits // 2)]
-    return run_kernel(owen_kernel, (points, count), inputs, (wp.vec2, int), device)
-
-
 def draw_sets(device, sampler, points, count):
     inputs = [sample_set(sampler, count)]
     squares, slots = run_kernel(draw_square_kernel, (points, count), inputs, (wp.vec2, int), device)
@@ -101,7 +81,7 @@ def test_second_dimension_is_sobols(device):
 
 @pytest.mark.parametrize("count", [2, 8, 64, 128])
 def test_each_stratum_holds_one_point(device, count):
-    points, cells = owen_points(device, 50, count)
+    points, cells = draw_sets(device, "owen", 50, count)
     assert (np.sort(cells, axis=1) == np.arange(count)).all()
     assert ((points >= 0.0) & (points < 1.0)).all()
     # not only the squarest grid: every elementary interval of a (0,2)-sequence
@@ -180,7 +160,7 @@ class TestSpread:
 
 
 def test_scrambled_estimates_are_unbiased_and_beat_independent_samples(device):
-    points, _ = owen_points(device, 2000, 64)
+    points, _ = draw_sets(device, "owen", 2000, 64)
     values = np.exp(points[..., 0] * points[..., 1])  # integral over the square: sum 1 / (n! (n + 1)^2)
     truth = sum(1.0 / (float(np.prod(np.arange(1, n + 1))) * (n + 1) ** 2) for n in range(20))
     means = values.mean(axis=1)
