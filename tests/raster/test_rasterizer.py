@@ -57,7 +57,7 @@ def reference_scene(made, camera, **more):
     ids=str,
 )
 def test_gradients_of_any_number_of_channels(device, rng, held, options):
-    """Of values or of captured colour, whose gradients go to its coefficients, and to positions by the direction."""
+    """Values or captured colour, whose gradients go to its coefficients, and to positions by the direction."""
     made, camera = cloud(rng, 60), around(33, 25)
     colors = {name: rng.normal(0.3, 0.4, (60, *shape)).astype(np.float32) for name, shape in held.items()}
     scene = reference_scene(made, camera, **colors, antialiased=options.antialiased, depth_mode=options.depth)
