@@ -118,7 +118,7 @@ def through_the_near_plane(rng):
 @hazard
 def around_the_camera(rng):
     """The camera stands inside splats of a hundred metres; those with centres behind it are not drawn."""
-    return make(rng, rng.normal(0.0, 2.0, (16, 3)), np.exp(rng.normal(3.0, 1.0, (16, 3))), opacities=0.3)
+    return make(rng, rng.normal(0.0, 2.0, (20, 3)), np.exp(rng.normal(3.0, 1.0, (20, 3))), opacities=0.3)
 
 
 @hazard
