@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.harmonics import sh_color
+from reference.rasterizing import RasterImage
+from support.raster_clouds import set_upstream
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.gbuffer import rasterize_values
@@ -59,6 +61,17 @@ def views(*azimuths):
     for k, camera in zip(ks, cameras, strict=True):
         k[:] = [[camera.focal_x, 0, camera.center_x], [0, camera.focal_y, camera.center_y], [0, 0, 1]]
     return cameras, {"viewmats": viewmats, "Ks": torch.tensor(ks), "width": WIDTH, "height": HEIGHT}
+
+
+@pytest.fixture
+def given(place, rng):
+    return gaussians(rng, place)
+
+
+@pytest.fixture
+def where():
+    """One camera, as gsplat takes it."""
+    return views()[1]
 
 
 def xyzw(quats):
@@ -123,8 +136,7 @@ def test_images_have_the_bits_of_rasterize_values(place, rng, channels):
     np.testing.assert_array_equal(numpy_of(led[0]), expected.values)
 
 
-def test_options_reach_the_rasteriser(place, rng):
-    given = gaussians(rng, place)
+def test_options_reach_the_rasteriser(place, given):
     cameras, where = views(10.0, 200.0)
     options = RasterOptions(antialiased=True, low_pass=0.7, near=2.2, depth="exact")
     own = Rasterizer(120, cameras, value_count=3, normals=True, options=options, device=str(place))
@@ -170,8 +182,7 @@ def test_spherical_harmonics_have_the_signs_of_3dgs(place, rng, degree):
     assert (found[(degree + 1) ** 2 :] == 0.0).all()
 
 
-def test_a_batch_of_cameras_is_each_of_them(place, rng):
-    given = gaussians(rng, place)
+def test_a_batch_of_cameras_is_each_of_them(given):
     _, where = views(0.0, 90.0, 200.0)
     together = rasterization(**given, **where, render_mode="RGB+ED", return_normals=True)
     for i in range(3):
@@ -183,8 +194,7 @@ def test_a_batch_of_cameras_is_each_of_them(place, rng):
             assert torch.equal(together[2][name][i], alone[2][name][0])
 
 
-def test_background_is_seen_through_what_is_left(place, rng):
-    given = gaussians(rng, place)
+def test_background_is_seen_through_what_is_left(place, rng, given):
     _, where = views(0.0, 90.0)
     backgrounds = torch.tensor(rng.uniform(0, 1, (2, 3)), dtype=torch.float32, device=place, requires_grad=True)
     plain, alphas, _ = rasterization(**given, **where)
@@ -208,20 +218,9 @@ def test_gradients_have_the_bits_of_the_rasteriser(place, rng, bases):
     own.draw(as_arrays(given, own.device, "values" if bases is None else "radiance"))
     degree = None if bases is None else 2
     renders, alphas, meta = rasterization(**given, **where, sh_degree=degree, return_normals=True)
-    images = (renders, alphas, meta["depth"], meta["median_depth"], meta["normals"])
+    images = (alphas, meta["depth"], meta["median_depth"], renders, meta["normals"])
     upstream = [rng.normal(size=image.shape).astype(np.float32) for image in images]
-    adjoints = own.adjoints()
-    columns = [upstream[4], upstream[0]] if bases is None else [upstream[0], upstream[4]]
-    rows = np.concatenate([c.reshape(-1, c.shape[-1]) for c in columns], axis=1)
-    start = 0
-    for channels in adjoints.channels:
-        padded = np.zeros(channels.shape, np.float32)
-        part = rows[:, start : start + channels.shape[1]]
-        padded[:, : part.shape[1]] = part
-        channels.assign(padded)
-        start += channels.shape[1]
-    for target, array in zip((adjoints.alpha, adjoints.depth, adjoints.median_depth), upstream[1:4], strict=True):
-        target.assign(array.reshape(-1))
+    set_upstream(own, RasterImage(*upstream))
     expected = own.backward()
     torch.autograd.backward(images, [torch.tensor(array, device=place) for array in upstream])
     pairs = {
@@ -237,9 +236,7 @@ def test_gradients_have_the_bits_of_the_rasteriser(place, rng, bases):
         np.testing.assert_array_equal(numpy_of(given[name].grad), wanted, err_msg=name)
 
 
-def test_a_loss_leaves_nothing_for_the_next(place, rng):
-    given = gaussians(rng, place)
-    _, where = views()
+def test_a_loss_leaves_nothing_for_the_next(given, where):
 
     def images():
         renders, alphas, meta = rasterization(**given, **where, return_normals=True)
@@ -256,9 +253,7 @@ def test_a_loss_leaves_nothing_for_the_next(place, rng):
         assert_same(alone[name], gradients(given))
 
 
-def test_only_what_is_asked_for_has_a_gradient(place, rng):
-    given = gaussians(rng, place)
-    _, where = views()
+def test_only_what_is_asked_for_has_a_gradient(given, where):
     rasterization(**given, **where)[0].sum().backward()
     everything = gradients(given)
     for name in GEOMETRY:
@@ -304,9 +299,7 @@ def test_draws_between_do_not_matter(place, rng):
     assert len(gsplat._kept) == 1  # and all of it with one rasteriser
 
 
-def test_what_was_written_to_since_is_refused(place, rng):
-    given = gaussians(rng, place)
-    _, where = views()
+def test_what_was_written_to_since_is_refused(given, where):
     loss = rasterization(**given, **where)[0].sum()
     with torch.no_grad():
         given["scales"].mul_(1.1)
@@ -314,9 +307,7 @@ def test_what_was_written_to_since_is_refused(place, rng):
         loss.backward()
 
 
-def test_second_derivatives_are_refused(place, rng):
-    given = gaussians(rng, place)
-    _, where = views()
+def test_second_derivatives_are_refused(given, where):
     (found,) = torch.autograd.grad(
         rasterization(**given, **where)[0].square().sum(), given["colors"], create_graph=True
     )
@@ -324,8 +315,7 @@ def test_second_derivatives_are_refused(place, rng):
         found.sum().backward()
 
 
-def test_tensors_go_in_without_a_copy_whatever_their_rows(place, rng):
-    given = gaussians(rng, place)
+def test_tensors_go_in_without_a_copy_whatever_their_rows(place, given):
     packed = torch.cat([given["means"], given["scales"], given["opacities"][:, None], given["colors"]], dim=1).detach()
     cameras, _ = views()
     drawer = TorchRasterizer(120, cameras, value_count=3, device=place)
@@ -340,8 +330,7 @@ def test_tensors_go_in_without_a_copy_whatever_their_rows(place, rng):
         assert image is expected is None or torch.equal(image, expected)
 
 
-def test_views_share_the_rasterisers_memory(place, rng):
-    given = gaussians(rng, place)
+def test_views_share_the_rasterisers_memory(place, given):
     cameras, _ = views(0.0, 90.0)
     drawer = TorchRasterizer(120, cameras, value_count=3, device=place)
     with torch.no_grad():
@@ -355,8 +344,7 @@ def test_views_share_the_rasterisers_memory(place, rng):
     assert images.alpha.data_ptr() != rasterizer.images.alpha.ptr
 
 
-def test_a_rasteriser_is_kept_for_the_next_call_and_four_at_most(place, rng):
-    _, where = views()
+def test_a_rasteriser_is_kept_for_the_next_call_and_four_at_most(place, rng, where):
     for count in range(1, 8):
         given = gaussians(rng, place, count=count)
         rasterization(**given, **where)
@@ -371,11 +359,9 @@ def test_a_rasteriser_is_kept_for_the_next_call_and_four_at_most(place, rng):
     assert given["colors"].grad.abs().max() > 0.0
 
 
-def test_streams_of_torch_are_followed(place, rng):
+def test_streams_of_torch_are_followed(place, given, where):
     if place.type == "cpu":
         pytest.skip("streams are CUDA's")
-    given = gaussians(rng, place)
-    _, where = views()
     rasterization(**given, **where)[0].square().sum().backward()
     expected = gradients(given)
     for _ in range(3):
@@ -389,9 +375,8 @@ def test_streams_of_torch_are_followed(place, rng):
 
 
 @pytest.mark.parametrize("width", [1, 17])
-def test_few_pixels_and_no_gaussians(place, rng, width):
+def test_few_pixels_and_no_gaussians(place, rng, where, width):
     given = gaussians(rng, place, count=3)
-    _, where = views()
     renders, alphas, _ = rasterization(**given, **{**where, "width": width, "height": 1})
     assert renders.shape == (1, 1, width, 3)
     empty = {name: tensor[:0].detach().requires_grad_() for name, tensor in given.items()}
@@ -422,8 +407,7 @@ def test_few_pixels_and_no_gaussians(place, rng, width):
         ("viewmats_rs", torch.zeros(1, 4, 4)),
     ],
 )
-def test_arguments_without_a_counterpart_are_refused(rng, name, value):
-    _, where = views()
+def test_arguments_without_a_counterpart_are_refused(rng, where, name, value):
     with pytest.raises(InvalidOptionError, match=rf"^{name} must be .*, the only one that is drawn here, got .*\. \w+"):
         rasterization(**gaussians(rng, "cpu"), **where, **{name: value})
 
@@ -469,15 +453,13 @@ def test_every_refused_argument_is_tested():
         ({"extra_signals": None}, "extra_signals must be an argument of rasterization"),
     ],
 )
-def test_arguments_that_break_their_contract(rng, changes, message):
-    _, where = views()
+def test_arguments_that_break_their_contract(rng, where, changes, message):
     with pytest.raises((InvalidArrayError, InvalidOptionError), match=message):
         rasterization(**{**gaussians(rng, "cpu"), **where, **changes})
 
 
-def test_cameras_may_ask_for_a_gradient_where_none_is_taken(rng):
+def test_cameras_may_ask_for_a_gradient_where_none_is_taken(rng, where):
     given = gaussians(rng, "cpu")
-    _, where = views()
     expected = rasterization(**given, **where)[0]
     where["viewmats"].requires_grad_()
     with torch.no_grad():

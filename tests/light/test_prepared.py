@@ -1,5 +1,7 @@
 """Prepared environments: each form made once, scaling, and blurred levels against brute force."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from support.split_sum import blurred_level, sunny_environment
@@ -21,6 +23,11 @@ def blur_brute_force(environment, axis, alpha):
     return np.einsum("rc,rcx->x", weights, environment.radiance) / weights.sum()
 
 
+@cache
+def sunny_light(device):
+    return PreparedEnvironment(sunny_environment(np.random.default_rng(20260)), device=device)
+
+
 class TestBlurredLevels:
     def test_uniform_light_stays(self, device):
         lighting = PreparedEnvironment(EnvironmentMap.constant([1, 2, 0]), device=device)
@@ -29,7 +36,7 @@ class TestBlurredLevels:
             np.testing.assert_allclose(blurred_level(lighting, level)[..., :2] / [1, 2], 1, atol=500 * FLOAT32)
             assert not blurred_level(lighting, level)[..., 2].any()
 
-    @pytest.mark.parametrize("height", [4, 45, 64])
+    @pytest.mark.parametrize("height", [4, 45])
     def test_level_zero_is_the_map(self, device, rng, height):
         environment = EnvironmentMap(rng.random((height, 2 * height, 3)))
         lighting = PreparedEnvironment(environment, device=device)
@@ -37,26 +44,23 @@ class TestBlurredLevels:
 
     @pytest.mark.parametrize("level", [3, 6, 9, 12])
     def test_against_brute_force(self, device, rng, level):
-        environment = sunny_environment(rng)
-        lighting = PreparedEnvironment(environment, device=device)
+        lighting = sunny_light(device)
         blurred = blurred_level(lighting, level)
         directions = texel_directions(*blurred.shape[:2]).reshape(-1, 3)
         picked = [*rng.integers(0, len(directions), 40), blurred[..., 0].argmax()]
-        expected = [blur_brute_force(environment, directions[i], LEVEL_ROUGHNESS[level] ** 2) for i in picked]
+        expected = [blur_brute_force(lighting.environment, directions[i], LEVEL_ROUGHNESS[level] ** 2) for i in picked]
         # A cell of size c w counts as a point: the second-order term of (1 + d² / w²)^-2 is c² / 3 of the peak.
         np.testing.assert_allclose(blurred.reshape(-1, 3)[picked], expected, rtol=OPENING**2 / 3)
 
-    def test_the_mean_over_the_sphere_is_kept(self, device, rng):
-        environment = sunny_environment(rng)
-        lighting = PreparedEnvironment(environment, device=device)
+    def test_the_mean_over_the_sphere_is_kept(self, device):
+        lighting = sunny_light(device)
         for level in (8, 12):  # a symmetric, normalised kernel keeps it; these lobes are wider than a texel
             mean = EnvironmentMap(blurred_level(lighting, level)).mean_radiance()
-            np.testing.assert_allclose(mean, environment.mean_radiance(), rtol=1e-2)
+            np.testing.assert_allclose(mean, lighting.environment.mean_radiance(), rtol=1e-2)
 
-    def test_the_sun_stays_in_its_place(self, device, rng):
-        environment = sunny_environment(rng)
-        lighting = PreparedEnvironment(environment, device=device)
-        sun = environment.directions()[16, 21]
+    def test_the_sun_stays_in_its_place(self, device):
+        lighting = sunny_light(device)
+        sun = lighting.environment.directions()[16, 21]
         for level in range(1, len(LEVEL_ROUGHNESS)):
             blurred = blurred_level(lighting, level)
             height = len(blurred)
@@ -64,7 +68,7 @@ class TestBlurredLevels:
             assert np.arccos(np.clip(brightest @ sun, -1, 1)) < np.pi / height
 
     def test_same_bits_for_any_thread_count(self, monkeypatch, rng):
-        environment = sunny_environment(rng)
+        environment = sunny_environment(rng, height=32)
         results = []
         for threads in ("1", "3"):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
+from support.float32 import EPSILON
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
 
 KINDS = {"position": wp.vec3, "orientation": wp.quat, "opacity": float, "harmonics": (float, 9)}
 RATES = {"position": 1.6e-4, "orientation": 1e-3, "opacity": 0.05, "harmonics": 2.5e-3}
@@ -50,6 +48,16 @@ def values_of(adam):
     return {name: group.values.numpy().reshape(len(group.values), -1).copy() for name, group in adam.parameters.items()}
 
 
+def both_of(values, device):
+    return Adam(parameters_of(values, device)), Twin(values, RATES)
+
+
+def step_both(adam, twin, gradients, visible=None):
+    set_gradients(adam, gradients)
+    adam.step(None if visible is None else wp.array(visible, dtype=bool, device=adam.device))
+    twin.step(gradients, visible)
+
+
 class Twin:
     """Adam in float64, row by row."""
 
@@ -85,24 +93,17 @@ def assert_close(found, twin, steps):
 @pytest.mark.parametrize("count", [1, 257])
 class TestTwin:
     def test_many_steps(self, device, rng, count):
-        values = random_rows(rng, count)
-        adam, twin = Adam(parameters_of(values, device)), Twin(values, RATES)
+        adam, twin = both_of(random_rows(rng, count), device)
         for _ in range(20):
-            gradients = random_rows(rng, count)
-            set_gradients(adam, gradients)
-            adam.step()
-            twin.step(gradients)
+            step_both(adam, twin, random_rows(rng, count))
         assert_close(values_of(adam), twin, 20)
 
     def test_only_visible_rows_move(self, device, rng, count):
-        values = random_rows(rng, count)
-        adam, twin = Adam(parameters_of(values, device)), Twin(values, RATES)
+        adam, twin = both_of(random_rows(rng, count), device)
         for _ in range(10):
             gradients, visible = random_rows(rng, count), rng.uniform(size=count) < 0.4
             before = values_of(adam)
-            set_gradients(adam, gradients)
-            adam.step(wp.array(visible, dtype=bool, device=device))
-            twin.step(gradients, visible)
+            step_both(adam, twin, gradients, visible)
             for name, found in values_of(adam).items():
                 assert (found[~visible] == before[name][~visible]).all()
         assert_close(values_of(adam), twin, 10)
@@ -110,8 +111,8 @@ class TestTwin:
 
 class TestRestart:
     def test_rows_begin_again_and_the_others_go_on(self, device, rng):
-        values, marks = random_rows(rng, 257), rng.uniform(size=257) < 0.5
-        adam, twin = Adam(parameters_of(values, device)), Twin(values, RATES)
+        adam, twin = both_of(random_rows(rng, 257), device)
+        marks = rng.uniform(size=257) < 0.5
         for step in range(8):
             if step == 5:
                 adam.restart(marks)
@@ -119,10 +120,7 @@ class TestRestart:
                     for array in part.values():
                         array[marks] = 0.0
                 twin.steps[marks] = 0.0
-            gradients = random_rows(rng, 257)
-            set_gradients(adam, gradients)
-            adam.step()
-            twin.step(gradients)
+            step_both(adam, twin, random_rows(rng, 257))
         assert_close(values_of(adam), twin, 8)
 
     def test_nothing_else_changes(self, device, rng):
@@ -169,10 +167,8 @@ class TestLearningRates:
         if device == "cpu":
             pytest.skip("CUDA graphs are for CUDA")
         values, gradients = random_rows(rng, 300), random_rows(rng, 300)
-        adam, twin = Adam(parameters_of(values, device)), Twin(values, RATES)
-        set_gradients(adam, gradients)
-        adam.step()  # loads the module
-        twin.step(gradients)
+        adam, twin = both_of(values, device)
+        step_both(adam, twin, gradients)  # loads the module
         with wp.ScopedCapture(device) as capture:
             adam.step()
         for rate in (0.1, 0.02, 0.3):

@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 from reference.raster_splats import RasterScene, see
 from reference.rasterizing import decide, pair_terms
-from support.raster_clouds import around, cloud
+from support.float32 import EPSILON
+from support.raster_clouds import around, cloud, drawn
 
 from beam_warp import Camera, GaussianCloud
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
@@ -15,9 +16,6 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 
-ROUNDING = 2.0**-24
-"""Relative error of one operation in single precision."""
-
 TWIN_ERROR = 1e-5
 """Relative L2 against float64: coordinates below 64 pixels are rounded by 4e-6 twice, and the slope of alpha is at most
 exp(-1/2) / sqrt(0.3) = 1.1 per pixel, so that weights are off by at most 9e-6."""
@@ -26,14 +24,6 @@ COUNT = 200
 
 
 VIEWS = [around(), around(17, 33, 110.0), around(1, 1, 200.0), around(64, 3, 290.0)]
-
-
-def drawn(made, cameras, device, values=None, **options):
-    """A rasteriser that has drawn a cloud, with values."""
-    width = 0 if values is None else values.shape[1]
-    drawer = Rasterizer(len(made.positions), cameras, value_count=width, device=device, **options)
-    drawer.draw(upload_gaussians(made, drawer.device, values=values))
-    return drawer
 
 
 def back_projected(drawer, pixels):
@@ -67,7 +57,7 @@ def test_weights_are_those_of_drawing_to_the_last_bit(device, rng, opacity):
     made = made.with_arrays(
         positions=0.3 * made.positions, scales=3.0 * made.scales, opacities=np.full(16, opacity, np.float32)
     )
-    drawer = drawn(made, [around(20, 20)], device, np.eye(16, dtype=np.float32))
+    drawer, _ = drawn(made, [around(20, 20)], device, np.eye(16, dtype=np.float32))
     weights = drawer.images.channels[0].numpy()
     assert (weights > 0).any(axis=1).mean() > 0.5
     for start in range(0, 400, 16):
@@ -88,13 +78,13 @@ def test_against_float64(device, rng, length, antialiased):
         pixels = rng.normal(size=(camera.width * camera.height, length)).astype(np.float32)
         pixels[decisions.near_jump.ravel()] = 0.0  # where single precision may decide otherwise
         alphas, _ = pair_terms(scene, see(scene, decisions.splats), decisions)
-        total, passing = np.zeros((COUNT, length)), np.ones(len(pixels))
+        weights, passing = np.zeros((COUNT, len(pixels))), np.ones(len(pixels))
         for splat, pixel, alpha in zip(decisions.splat, decisions.pixel, alphas, strict=True):  # front to back
-            total[splat] += alpha * passing[pixel] * pixels[pixel]
+            weights[splat, pixel] = alpha * passing[pixel]
             passing[pixel] *= 1.0 - alpha
         held.append(pixels)
-        wanted.append(total)
-    found = back_projected(drawn(made, VIEWS, device, options=options), np.concatenate(held))
+        wanted.append(weights @ pixels)
+    found = back_projected(drawn(made, VIEWS, device, options=options)[0], np.concatenate(held))
     for got, want in zip(found, wanted, strict=True):
         assert np.linalg.norm(got - want) <= TWIN_ERROR * np.linalg.norm(want)
         np.testing.assert_array_equal(got[~want.any(axis=1)], 0.0)
@@ -105,7 +95,7 @@ def test_against_float64(device, rng, length, antialiased):
 def test_it_is_the_gradient_of_values(device, rng, depth):
     """`backward` finds what passes before a splat by a division for each of those behind it."""
     made, count = cloud(rng), 7
-    drawer = drawn(made, VIEWS, device, np.zeros((COUNT, count), np.float32), options=RasterOptions(depth=depth))
+    drawer, _ = drawn(made, VIEWS, device, np.zeros((COUNT, count), np.float32), options=RasterOptions(depth=depth))
     pixels = rng.normal(size=(len(drawer.images.alpha), 8)).astype(np.float32)
     drawer.adjoints().channels[0].assign(pixels)
     want = drawer.backward().values.numpy()
@@ -113,7 +103,7 @@ def test_it_is_the_gradient_of_values(device, rng, depth):
     weighed = summed(drawer, back_projected(drawer, np.abs(pixels)))[:, :count]
     assert np.abs(want).max() > 1.0
     # A product and a quotient, of up to two roundings, for each of at most all splats; two sums.
-    assert (np.abs(got - want) <= (3 * COUNT + 2 * roundings(VIEWS)) * ROUNDING * weighed).all()
+    assert (np.abs(got - want) <= (3 * COUNT + 2 * roundings(VIEWS)) * EPSILON * weighed).all()
     np.testing.assert_array_equal(drawer.backward().values.numpy(), want)  # nothing that it needs was changed
 
 
@@ -123,12 +113,12 @@ def test_bands_change_roundings_only(device, rng, monkeypatch):
     pixels = rng.normal(size=(sum(camera.width * camera.height for camera in VIEWS), 4)).astype(np.float32)
     for limit in (2**24, 300):
         monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
-        drawer = drawn(made, VIEWS, device)
+        drawer, _ = drawn(made, VIEWS, device)
         assert (len(drawer._bands) > 2) == (limit == 300)
         found.append(back_projected(drawer, pixels))
         np.testing.assert_array_equal(back_projected(drawer, pixels), found[-1])
         weighed = back_projected(drawer, np.abs(pixels))
-    assert (np.abs(found[0] - found[1]) <= 2 * roundings(VIEWS) * ROUNDING * weighed).all()
+    assert (np.abs(found[0] - found[1]) <= 2 * roundings(VIEWS) * EPSILON * weighed).all()
 
 
 def test_many_splats_on_a_tile(device, rng):
@@ -137,13 +127,13 @@ def test_many_splats_on_a_tile(device, rng):
     made = cloud(rng, count).with_arrays(
         positions=rng.uniform(-0.1, 0.1, (count, 3)), scales=np.full((count, 3), 1.0), opacities=np.full(count, 0.2)
     )
-    drawer = drawn(made, [camera], device, np.ones((count, 1), np.float32))
+    drawer, _ = drawn(made, [camera], device, np.ones((count, 1), np.float32))
     assert drawer.pair_count() == count
     assert drawer.images.alpha.numpy().max() > 1.0 - 1e-3
     found = back_projected(drawer, np.ones((256, 4)))[0]
     assert 32 < (found[:, 0] > 0.0).sum() < count  # what is behind the last stop gets nothing
     alpha = drawer.images.alpha.numpy().sum(dtype=float)
-    np.testing.assert_allclose(found.sum(axis=0, dtype=float), alpha, rtol=(count + roundings([camera])) * ROUNDING)
+    np.testing.assert_allclose(found.sum(axis=0, dtype=float), alpha, rtol=(count + roundings([camera])) * EPSILON)
 
 
 def test_what_no_view_sees_gets_nothing(device):
@@ -156,14 +146,14 @@ def test_what_no_view_sees_gets_nothing(device):
         opacities=[0.5] * 3,
     )
     pixels = np.ones((240, 4))
-    found = back_projected(drawn(made, [camera], device), pixels)
+    found = back_projected(drawn(made, [camera], device)[0], pixels)
     np.testing.assert_array_equal(found[0, [0, 2]], 0.0)
     assert (found[0, 1] > 0.1).all()
     unseen = made.with_arrays(positions=made.positions * np.float32([1, 1, -1]), opacities=np.zeros(3, np.float32))
-    drawer = drawn(unseen, [camera, camera], device)
+    drawer, _ = drawn(unseen, [camera, camera], device)
     assert drawer.pair_capacity == 0
     np.testing.assert_array_equal(back_projected(drawer, np.ones((480, 4))), np.zeros((2, 3, 4)))
-    nothing = drawn(cloud(np.random.default_rng(1), 0), [camera, camera], device)
+    nothing, _ = drawn(cloud(np.random.default_rng(1), 0), [camera, camera], device)
     assert back_projected(nothing, np.ones((480, 4))).shape == (2, 0, 4)
     assert summed(nothing, np.zeros((0, 4), np.float32)).shape == (0, 4)
 
@@ -173,7 +163,7 @@ def test_any_number_of_threads_gives_the_same_bits(rng, monkeypatch):
     found = []
     for threads in ("1", "2", "5"):
         monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-        drawer = drawn(made, [around(150, 140), around(31, 90, 80.0)], "cpu")
+        drawer, _ = drawn(made, [around(150, 140), around(31, 90, 80.0)], "cpu")
         pixels = np.random.default_rng(1).normal(size=(len(drawer.images.alpha), 8))
         rows = back_projected(drawer, pixels)
         found.append((rows, summed(drawer, rows)))
@@ -195,28 +185,26 @@ def test_sums_are_of_one_view_after_the_other(device, rng):
 def test_it_follows_redraw_and_other_rooms(device, rng):
     """Moved Gaussians, other cameras, more pairs than there is room for: the rows are those of what was drawn last."""
     made = cloud(rng)
-    drawer = Rasterizer(COUNT, [around(50, 40)], device=device)
-    arrays = upload_gaussians(made.with_arrays(scales=0.02 * made.scales), drawer.device)
+    drawer, arrays = drawn(made.with_arrays(scales=0.02 * made.scales), [around(50, 40)], device)
     pixels = rng.normal(size=(2000, 4))
-    drawer.draw(arrays)
     assert np.abs(back_projected(drawer, pixels)).max() > 0.0
     arrays.scales.assign(made.scales)
     drawer.redraw()
     assert drawer.pair_count() > drawer.pair_capacity
     assert np.isfinite(back_projected(drawer, pixels)).all()
     drawer.draw(arrays)
-    wanted = back_projected(drawn(made, [around(50, 40)], device), pixels)
-    np.testing.assert_array_equal(back_projected(drawer, pixels), wanted)
+    fresh, _ = drawn(made, [around(50, 40)], device)
+    np.testing.assert_array_equal(back_projected(drawer, pixels), back_projected(fresh, pixels))
     drawer.set_cameras([around(50, 40, 140.0)])
     drawer.redraw()
-    wanted = back_projected(drawn(made, [around(50, 40, 140.0)], device), pixels)
-    np.testing.assert_array_equal(back_projected(drawer, pixels), wanted)
+    fresh, _ = drawn(made, [around(50, 40, 140.0)], device)
+    np.testing.assert_array_equal(back_projected(drawer, pixels), back_projected(fresh, pixels))
 
 
 def test_a_frame_and_its_back_projection_are_one_graph(rng):
     if not wp.is_cuda_available():
         pytest.skip("needs a CUDA device")
-    drawer = drawn(cloud(rng), VIEWS, "cuda:0")
+    drawer, _ = drawn(cloud(rng), VIEWS, "cuda:0")
     pixels = wp.array(rng.normal(size=(len(drawer.images.alpha), 8)), dtype=float, device="cuda:0")
     out, sums = (wp.zeros((count, 8), dtype=float, device="cuda:0") for count in (len(VIEWS) * COUNT, COUNT))
     drawer.back_project(pixels, out)
@@ -267,6 +255,6 @@ def test_wrong_arrays_are_refused(rng):
 def test_arrays_of_another_device_are_refused(rng):
     if not wp.is_cuda_available():
         pytest.skip("needs a CUDA device")
-    drawer = drawn(cloud(rng), [around(8, 4)], "cuda:0")
+    drawer, _ = drawn(cloud(rng), [around(8, 4)], "cuda:0")
     with pytest.raises(InvalidArrayError, match=r"on cuda:0, got float32 .* on cpu"):
         drawer.back_project(wp.zeros((32, 4), dtype=float, device="cpu"), wp.zeros((COUNT, 4), device="cuda:0"))

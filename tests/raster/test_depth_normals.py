@@ -4,23 +4,18 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.depth_normals import depth_normals, has_normal, rays
+from support.float32 import EPSILON
+from support.kernel_runs import upload_floats as upload
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.raster.depth_normals import DepthNormals
 from beam_warp.world.camera import Camera
-
-EPSILON = 2.0**-24
-"""Largest relative rounding of a float32."""
 
 
 def camera_of(width, height, focal=80.0):
     """A camera that looks somewhere from somewhere, with a principal point off the centre."""
     seen = Camera.look_at((0.3, -2.0, 0.7), (0.0, 0.1, 0.2), width=width, height=height, vertical_fov=40.0)
     return Camera(width, height, focal, 1.1 * focal, 0.45 * width, 0.56 * height, seen.camera_to_world)
-
-
-def upload(array, device):
-    return wp.array(np.asarray(array, np.float32), dtype=float, device=device)
 
 
 def normals_of(depth, camera, device, alpha=None, **options):

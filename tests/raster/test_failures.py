@@ -66,10 +66,6 @@ class Drawn:
         return {name: getattr(found, name).numpy() for name in self.scene.arrays()}
 
 
-def draw(scene, device):
-    return Drawn(scene, device).image()
-
-
 def remoteness(scene, decisions):
     """How many images the farthest centre that counts is away: responses and depths are forms about it.
 
@@ -91,8 +87,8 @@ def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
     clear = ~decisions.near_jump
     assert clear.mean() > 0.9
     upstream = random_upstream(rng, scene, decisions)
-    image, wanted = replay(scene, decisions), gradients(scene, upstream, decisions)
-    wanted |= {name: getattr(image, name)[clear] for name in OUTPUTS}
+    truth, wanted = replay(scene, decisions), gradients(scene, upstream, decisions)
+    wanted |= {name: getattr(truth, name)[clear] for name in OUTPUTS}
     spread = dict.fromkeys(wanted, 0.0)
     for _ in range(3):
         other = rounded(rng, scene)
@@ -108,7 +104,7 @@ def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
         assert np.isfinite(got[key]).all(), key
         limit = factor * (spread[key] + rounding * np.linalg.norm(array))
         assert np.linalg.norm(got[key] - array) <= limit, key
-    np.testing.assert_array_equal(image.last[clear], replay(scene, decisions).last[clear])
+    np.testing.assert_array_equal(image.last[clear], truth.last[clear])
 
 
 @pytest.mark.parametrize("name", INVISIBLE)
@@ -187,7 +183,7 @@ def test_images_of_every_shape(device, rng, width, height):
     scene = make(rng, positions, np.exp(rng.normal(-2.5, 0.5, (80, 3))), camera=camera)
     decisions = decide(scene)
     clear = ~decisions.near_jump
-    got, want = draw(scene, device), replay(scene, decisions)
+    got, want = Drawn(scene, device).image(), replay(scene, decisions)
     for output in ("alpha", "channels"):
         # A pixel coordinate below 80 is rounded by 4e-6 twice, and a response changes by at most 1.1 per pixel.
         np.testing.assert_allclose(getattr(got, output)[clear], getattr(want, output)[clear], atol=1e-5)
@@ -203,31 +199,27 @@ def test_every_camera_of_a_batch_sees_what_it_sees_alone(device, rng):
         *(upload(a, kind, device) for a, kind in zip(arrays, (wp.vec3, wp.quat, wp.vec3, float), strict=True)),
         upload(scene.values.astype(np.float32), float, device),
     )
-    together = Rasterizer(len(arrays[0]), cameras, value_count=3, normals=True, device=device)
-    images = together.draw(gaussians)
-    adjoints = together.adjoints()
-    upstream = {
-        "alpha": rng.normal(size=together.first_pixels[-1]).astype(np.float32),
-        "channels": rng.normal(size=images.channels[0].shape).astype(np.float32),
-    }
-    adjoints.alpha.assign(upstream["alpha"])
-    adjoints.channels[0].assign(upstream["channels"])
-    total = {name: getattr(together.backward(), name).numpy().astype(np.float64) for name in scene.arrays()}
+    edges = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+    to_alpha, to_channels = (rng.normal(size=(edges[-1], k)).astype(np.float32) for k in (1, 16))
+
+    def seen(cameras, part):
+        """Images, and gradients of the part of the loss that is theirs."""
+        drawer = Rasterizer(len(arrays[0]), cameras, value_count=3, normals=True, device=device)
+        images, adjoints = drawer.draw(gaussians), drawer.adjoints()
+        adjoints.alpha.assign(to_alpha[part, 0])
+        adjoints.channels[0].assign(np.ascontiguousarray(to_channels[part, : images.channels[0].shape[1]]))
+        shown = (images.alpha, images.depth, images.median_depth, images.channels[0], drawer.gaussian_ids)
+        found = drawer.backward()
+        gradients = {name: getattr(found, name).numpy().astype(np.float64) for name in scene.arrays()}
+        return [array.numpy() for array in shown], gradients
+
+    together, total = seen(cameras, slice(None))
     size = dict.fromkeys(total, 0.0)
-    for i, camera in enumerate(cameras):
-        part = slice(*together.first_pixels[i : i + 2])
-        alone = Rasterizer(len(arrays[0]), [camera], value_count=3, normals=True, device=device)
-        image = alone.draw(gaussians)
-        for name in ("alpha", "depth", "median_depth"):
-            np.testing.assert_array_equal(getattr(images, name).numpy()[part], getattr(image, name).numpy())
-        np.testing.assert_array_equal(images.channels[0].numpy()[part], image.channels[0].numpy())
-        np.testing.assert_array_equal(together.gaussian_ids.numpy()[part], alone.gaussian_ids.numpy())
-        adjoints = alone.adjoints()
-        adjoints.alpha.assign(upstream["alpha"][part])
-        adjoints.channels[0].assign(upstream["channels"][part])
-        found = alone.backward()
-        for name in total:
-            array = getattr(found, name).numpy().astype(np.float64)
+    for camera, part in zip(cameras, map(slice, edges[:-1], edges[1:]), strict=True):
+        alone, found = seen([camera], part)
+        for image, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(image[part], one)
+        for name, array in found.items():
             total[name] -= array
             size[name] += np.abs(array).max()
     for name, rest in total.items():

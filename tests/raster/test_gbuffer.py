@@ -6,6 +6,7 @@ from reference import rasterizing as reference
 from reference.harmonics import sh_color
 from support.raster_clouds import around
 from support.raster_clouds import cloud as make_cloud
+from support.shapes import aligned
 
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.raster.channels import MATERIAL_CHANNELS
@@ -20,18 +21,6 @@ exp(-1/2) / sqrt(0.3) = 1.1 per pixel, since no splat is narrower than the low-p
 
 DEPTH_ROUNDING = 1e-6
 """Relative: eight single-precision operations on a depth, 6e-8 each."""
-
-
-def still(positions, scales, opacities, **more):
-    """Gaussians whose axes are the world's."""
-    count = len(positions)
-    return GaussianCloud(
-        positions=positions,
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-        scales=np.broadcast_to(scales, (count, 3)),
-        opacities=np.broadcast_to(opacities, (count,)),
-        **more,
-    )
 
 
 def sums(images):
@@ -81,14 +70,14 @@ def test_what_is_not_in_view_is_not_drawn(device, rng):
     assert not buffer.depth.any()
     assert buffer.channels["base_color"].shape == (40, 40, 3)
     for position in ([0, -3, 0], [0, -2, 0], [0, -1.995, 0], [50, 0, 0], [0, 0, -50]):
-        assert not rasterize(still([position], 0.1, 1.0), camera, channels=(), device=device).alpha.any(), position
-    assert not rasterize(still([[0, 0, 0]], 0.1, 0.003), camera, channels=(), device=device).alpha.any()
+        assert not rasterize(aligned([position], 1.0, 0.1), camera, channels=(), device=device).alpha.any(), position
+    assert not rasterize(aligned([[0, 0, 0]], 0.003, 0.1), camera, channels=(), device=device).alpha.any()
 
 
 def test_extreme_gaussians_stay_finite(device, rng):
     positions = [[0, 0, 0], [1e30, 1e30, 1e30], [0, -1.98, 0], [0, 1e6, 0], [0.0, 0.5, 0.0], [3, -1.98, 0.0]]
     scales = [[1e-30, 1e-30, 1e-30], [1e20, 1e20, 1e20], [5, 5, 5], [1e15, 1, 1e15], [1e4, 0, 0], [10, 1e-6, 1]]
-    cloud = still(np.asarray(positions, float), np.asarray(scales, float), 0.9)
+    cloud = aligned(np.asarray(positions, float), 0.9, np.asarray(scales, float))
     for antialiased in (False, True):
         options = RasterOptions(antialiased=antialiased)
         for array in rasterize_values(cloud, front(), np.ones((6, 2)), device=device, options=options):
@@ -135,7 +124,7 @@ def test_more_channels_than_one_pass(device, rng):
 def test_radiance_is_seen_from_the_camera(device, rng):
     camera = around()
     radiance = rng.normal(0, 0.3, (1, 16, 3))
-    cloud = still([[0.1, 0.0, 0.1]], 0.2, 0.9, radiance=radiance, radiance_color_space="srgb_rec709_display")
+    cloud = aligned([[0.1, 0.0, 0.1]], 0.9, 0.2, radiance=radiance, radiance_color_space="srgb_rec709_display")
     direction = cloud.positions - camera.position
     expected = sh_color(radiance, direction / np.linalg.norm(direction))[0]
     buffer = rasterize(cloud, camera, channels=("radiance",), device=device)

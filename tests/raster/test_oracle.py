@@ -7,7 +7,8 @@ import pytest
 from reference.raster_differences import gradients, random_upstream
 from reference.raster_splats import RasterScene, harmonics, rotations
 from reference.rasterizing import RasterImage, decide, draw, pixel_centers, replay
-from support.raster_hazards import HAZARDS
+from support.raster_clouds import around
+from support.raster_hazards import HAZARDS, ahead
 
 from beam_warp.world.camera import Camera
 from beam_warp.world.harmonics import sh_basis
@@ -29,13 +30,7 @@ STEPS = {
 UP = [0.0, 0.0, 0.0, 1.0]
 
 
-def ahead(width=16, height=12, focal=20.0):
-    """A camera at the origin, its axes those of the world."""
-    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(4))
-
-
-def around(size):
-    return Camera.orbit((0, 0, 0), 2.5, 20.0, 10.0, width=size, height=size, vertical_fov=50.0)
+SMALL = ahead(16, 12, 20.0)
 
 
 def thinness(scene):
@@ -51,7 +46,7 @@ def make_scene(rng, count, size, **changes):
         "orientations": rng.normal(size=(count, 4)),
         "scales": np.exp(rng.normal(-2.5, 0.7, (count, 3))),
         "opacities": rng.uniform(0.05, 1.0, count),
-        "camera": around(size),
+        "camera": around(size, size),
         "values": rng.uniform(size=(count, 2)),
         "radiance": rng.normal(0.0, 0.3, (count, 16, 3)),
     }
@@ -70,7 +65,7 @@ def offsets(camera):
 
 @pytest.mark.parametrize("depth_mode", ["plane", "exact"])
 def test_a_ball_on_the_axis_is_its_closed_form(depth_mode):
-    camera, z, scale, opacity = ahead(), 2.0, 0.3, 0.7
+    camera, z, scale, opacity = SMALL, 2.0, 0.3, 0.7
     scene = RasterScene([[0, 0, z]], [UP], [[scale] * 3], [opacity], camera, values=[[3.0]], depth_mode=depth_mode)
     image = draw(scene)
     square = (offsets(camera) ** 2).sum(-1)
@@ -88,7 +83,7 @@ def test_a_ball_on_the_axis_is_its_closed_form(depth_mode):
 
 
 def test_antialiasing_keeps_the_total():
-    camera = ahead()
+    camera = SMALL
     scene = RasterScene([[0, 0, 2.0]], [UP], [[0.02] * 3], [0.9], camera, antialiased=True)
     sharp = (20.0 * 0.02 / 2.0) ** 2
     alpha = 0.9 * sharp / (sharp + 0.3) * np.exp(-200.0 * (offsets(camera) ** 2).sum(-1) / (sharp + 0.3))
@@ -123,7 +118,7 @@ def test_the_median_is_the_last_with_more_than_half_before_it(first, median):
 
 
 def test_what_is_not_seen():
-    camera = ahead()
+    camera = SMALL
     image = draw(
         RasterScene(
             [[0, 0, -1.0], [0, 0, 0.009]], [UP] * 2, [[0.1] * 3] * 2, [1.0, 1.0], camera, values=np.ones((2, 1))
@@ -172,7 +167,7 @@ def random_gaussian(rng):
 
 def test_exact_depth_is_where_the_response_is_largest(rng):
     """Against bisection on the response itself, a parabola on the ray: its rise across t is zero at its top."""
-    camera, worst, compared = ahead(), 0.0, 0
+    camera, worst, compared = SMALL, 0.0, 0
     for _ in range(60):
         position, orientation, scales = random_gaussian(rng)
         scene = RasterScene(position, orientation, scales, [0.9], camera, depth_mode="exact")
@@ -210,7 +205,7 @@ def test_radiance_is_seen_from_the_camera_and_clamped():
     radiance = np.zeros((1, 4, 3))
     radiance[0, 0] = [1.0, 0.0, -3.0]
     radiance[0, 2] = 0.5  # grows along z
-    scene = RasterScene([[0, 0, 2.0]], [UP], [[0.3] * 3], [0.8], ahead(), values=[[7.0]], radiance=radiance)
+    scene = RasterScene([[0, 0, 2.0]], [UP], [[0.3] * 3], [0.8], SMALL, values=[[7.0]], radiance=radiance)
     image = draw(scene)
     first, along_z = np.sqrt(0.25 / np.pi), np.sqrt(0.75 / np.pi)
     expected = [7.0, 0.5 + first + 0.5 * along_z, 0.5 + 0.5 * along_z, 0.0]
@@ -220,7 +215,7 @@ def test_radiance_is_seen_from_the_camera_and_clamped():
 def test_gradients_of_a_ball_by_hand():
     """Every derivative of alpha, expected depth, median, one value and the normals of one ball on the axis."""
     rng = np.random.default_rng(5)
-    camera, f, z, s, o, v = ahead(), 20.0, 2.0, 0.3, 0.7, 3.0
+    camera, f, z, s, o, v = SMALL, 20.0, 2.0, 0.3, 0.7, 3.0
     scene = RasterScene([[0, 0, z]], [2 * np.array(UP)], [[s] * 3], [o], camera, values=[[v]])
     upstream = random_upstream(rng, scene, decide(scene))
     got = gradients(scene, upstream)
@@ -291,7 +286,7 @@ def test_depth_clamped_at_an_end_moves_with_the_splat(rng, end):
         orientations=[[0, np.sin(half), 0, np.cos(half)]],
         scales=[[0.05, 0.2, 1e-4]],
         opacities=[0.9],
-        camera=ahead(33, 1, focal=40.0),
+        camera=ahead(33, 1, 40.0),
         low_pass=40.0,
     )
     decisions = decide(scene)

@@ -8,7 +8,7 @@ moved at once, and each splat's pixels are composited again with every other spl
 from dataclasses import replace
 
 import numpy as np
-from reference.raster_splats import see
+from reference.raster_splats import dot, see
 from reference.rasterizing import RasterImage, decide, pair_terms, replay
 
 STEP = 1e-20
@@ -89,8 +89,7 @@ class FrozenPairs:
     def _linear(self, splats):
         """What one unit of weight of each pair adds to L through the outputs that are plain sums."""
         i = self.decisions.splat
-        of_channels = (self.to_channels * splats.channels[i]).sum(axis=1)
-        return self.to_alpha + of_channels + (self.to_normals * splats.normal[i]).sum(axis=1)
+        return self.to_alpha + dot(self.to_channels, splats.channels[i]) + dot(self.to_normals, splats.normal[i])
 
     def _before(self, alpha):
         """Transmittance before each pair."""

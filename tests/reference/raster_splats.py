@@ -145,7 +145,7 @@ def shifted_color(scene, visible):
 def response(splats, i, pixels):
     """Alpha before its cap; ``i`` is one splat or one for each pixel."""
     offset = pixels - splats.center[i]
-    square = (offset[..., :, None] * splats.conic[i] * offset[..., None, :]).sum(axis=(-1, -2))
+    square = np.einsum("...i,...ij,...j->...", offset, splats.conic[i], offset)
     return splats.opacity[i] * np.exp(-0.5 * square)
 
 
@@ -155,10 +155,10 @@ def ray_forms(scene, splats, i, pixels):
     The plane through the centre with normal A c has inverse depth l / z on r.
     """
     r = np.concatenate([(pixels - scene.middle) / scene.focal, np.ones((len(pixels), 1))], axis=1)
-    white_r = (splats.whitening[i] * r[:, None, :]).sum(axis=-1)
-    white_c = (splats.whitening[i] * splats.ray[i][..., None, :]).sum(axis=-1)
-    facing = (white_c * white_c).sum(axis=-1)
-    return (white_r * white_c).sum(axis=-1) / facing, (white_r * white_r).sum(axis=-1) / facing
+    white_r = np.einsum("...ij,...j->...i", splats.whitening[i], r)
+    white_c = np.einsum("...ij,...j->...i", splats.whitening, splats.ray)[i]
+    facing = dot(white_c, white_c)
+    return dot(white_r, white_c) / facing, dot(white_r, white_r) / facing
 
 
 def inverse_depth(scene, splats, i, forms, behind):
@@ -170,8 +170,12 @@ def inverse_depth(scene, splats, i, forms, behind):
     return (ahead + (square - along * along) / ahead) / splats.depth[i]
 
 
+def dot(some, others):
+    return np.einsum("...i,...i->...", some, others)
+
+
 def length(vectors):
-    return np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    return np.sqrt(dot(vectors, vectors))[..., None]
 
 
 def rotations(orientations):

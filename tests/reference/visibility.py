@@ -15,7 +15,7 @@ class FrozenVisibility:
     """Rays through a cloud.
 
     Attributes:
-        counts: Whether a Gaussian acts on a ray, ``(R, N)``.
+        rays, rows: The ray and the Gaussian of every pair that counts, ``(P,)``.
         near_tie: Rays on which float32 may decide otherwise, ``(R,)``.
     """
 
@@ -30,41 +30,42 @@ class FrozenVisibility:
             "directions": np.asarray(directions, np.float64),
         }
         reach = np.broadcast_to(np.asarray(t_max, np.float64), len(origins))[:, None]
-        alpha, t, chord = self._terms(self.parameters)
+        alpha, t, chord = self._terms(self.parameters, *np.ogrid[: len(origins), : len(cloud)])
         start = t - chord if front == "entry" else t
-        self.counts = (alpha >= ALPHA_MIN) & (start > 0.0) & (t < reach)
+        counts = (alpha >= ALPHA_MIN) & (start > 0.0) & (t < reach)
         ties = (np.abs(start) < 1e-3) | (np.abs(t - reach) < 1e-3) | (np.abs(alpha - ALPHA_MAX) < 1e-4)
         if cull:
             facing = self.parameters["directions"] @ cloud.normals.T.astype(np.float64)
-            self.counts &= facing <= 0.0
+            counts &= facing <= 0.0
             ties |= np.abs(facing) < 1e-5
         ties &= alpha > 0.9 * ALPHA_MIN
+        self.rays, self.rows = np.nonzero(counts)
         self.near_tie = (ties | (np.abs(alpha / ALPHA_MIN - 1.0) < 1e-2)).any(axis=1)
 
-    def _terms(self, parameters):
-        """Alpha before its cap, its place t, and half the chord of the support, each ``(R, N)``."""
-        whitening = np.swapaxes(rotation_matrices(parameters["orientations"]), 1, 2) / parameters["scales"][:, :, None]
-        p = np.einsum(
-            "nij,rnj->rni", whitening, parameters["origins"][:, None] - parameters["positions"][None], optimize=True
-        )
-        v = np.einsum("nij,rj->rni", whitening, parameters["directions"], optimize=True)
+    def _terms(self, parameters, rays, rows):
+        """Alpha before its cap, its place t, and half the chord of the support of every pair."""
+        turned = np.swapaxes(rotation_matrices(parameters["orientations"]), 1, 2)
+        whitening = (turned / parameters["scales"][:, :, None])[rows]
+        p = np.einsum("...ij,...j->...i", whitening, parameters["origins"][rays] - parameters["positions"][rows])
+        v = np.einsum("...ij,...j->...i", whitening, parameters["directions"][rays])
         vv = (v * v).sum(-1)
         t = -(p * v).sum(-1) / vv
         closest = p + t[..., None] * v
         distance = (closest * closest).sum(-1)
         exponent = -0.5 * distance if self.degree == 2 else -(distance**2) / 18.0
-        support = np.log(np.maximum(255.0 * parameters["opacities"], 1.0))
+        opacities = parameters["opacities"][rows]
+        support = np.log(np.maximum(255.0 * opacities, 1.0))
         support = 2.0 * support if self.degree == 2 else np.sqrt(18.0 * support)
         chord = np.sqrt(np.maximum(support - distance, 0.0) / vv)
-        return parameters["opacities"] * np.exp(exponent), t, chord
+        return opacities * np.exp(exponent), t, chord
 
     def passed(self, **changed):
-        """1 - alpha where a Gaussian counts, else 1, ``(R, N)``."""
-        alpha, _, _ = self._terms({**self.parameters, **changed})
-        return np.where(self.counts, 1.0 - np.minimum(ALPHA_MAX, alpha), 1.0)
+        """1 - alpha of every pair that counts, ``(P,)``."""
+        alpha, _, _ = self._terms({**self.parameters, **changed}, self.rays, self.rows)
+        return 1.0 - np.minimum(ALPHA_MAX, alpha)
 
     def visibility(self, **changed):
-        return self.passed(**changed).prod(axis=1)
+        return np.exp(np.bincount(self.rays, np.log(self.passed(**changed)), len(self.near_tie)))
 
     def gradients(self, adjoints):
         """Central differences of sum of adjoint V with respect to every array.
@@ -72,7 +73,7 @@ class FrozenVisibility:
         A Gaussian's parameters change its own factor only, so one parameter of all Gaussians is moved at once, and of
         all rays likewise.
         """
-        without = self.visibility()[:, None] / self.passed()  # V without each Gaussian
+        without = (adjoints * self.visibility())[self.rays] / self.passed()  # adjoint V without each Gaussian
         result = {}
         for name, value in self.parameters.items():
             gradient = np.zeros_like(value)
@@ -87,7 +88,7 @@ class FrozenVisibility:
                     if of_rays:
                         moved.append(adjoints * self.visibility(**{name: other}))
                     else:
-                        moved.append(adjoints @ (without * self.passed(**{name: other})))
+                        moved.append(np.bincount(self.rows, without * self.passed(**{name: other}), len(value)))
                 gradient[column] = (moved[0] - moved[1]) / (2.0 * step)
             result[name] = gradient
         return result

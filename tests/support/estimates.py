@@ -13,6 +13,15 @@ def rms(errors):
     return np.sqrt(np.mean(np.asarray(errors, dtype=np.float64) ** 2))
 
 
+def require_density(counts, mass, least=20.0):
+    """Draws fall into cells as often as their mass says; cells that expect fewer than ``least`` count as one."""
+    counts, expected = np.ravel(counts), np.ravel(mass) * np.sum(counts)
+    large = expected > least
+    observed = np.append(counts[large], counts[~large].sum())
+    wanted = np.append(expected[large], expected[~large].sum())
+    assert stats.chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > SIGNIFICANCE
+
+
 def by_point(values):
     """Mean over all axes but the first: channels of a point see the same rays and count once."""
     return np.asarray(values, dtype=np.float64).reshape(len(values), -1).mean(axis=1)

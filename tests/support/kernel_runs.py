@@ -1,8 +1,13 @@
 """Kernels that tests write around device functions, run from NumPy to NumPy."""
 
+import numpy as np
 import warp as wp
 
 from beam_warp.device.arrays import upload
+
+
+def upload_floats(array, device):
+    return upload(np.float32(array), float, device)
 
 
 def run_kernel(kernel, shape, inputs, types, device):

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -19,6 +21,15 @@ def cloud(rng, count=200, **more):
         opacities=rng.uniform(0.05, 0.95, count),
         **more,
     )
+
+
+def drawn(made, cameras, device, values=None, **options):
+    """A rasteriser that has drawn a cloud, with values, and the arrays that it drew."""
+    width = 0 if values is None else values.shape[1]
+    drawer = Rasterizer(len(made), cameras, value_count=width, device=device, **options)
+    arrays = upload_gaussians(made, drawer.device, values=values)
+    drawer.draw(arrays)
+    return drawer, arrays
 
 
 def set_upstream(drawer, upstream):

@@ -156,23 +156,23 @@ def below_a_pixel(rng):
 @hazard
 def at_one_depth(rng):
     """Bit for bit: drawn in the order of their rows."""
-    positions = in_view(rng, 40, reach=0.2)
+    positions = in_view(rng, 20, reach=0.2)
     positions[:, 2] = 2.0
-    return make(rng, positions, np.exp(rng.normal(-2.0, 0.3, (40, 3))))
+    return make(rng, positions, np.exp(rng.normal(-2.0, 0.3, (20, 3))))
 
 
 @hazard
 def copies(rng):
-    """The same splat forty times with other values."""
+    """The same splat twenty times with other values."""
     one = rng.normal(size=4)
-    turns = np.tile(one / np.linalg.norm(one), (40, 1))
-    return make(rng, np.tile([[0.05, -0.03, 2.0]], (40, 1)), [0.3, 0.2, 0.1], 0.2, turns)
+    turns = np.tile(one / np.linalg.norm(one), (20, 1))
+    return make(rng, np.tile([[0.05, -0.03, 2.0]], (20, 1)), [0.3, 0.2, 0.1], 0.2, turns)
 
 
 @hazard
 def opaque(rng):
     """Opacity 1: capped at 0.99, and two of them end a pixel."""
-    return make(rng, in_view(rng, 40), np.exp(rng.normal(-2.0, 0.5, (40, 3))), opacities=1.0)
+    return make(rng, in_view(rng, 25), np.exp(rng.normal(-2.0, 0.5, (25, 3))), opacities=1.0)
 
 
 @hazard
@@ -190,7 +190,7 @@ def balls(rng):
 @hazard
 def many_layers(rng):
     """Two hundred wide faint ones: no pixel stops, and rounding adds up."""
-    return make(rng, in_view(rng, 200, reach=0.1), [0.9, 1.0, 1.1], opacities=0.02, camera=ahead(13, 9))
+    return make(rng, in_view(rng, 200, reach=0.1), [0.9, 1.0, 1.1], opacities=0.02, camera=ahead(9, 5))
 
 
 @hazard

@@ -78,6 +78,13 @@ def aligned(positions, opacities=0.5, scales=0.1, **fields):
     )
 
 
+def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), orientation=(0.0, 0.0, 0.0, 1.0), **fields):
+    """A Gaussian at the origin."""
+    return GaussianCloud(
+        positions=[[0, 0, 0]], orientations=[orientation], scales=[scales], opacities=[opacity], **fields
+    )
+
+
 def along_x(y=0.0, z=0.0, x=-2.0, count=1):
     """Origins and directions of equal rays along +x."""
     return np.tile([[x, y, z]], (count, 1)), np.tile([[1.0, 0.0, 0.0]], (count, 1))

@@ -60,7 +60,8 @@ def test_the_mean_over_seeds_is_the_product(device, options, rng):
     require_chi_square(np.sum(z**2), between.sum())
 
 
-@pytest.mark.parametrize("opacities", [(0.5,), (0.5, 0.5), (0.1, 0.2, 0.3), (0.3,) * 5, (1 / 250,) * 100], ids=len)
+@pytest.mark.parametrize("options", ["batch", "entry"], indirect=True)
+@pytest.mark.parametrize("opacities", [(0.5,), (0.1, 0.2, 0.3), (1 / 250,) * 100], ids=len)
 def test_equal_rays_draw_independently(device, options, opacities):
     """A batch of one ray, many times: the mean is the product, which tells Gaussians that draw alike from others."""
     count = 20_000

@@ -11,6 +11,7 @@ from beam_warp.trace import denoise as denoising
 from beam_warp.trace.denoise import DENOISERS, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
 
 WIDTH, HEIGHT = 72, 60
+BESIDE = slice(WIDTH // 2 - 1, WIDTH // 2 + 1)
 
 FILTERS = ("oidn", "bilateral")
 
@@ -92,12 +93,11 @@ class TestFilters:
         truth = np.where(wall.right, 0.8, 0.3)[None].repeat(HEIGHT, axis=0)
         noisy = np.clip(truth + 0.07 * rng.normal(size=truth.shape), 0.0, 1.0)
         found = wall.denoised(noisy, 0.07, denoiser)
-        beside = slice(WIDTH // 2 - 1, WIDTH // 2 + 1)
         assert psnr(found, truth) > psnr(noisy, truth) + 6.0
         # The step of 0.5 is there in full right at the edge: the mean of a column has a noise of 0.07 / sqrt(60). The
         # network takes off up to a sixth of it in the last column.
         allowed = 0.03 if denoiser == "bilateral" else 0.1
-        np.testing.assert_allclose(found[:, beside].mean(axis=0), [0.3, 0.8], atol=allowed)
+        np.testing.assert_allclose(found[:, BESIDE].mean(axis=0), [0.3, 0.8], atol=allowed)
 
     def test_background_neither_gives_nor_takes(self, device, denoiser, rng):
         wall = Wall(device, hole=HEIGHT // 2)
@@ -135,8 +135,7 @@ class TestBilateral:
         truth = np.where(wall.right, 0.9, 0.4)[None].repeat(HEIGHT, axis=0)
         noisy = truth + 0.05 * rng.normal(size=truth.shape)
         found = wall.denoised(noisy, 0.05, "bilateral")
-        beside = slice(WIDTH // 2 - 1, WIDTH // 2 + 1)
-        np.testing.assert_allclose(found[:, beside].mean(axis=0), [0.4, 0.9], atol=0.1)
+        np.testing.assert_allclose(found[:, BESIDE].mean(axis=0), [0.4, 0.9], atol=0.1)
         assert psnr(found, truth) > psnr(noisy, truth) + 5.0
 
     @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 9), (33, 1), (5, 65)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.closest_surface import closest_surface_reference
+from scipy.spatial.transform import Rotation
 from support.shapes import aligned, along_x, random_cloud, random_rays, unit
 
 from beam_warp import Scene, visibility
@@ -27,6 +28,19 @@ def blend(alphas, values):
     return weights @ np.asarray(values) / weights.sum()
 
 
+def seen_along_x(cloud, device, **options):
+    return closest_surface(Scene.from_gaussians(cloud, device), *along_x(), **options)
+
+
+def oracle_of(scene, cloud, rays, **options):
+    return closest_surface_reference(traced_cloud(cloud, scene), *rays, middle=scene.origin, **options)
+
+
+def three_in_a_row():
+    """Not in the order of their rows."""
+    return aligned([[2, 0, 0], [0, 0, 0], [1, 0, 0]], [0.3, 0.1, 0.6])
+
+
 class TestClosedForm:
     @pytest.mark.parametrize(("y", "z"), [(0.0, 0.0), (0.1, 0.0), (0.15, -0.3)])
     def test_one_gaussian(self, device, y, z):
@@ -46,10 +60,7 @@ class TestClosedForm:
 
     def test_normal_of_a_turned_gaussian(self, device, rng):
         """R S^-1 y, against the gradient of the squared whitened distance at the entry."""
-        q = rng.normal(size=(1, 4))
-        q /= np.linalg.norm(q)
-        scales = np.array([0.3, 0.1, 0.02])
-        cloud = aligned([[0, 0, 0]], 0.9, scales).with_arrays(orientations=q)
+        cloud = aligned([[0, 0, 0]], 0.9, (0.3, 0.1, 0.02)).with_arrays(orientations=unit(rng.normal(size=(1, 4))))
         origin, direction = along_x(0.01, 0.02)
         whitening = rotation_matrices(cloud.orientations)[0].T / cloud.scales[0].astype(float)[:, None]
         a, b = whitening @ origin[0], whitening @ direction[0]
@@ -62,10 +73,8 @@ class TestClosedForm:
         assert np.linalg.norm(hit.normals - truth.normals) <= truth.normal_error[0] < 1e-3
 
     def test_three_on_a_ray(self, device):
-        cloud = aligned([[2, 0, 0], [0, 0, 0], [1, 0, 0]], [0.3, 0.1, 0.6])  # not in order
-        colors = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-        scene = Scene.from_gaussians(cloud, device)
-        hit = closest_surface(scene, *along_x(), attributes=colors)
+        colors = np.eye(3)
+        hit = seen_along_x(three_in_a_row(), device, attributes=colors)
         alphas, order = [0.1, 0.6, 0.3], [1, 2, 0]
         assert hit.transmittance == pytest.approx(0.9 * 0.4 * 0.7, abs=1e-6)
         assert hit.attributes[0] == pytest.approx(blend(alphas, colors[order]), abs=1e-6)
@@ -76,31 +85,27 @@ class TestClosedForm:
 
     @pytest.mark.parametrize(("threshold", "row"), [(1.0, 1), (0.91, 1), (0.89, 2), (0.37, 2), (0.35, 0), (0.26, 0)])
     def test_threshold(self, device, threshold, row):
-        scene = Scene.from_gaussians(aligned([[2, 0, 0], [0, 0, 0], [1, 0, 0]], [0.3, 0.1, 0.6]), device)
-        hit = closest_surface(scene, *along_x(), threshold=threshold)
+        hit = seen_along_x(three_in_a_row(), device, threshold=threshold)
         assert (hit.gaussians[0], hit.depth[0]) == (row, pytest.approx([4.0, 2.0, 3.0][row], abs=1e-6))
 
     def test_threshold_that_is_not_met(self, device):
-        scene = Scene.from_gaussians(aligned([[2, 0, 0]], 0.3), device)
-        hit = closest_surface(scene, *along_x(), threshold=0.5)
+        hit = seen_along_x(aligned([[2, 0, 0]], 0.3), device, threshold=0.5)
         assert (hit.gaussians[0], hit.depth[0], hit.hit_counts[0]) == (-1, np.inf, 1)
         assert hit.expected_depth == pytest.approx(4.0, abs=1e-6)
 
     def test_reach_ends_before_peaks(self, device):
         scene = Scene.from_gaussians(aligned([[0, 0, 0], [1, 0, 0]], [0.3, 0.4]), device)
-        hit = closest_surface(scene, np.tile(along_x()[0], (3, 1)), np.tile(along_x()[1], (3, 1)), t_max=[1.9, 2.5, 9])
+        hit = closest_surface(scene, *along_x(count=3), t_max=[1.9, 2.5, 9])
         assert hit.hit_counts.tolist() == [0, 1, 2]
         assert hit.transmittance == pytest.approx([1.0, 0.7, 0.42], abs=1e-6)
 
     def test_blending_ends_below_the_stop(self, device):
-        scene = Scene.from_gaussians(aligned(np.arange(9)[:, None] * [1.0, 0, 0], 0.5), device)
-        hit = closest_surface(scene, *along_x(), options=TraceOptions(stop=0.2))
+        hit = seen_along_x(aligned(np.arange(9)[:, None] * [1.0, 0, 0], 0.5), device, options=TraceOptions(stop=0.2))
         assert (hit.hit_counts[0], hit.transmittance[0]) == (3, pytest.approx(0.125, abs=1e-6))
 
     def test_nothing_to_see(self, device):
         for cloud in (aligned(np.zeros((0, 3)), []), aligned([[0, 5, 0]], 0.5), aligned([[0, 0, 0]], 0.0)):
-            scene = Scene.from_gaussians(cloud, device)
-            hit = closest_surface(scene, *along_x(), attributes=np.ones((len(cloud), 2)))
+            hit = seen_along_x(cloud, device, attributes=np.ones((len(cloud), 2)))
             assert (hit.depth[0], hit.expected_depth[0], hit.transmittance[0]) == (np.inf, np.inf, 1.0)
             assert (hit.gaussians[0], hit.hit_counts[0]) == (-1, 0)
             assert not hit.normals.any()
@@ -121,8 +126,7 @@ class TestClosedForm:
         y = rng.normal(size=(count, 3))
         y /= np.linalg.norm(y, axis=1, keepdims=True)
         edge = cloud.positions + (np.sqrt(2.0 * np.log(255.0 * 0.8)) * y * scales) @ rotation.T
-        d = np.cross((y / scales) @ rotation.T, rng.normal(size=(count, 3)))
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        d = unit(np.cross((y / scales) @ rotation.T, rng.normal(size=(count, 3))))
         hit = closest_surface(Scene.from_gaussians(cloud, device), edge - d, d, attributes=[[1.0]])
         met = hit.hit_counts > 0
         assert 0.1 < met.mean() < 0.9
@@ -152,8 +156,9 @@ def require_agreement(hit, truth, least_decided):
 
 
 class TestAgainstBruteForce:
-    @pytest.mark.parametrize("channels", [0, 1, 5])
-    @pytest.mark.parametrize("scale", [(-3.5, 0.8), (-2.0, 0.3), (-4.0, 1.2)])
+    @pytest.mark.parametrize(
+        ("scale", "channels"), [((-3.5, 0.8), 0), ((-2.0, 0.3), 1), ((-4.0, 1.2), 5), ((-3.5, 0.8), 5)]
+    )
     def test_random_clouds(self, device, rng, scale, channels):
         cloud = random_cloud(rng, 600, scale=scale, opacity=(0.05, 1.0))
         origins, directions = random_rays(rng, 300)
@@ -161,9 +166,7 @@ class TestAgainstBruteForce:
         values = rng.normal(size=(600, channels)).astype(np.float32)
         scene = Scene.from_gaussians(cloud, device)
         hit = closest_surface(scene, origins, directions, attributes=values if channels else None)
-        truth = closest_surface_reference(
-            traced_cloud(cloud, scene), origins, directions, attributes=values, middle=scene.origin
-        )
+        truth = oracle_of(scene, cloud, (origins, directions), attributes=values)
         assert hit.attributes.shape == (300, channels)
         require_agreement(hit, truth, least_decided=0.8)
         assert np.median(truth.normal_error) < 1e-2
@@ -190,16 +193,35 @@ class TestAgainstBruteForce:
         rays, values = random_rays(rng, 200), rng.normal(size=(500, 2)).astype(np.float32)
         degree = rules.get("response_degree", 2)
         scene = Scene.from_gaussians(cloud, device, response_degree=degree)
-        options = {name: value for name, value in rules.items() if name in ("front", "cull", "stop")}
-        others = {name: value for name, value in rules.items() if name in ("t_max", "threshold")}
-        hit = closest_surface(
-            scene, *rays, attributes=values, options=TraceOptions(**{"stop": 1e-3, **options}), **others
-        )
-        truth = closest_surface_reference(
-            traced_cloud(cloud, scene), *rays, attributes=values, middle=scene.origin, **rules
-        )
+        options = {"stop": 1e-3} | {name: rules[name] for name in ("front", "cull", "stop") if name in rules}
+        others = {name: rules[name] for name in ("t_max", "threshold") if name in rules}
+        hit = closest_surface(scene, *rays, attributes=values, options=TraceOptions(**options), **others)
+        truth = oracle_of(scene, cloud, rays, attributes=values, **rules)
         require_agreement(hit, truth, least_decided=0.8)
         assert truth.hit_counts.mean() > 1.0
+
+
+def test_the_oracle_agrees_with_a_plain_loop(rng):
+    """One Gaussian at a time along each ray, in double precision, with nothing of the oracle's."""
+    cloud, rays = random_cloud(rng, 60, scale=(-1.5, 0.5)), random_rays(rng, 30)
+    values = rng.normal(size=60)
+    truth = closest_surface_reference(cloud, *rays, attributes=values[:, None], stop=0.2)
+    for ray, (o, d) in enumerate(zip(*(x.astype(float) for x in rays), strict=True)):
+        hits = []
+        for k, rotation in enumerate(Rotation.from_quat(cloud.orientations).as_matrix()):
+            p, v = ((x @ rotation) / cloud.scales[k] for x in (o - cloud.positions[k], d))
+            t = -(p @ v) / (v @ v)
+            alpha = min(0.99, cloud.opacities[k] * np.exp(-0.5 * np.sum((p + t * v) ** 2)))
+            hits += [(t, k, alpha)] if t > 0.0 and alpha >= 1.0 / 255.0 else []
+        passed, total, color, first = 1.0, 0.0, 0.0, (np.inf, -1)
+        for t, k, alpha in sorted(hits):
+            if passed >= 0.2:
+                total, color = total + passed * alpha, color + passed * alpha * values[k]
+                first = (t, k) if passed >= 0.5 > passed * (1.0 - alpha) else first
+                passed *= 1.0 - alpha
+        assert (truth.depth[ray], truth.gaussians[ray]) == (pytest.approx(first[0]), first[1])
+        assert truth.transmittance[ray] == pytest.approx(passed, abs=1e-12)
+        assert truth.attributes[ray] == pytest.approx(color / total if total else 0.0, abs=1e-9)
 
 
 class TestRounds:
@@ -211,40 +233,25 @@ class TestRounds:
         assert {BUFFER_SIZE - 1, BUFFER_SIZE, BUFFER_SIZE + 1, 2 * BUFFER_SIZE, 2 * BUFFER_SIZE + 1} <= set(self.SIZES)
 
     @pytest.mark.parametrize("count", SIZES)
-    def test_coincident_hits_are_blended_by_row(self, device, rng, count):
-        alphas, values = rng.uniform(0.01, 0.1, count).astype(np.float32), rng.normal(size=(count, 2))
-        scene = Scene.from_gaussians(aligned(np.zeros((count, 3)), alphas), device)
-        hit = closest_surface(scene, *along_x(), attributes=values, options=WHOLE, threshold=0.0)
-        rounding = 4.0 * (count + 4) * FLOAT32_ROUNDOFF
-        assert hit.hit_counts[0] == count
-        assert hit.transmittance == pytest.approx(np.prod(1.0 - alphas.astype(float)), rel=rounding)
-        assert hit.attributes[0] == pytest.approx(
-            blend(alphas.astype(float), values), abs=rounding * np.abs(values).max()
-        )
-        assert hit.expected_depth == pytest.approx(2.0, abs=2.0 * rounding)
-
-    @pytest.mark.parametrize("count", SIZES)
-    @pytest.mark.parametrize("gap", [1e-6, 1e-3])
-    def test_nearly_coincident_hits_are_blended_by_depth(self, device, rng, count, gap):
-        """Gaps of 8 ulp of the depth and of 8,000; rows in any order."""
+    @pytest.mark.parametrize("gap", [0.0, 1e-6, 1e-3])
+    def test_close_hits_are_blended_by_depth_and_row(self, device, rng, count, gap):
+        """Gaps of nothing, of 8 ulp of the depth and of 8,000; rows in any order, which alone counts without a gap."""
         places = rng.permutation(count)
-        alphas, values = rng.uniform(0.01, 0.1, count).astype(np.float32), rng.normal(size=(count, 1))
+        alphas, values = rng.uniform(0.01, 0.1, count).astype(np.float32), rng.normal(size=(count, 2))
         cloud = aligned(places[:, None] * [gap, 0.0, 0.0], alphas)
-        scene = Scene.from_gaussians(cloud, device)
-        hit = closest_surface(scene, *along_x(), attributes=values, options=WHOLE, threshold=0.0)
-        order = np.argsort(places)
+        hit = seen_along_x(cloud, device, attributes=values, options=WHOLE, threshold=0.0)
+        order = np.argsort(places) if gap else np.arange(count)
         rounding = 4.0 * (count + 4) * FLOAT32_ROUNDOFF
+        blended = blend(alphas.astype(float)[order], np.c_[values, 2.0 + gap * places][order])
         assert hit.hit_counts[0] == count
         assert hit.transmittance == pytest.approx(np.prod(1.0 - alphas.astype(float)), rel=rounding)
-        assert hit.attributes[0] == pytest.approx(
-            blend(alphas.astype(float)[order], values[order]), abs=rounding * np.abs(values).max()
-        )
+        assert hit.attributes[0] == pytest.approx(blended[:2], abs=rounding * np.abs(values).max())
+        assert hit.expected_depth == pytest.approx(blended[2], abs=blended[2] * rounding)
 
     @pytest.mark.parametrize("stop", [0.0, 1e-3])
     def test_ten_thousand_in_one_place(self, device, stop):
         count, alpha = 10_000, np.float32(1.0 / 250.0)
-        scene = Scene.from_gaussians(aligned(np.zeros((count, 3)), alpha), device)
-        hit = closest_surface(scene, *along_x(), options=TraceOptions(stop=stop))
+        hit = seen_along_x(aligned(np.zeros((count, 3)), alpha), device, options=TraceOptions(stop=stop))
         log = np.log1p(-float(alpha))
         expected = count if stop == 0.0 else int(np.ceil(np.log(stop) / log))
         assert hit.hit_counts[0] == expected
@@ -257,8 +264,7 @@ class TestRounds:
         """Two that coincide, behind a third: the row that comes first is met first, in either order of the rows."""
         for rows in ([0.9, 0.2], [0.2, 0.9]):
             cloud = aligned([[1, 0, 0], [1, 0, 0], [0, 0, 0]], [*rows, 0.1])
-            hit = closest_surface(Scene.from_gaussians(cloud, device), *along_x(), threshold=0.85)
-            assert hit.gaussians[0] == 0
+            assert seen_along_x(cloud, device, threshold=0.85).gaussians[0] == 0
 
 
 class TestProperties:
@@ -271,7 +277,7 @@ class TestProperties:
         passed = visibility(scene, *rays, options=options)
         open_rays = np.maximum(seen.transmittance, passed) >= stop
         # Both round 1 - alpha and the product, in another order, and whiten by another factor of the same matrix.
-        truth = closest_surface_reference(traced_cloud(cloud, scene), *rays, stop=0.0, middle=scene.origin)
+        truth = oracle_of(scene, cloud, rays, stop=0.0)
         clear = truth.decided & open_rays & (truth.transmittance - truth.transmittance_error > stop)
         error = 2.0 * truth.transmittance_error[clear] + FLOAT32_ROUNDOFF
         assert clear.mean() > 0.2

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.visibility import FrozenVisibility
-from support.shapes import aligned, along_x, random_cloud, random_rays, unit
+from support.float32 import relative_error
+from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays, unit
 
-from beam_warp import GaussianCloud, Scene, visibility
+from beam_warp import Scene, visibility
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.trace import gradients
 from beam_warp.trace.gradients import visibility_gradients
@@ -14,8 +15,7 @@ from beam_warp.trace.transmittance import TraceOptions
 from beam_warp.world.quaternions import rotation_matrices
 
 WHOLE = TraceOptions(stop=0.0)
-OF_GAUSSIANS = ("positions", "orientations", "scales", "opacities")
-ATTRIBUTES = (*OF_GAUSSIANS, "origins", "directions")
+ATTRIBUTES = ("positions", "orientations", "scales", "opacities", "origins", "directions")
 
 
 def rounding(cloud, gradient):
@@ -36,14 +36,24 @@ def rounding(cloud, gradient):
     )
 
 
-def relative_error(value, expected):
-    return np.linalg.norm(value - expected) / np.linalg.norm(expected)
+def solve(cloud, device, rays, adjoints):
+    """Gradients of a fresh scene, with no early stop."""
+    return visibility_gradients(Scene.from_gaussians(cloud, device), *rays, adjoints, options=WHOLE)
 
 
-def one_gaussian(opacity=0.7, scales=(0.1, 0.2, 0.3), orientation=(0.0, 0.0, 0.0, 1.0), **fields):
-    return GaussianCloud(
-        positions=[[0, 0, 0]], orientations=[orientation], scales=[scales], opacities=[opacity], **fields
-    )
+def assert_same(one, other, factor=1.0):
+    for name in ATTRIBUTES:
+        assert np.array_equal(factor * getattr(one, name), getattr(other, name)), name
+
+
+def assert_close(cloud, found, expected):
+    """Equal but for single precision; ``expected`` holds an array for each name."""
+    for name, array in expected.items():
+        assert relative_error(getattr(found, name), array) <= rounding(cloud, array), name
+
+
+def arrays_of(result):
+    return {name: getattr(result, name) for name in ATTRIBUTES}
 
 
 class TestClosedForm:
@@ -150,10 +160,7 @@ class TestAgainstDifferences:
 
     def test_small_and_uneven_gaussians(self, device, rng):
         cloud, rays, _, adjoints, frozen = case(rng, scale=(-3.5, 0.8), rays=1000)
-        scene = Scene.from_gaussians(cloud, device)
-        result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
-        for name, expected in frozen.gradients(adjoints).items():
-            assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected), name
+        assert_close(cloud, solve(cloud, device, rays, adjoints), frozen.gradients(adjoints))
 
     @pytest.mark.parametrize("scales", [(0.3, 3e-4, 3e-4), (0.1, 0.1, 1e-4)])
     def test_needles_and_discs(self, device, rng, scales):
@@ -166,27 +173,20 @@ class TestAgainstDifferences:
         origins = (targets - rng.uniform(0.2, 1.0, (rays, 1)) * directions).astype(np.float32)
         clear = ~FrozenVisibility(cloud, origins, directions).near_tie
         adjoints = rng.normal(size=clear.sum()).astype(np.float32)
-        scene = Scene.from_gaussians(cloud, device)
-        result = visibility_gradients(scene, origins[clear], directions[clear], adjoints, options=WHOLE)
-        for name, expected in FrozenVisibility(cloud, origins[clear], directions[clear]).gradients(adjoints).items():
-            assert relative_error(getattr(result, name), expected) <= rounding(cloud, expected) < 1e-2, name
+        rays = origins[clear], directions[clear]
+        expected = FrozenVisibility(cloud, *rays).gradients(adjoints)
+        assert_close(cloud, solve(cloud, device, rays, adjoints), expected)
+        assert all(rounding(cloud, array) < 1e-2 for array in expected.values())
 
     def test_far_from_the_origin(self, device, rng):
         """The scene is recentred: moved by a power of two it keeps its gradients but for the grid of 1/1024."""
         cloud, rays, _, adjoints, _ = case(rng)
         cloud = cloud.with_arrays(positions=np.round(cloud.positions * 1024.0) / 1024.0)
         origins, directions = (np.round(rays[0] * 1024.0) / 1024.0).astype(np.float32), rays[1]
-        here = visibility_gradients(Scene.from_gaussians(cloud, device), origins, directions, adjoints, options=WHOLE)
+        here = solve(cloud, device, (origins, directions), adjoints)
         moved = cloud.with_arrays(positions=cloud.positions + np.float32(8192.0))
-        there = visibility_gradients(
-            Scene.from_gaussians(moved, device),
-            (origins + np.float32(8192.0)).astype(np.float32),
-            directions,
-            adjoints,
-            options=WHOLE,
-        )
-        for name in ATTRIBUTES:
-            assert relative_error(getattr(there, name), getattr(here, name)) <= rounding(cloud, getattr(here, name))
+        far = (origins + np.float32(8192.0)).astype(np.float32)
+        assert_close(cloud, solve(moved, device, (far, directions), adjoints), arrays_of(here))
 
 
 class TestIdentities:
@@ -195,9 +195,8 @@ class TestIdentities:
     @pytest.fixture
     def solved(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
-        scene = Scene.from_gaussians(cloud, device)
-        result = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
-        fields = {name: getattr(result, name).astype(np.float64) for name in ATTRIBUTES}
+        result = solve(cloud, device, rays, adjoints)
+        fields = {name: array.astype(np.float64) for name, array in arrays_of(result).items()}
         return cloud, rays[0].astype(np.float64), rays[1].astype(np.float64), fields
 
     @staticmethod
@@ -242,29 +241,21 @@ class TestIdentities:
     def test_quaternions_that_are_not_quite_unit(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         longer = cloud.with_arrays(orientations=cloud.orientations * np.float32(1.0 + 2.0**-10))
-        one, other = (
-            visibility_gradients(Scene.from_gaussians(c, device), *rays, adjoints, options=WHOLE)
-            for c in (cloud, longer)
-        )
+        one, other = (solve(c, device, rays, adjoints) for c in (cloud, longer))
         expected = one.orientations / (1.0 + 2.0**-10)
         assert relative_error(other.orientations, expected) <= rounding(cloud, expected) < 2.0**-11
 
     def test_opposite_quaternions_have_opposite_gradients(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         opposite = cloud.with_arrays(orientations=-cloud.orientations)
-        one, other = (
-            visibility_gradients(Scene.from_gaussians(c, device), *rays, adjoints, options=WHOLE)
-            for c in (cloud, opposite)
-        )
+        one, other = (solve(c, device, rays, adjoints) for c in (cloud, opposite))
         assert np.array_equal(one.orientations, -other.orientations)
 
     def test_adjoints_enter_linearly(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
         scene = Scene.from_gaussians(cloud, device)
         one = visibility_gradients(scene, *rays, adjoints)
-        other = visibility_gradients(scene, *rays, -4.0 * adjoints)
-        for name in ATTRIBUTES:
-            assert np.array_equal(-4.0 * getattr(one, name), getattr(other, name))
+        assert_same(one, visibility_gradients(scene, *rays, -4.0 * adjoints), factor=-4.0)
 
 
 class TestStop:
@@ -310,13 +301,13 @@ class TestBits:
         whole, few = solve("1", 1 << 22), solve("1", 1 << 22, 50)
         others = [solve("1", 1 << 22), solve("2", 1 << 22), solve("2", 2000)]
         ray_by_ray = solve("1", 1, 50)
-        for name in ATTRIBUTES:
-            assert np.abs(getattr(whole, name)).max() > 0.0
-            assert all(np.array_equal(getattr(whole, name), getattr(other, name)) for other in others)
-            assert np.array_equal(getattr(few, name), getattr(ray_by_ray, name))
+        assert all(array.any() for array in arrays_of(whole).values())
+        for other in others:
+            assert_same(whole, other)
+        assert_same(few, ray_by_ray)
 
-    @pytest.mark.parametrize("first", [0, 1, 255, 256, 257, 700])
-    @pytest.mark.parametrize("second", [1, 255, 256, 257, 512, 2000])
+    @pytest.mark.parametrize("first", [0, 1, 255, 256, 257])
+    @pytest.mark.parametrize("second", [1, 255, 256, 257, 2000])
     def test_sums_over_blocks_of_hits_add_each_hit_once(self, device, first, second):
         cloud = aligned([[0, 0, 0], [0, 5, 0], [0, 9, 0]], [0.5, 0.5, 0.5])
         scene = Scene.from_gaussians(cloud, device)
@@ -339,12 +330,10 @@ class TestBits:
         again = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
         monkeypatch.setattr(gradients, "HITS_AT_ONCE", 1000)
         parts = visibility_gradients(scene, *rays, adjoints, options=WHOLE)
-        for name, expected in FrozenVisibility(cloud, *rays).gradients(adjoints).items():
-            value = getattr(whole, name)
-            assert relative_error(value, expected) <= rounding(cloud, expected), name
-            assert np.array_equal(value, getattr(again, name))
-            # other parts, other blocks, other roundings of float64 sums: the last bit of float32 may differ
-            assert relative_error(getattr(parts, name), value) <= 2.0**-23
+        assert_close(cloud, whole, FrozenVisibility(cloud, *rays).gradients(adjoints))
+        assert_same(whole, again)
+        # other parts, other blocks, other roundings of float64 sums: the last bit of float32 may differ
+        assert all(relative_error(getattr(parts, name), array) <= 2.0**-23 for name, array in arrays_of(whole).items())
 
     @pytest.mark.parametrize("more", [-1, 1])
     def test_a_tie_that_the_traversals_decide_differently_overflows_no_slot(self, device, rng, monkeypatch, more):
@@ -368,8 +357,7 @@ class TestBits:
         others = np.r_[:10, 20:200]
         assert np.array_equal(result.origins[others], expected.origins[others])
         if more == 1:  # slots stay free
-            for name in ATTRIBUTES:
-                assert np.array_equal(getattr(result, name), getattr(expected, name))
+            assert_same(result, expected)
         else:
             assert not np.array_equal(result.opacities, expected.opacities)
 
@@ -398,10 +386,8 @@ class TestBits:
 
     def test_devices_agree(self, device, rng):
         cloud, rays, _, adjoints, _ = case(rng)
-        here = visibility_gradients(Scene.from_gaussians(cloud, device), *rays, adjoints, options=WHOLE)
-        cpu = visibility_gradients(Scene.from_gaussians(cloud, "cpu"), *rays, adjoints, options=WHOLE)
-        for name in ATTRIBUTES:
-            assert relative_error(getattr(here, name), getattr(cpu, name)) <= rounding(cloud, getattr(cpu, name))
+        here, cpu = (solve(cloud, where, rays, adjoints) for where in (device, "cpu"))
+        assert_close(cloud, here, arrays_of(cpu))
 
 
 class TestSizes:
@@ -425,15 +411,12 @@ class TestSizes:
         moved = Scene.from_gaussians(other, device)
         moved.move(cloud.positions, cloud.orientations, cloud.scales)
         result = visibility_gradients(moved, *rays, adjoints, options=WHOLE)
-        expected = visibility_gradients(Scene.from_gaussians(cloud, device), *rays, adjoints, options=WHOLE)
-        for name in ATTRIBUTES:
-            reference = getattr(expected, name)
-            assert relative_error(getattr(result, name), reference) <= rounding(cloud, reference)
+        assert_close(cloud, result, arrays_of(solve(cloud, device, rays, adjoints)))
 
     def test_zero_adjoints(self, device, rng):
         scene = Scene.from_gaussians(random_cloud(rng, 50, scale=(-1.0, 0.2)), device)
         result = visibility_gradients(scene, *random_rays(rng, 30), np.zeros(30))
-        assert all(np.abs(getattr(result, name)).max() == 0.0 for name in ATTRIBUTES)
+        assert not any(array.any() for array in arrays_of(result).values())
 
     def test_ten_thousand_coincident_gaussians(self, device):
         cloud = aligned(np.zeros((10_000, 3)), 1.0 / 250.0)

@@ -10,16 +10,16 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh
 
+UNIFORM = EnvironmentMap.constant((1.0, 1.0, 1.0))
 
-def material_mesh(mesh, base_color=0.5, roughness=0.5):
-    count = len(mesh.vertices)
-    return MaterialMesh(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=mesh.vertex_normals,
-        base_color=np.full((count, 3), base_color),
-        roughness=np.full(count, roughness),
-    )
+
+def one_material(vertices, faces, normals, base_color=0.5, roughness=0.5):
+    colors, roughnesses = np.full((len(vertices), 3), base_color), np.full(len(vertices), roughness)
+    return MaterialMesh(vertices=vertices, faces=faces, normals=normals, base_color=colors, roughness=roughnesses)
+
+
+def material_mesh(mesh, *material):
+    return one_material(mesh.vertices, mesh.faces, mesh.vertex_normals, *material)
 
 
 def ball(radius=1.0, center=(0.0, 0.0, 0.0), subdivisions=4):
@@ -28,7 +28,7 @@ def ball(radius=1.0, center=(0.0, 0.0, 0.0), subdivisions=4):
     return mesh
 
 
-def bowl(base_color=0.5, roughness=0.5, rings=48):
+def bowl(*material, rings=48):
     """Half of a sphere, open towards -y, with normals inwards."""
     theta = np.linspace(0.0, np.pi / 2.0, rings + 1)
     phi = np.linspace(0.0, 2.0 * np.pi, 2 * rings, endpoint=False)
@@ -42,14 +42,7 @@ def bowl(base_color=0.5, roughness=0.5, rings=48):
     corners = points[faces]
     outward = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(1)).sum(1) > 0.0
     faces[outward] = faces[outward][:, ::-1]
-    count = len(points)
-    return MaterialMesh(
-        vertices=points,
-        faces=faces,
-        normals=-points,
-        base_color=np.full((count, 3), base_color),
-        roughness=np.full(count, roughness),
-    )
+    return one_material(points, faces, -points, *material)
 
 
 def camera(width=24):
@@ -60,7 +53,7 @@ def camera(width=24):
 def test_white_furnace(device, roughness):
     """A convex white body under uniform light sends back what arrives: base colour 1, albedo scaling."""
     traced = TracedMesh.from_mesh(material_mesh(ball(), 1.0, roughness), device=device)
-    image = trace_radiance(traced, camera(), EnvironmentMap.constant((1.0, 1.0, 1.0)), sample_count=256)
+    image = trace_radiance(traced, camera(), UNIFORM, sample_count=256)
     solid = image.alpha > 0.999
     # Monte Carlo noise of 256 paths on some 300 pixels; facets of 2 degrees shadow a little at grazing
     assert image.rgb[solid].mean() == pytest.approx(1.0, abs=0.01)
@@ -69,7 +62,7 @@ def test_white_furnace(device, roughness):
 
 def test_furnace_never_gains_energy_inside_concavities(device):
     traced = TracedMesh.from_mesh(bowl(1.0, 1.0), device=device)
-    image = trace_radiance(traced, camera(), EnvironmentMap.constant((1.0, 1.0, 1.0)), sample_count=64, bounce_count=40)
+    image = trace_radiance(traced, camera(), UNIFORM, sample_count=64, bounce_count=40)
     inside = image.alpha > 0.999
     assert inside.any()
     assert image.rgb[inside].mean() == pytest.approx(1.0, abs=0.02)
@@ -89,13 +82,8 @@ def test_floor_under_a_resting_ball(device):
     floor = trimesh.creation.box((8.0, 8.0, 0.02))
     floor.apply_translation((0.0, 0.0, -0.01))
     scene = trimesh.util.concatenate([floor, ball(radius, (0.0, 0.0, radius), 5)])
-    mesh = MaterialMesh(
-        vertices=scene.triangles.reshape(-1, 3),
-        faces=np.arange(3 * len(scene.faces)).reshape(-1, 3),
-        normals=np.repeat(scene.face_normals, 3, axis=0),
-        base_color=np.full((3 * len(scene.faces), 3), 0.5),
-        roughness=np.full(3 * len(scene.faces), 0.5),
-    )
+    faces = np.arange(3 * len(scene.faces)).reshape(-1, 3)
+    mesh = one_material(scene.triangles.reshape(-1, 3), faces, np.repeat(scene.face_normals, 3, axis=0))
     view = Camera.look_at((1.5, 0.0, 6.0), (1.5, 0.0, 0.0), up=(0, 1, 0), width=32, height=16, vertical_fov=10.0)
     channels = trace_channels(TracedMesh.from_mesh(mesh, device=device), view, sample_count=4, visibility_count=256)
     hits = view.position + view.directions() * (channels.depth / (view.directions() @ view.forward))[..., None]
@@ -133,7 +121,6 @@ def test_outgoing_radiance_is_what_a_camera_sees(device):
 
 def test_same_seed_same_bits(device):
     traced = TracedMesh.from_mesh(material_mesh(ball(subdivisions=2)), device=device)
-    light = EnvironmentMap.constant((1.0, 1.0, 1.0))
-    one, again, other = (trace_radiance(traced, camera(), light, sample_count=4, seed=s).rgb for s in (1, 1, 2))
+    one, again, other = (trace_radiance(traced, camera(), UNIFORM, sample_count=4, seed=s).rgb for s in (1, 1, 2))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from support.float32 import EPSILON
+from support.kernel_runs import upload_floats as upload
 from support.moving_ball import block_means
 
 from beam_warp.image.color import linear_to_srgb
@@ -13,10 +14,6 @@ KNEE = 0.0031308
 
 ROUNDINGS = 32
 """A power of values down to 0.003 multiplies a logarithm of at most 6: 8 roundings of it, and some of mean and line."""
-
-
-def upload(array, device):
-    return wp.array(np.float32(array), dtype=float, device=device)
 
 
 def strided(array, device, columns=7):
