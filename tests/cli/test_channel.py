@@ -99,14 +99,10 @@ def test_a_channel_from_the_cameras_of_a_capture(judged, tmp_path):
         (["roughness", "--out", "no/x.png"], "out must be in a folder that exists, got no"),
     ],
 )
-def test_refusals_are_one_line(tmp_path, capsys, monkeypatch, words, message):
+def test_refusals_are_one_line(tmp_path, monkeypatch, refused, words, message):
     monkeypatch.chdir(tmp_path)
     save([drawn_ball()], tmp_path / "ball.ply")
-    assert run("ball.ply", "--out", "x.png", *words) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
+    refused("channel", "ball.ply", "--out", "x.png", *words, says=message)
 
 
 def test_the_option_that_it_was_names_the_command(tmp_path, capsys):

@@ -88,9 +88,8 @@ def test_json_of_a_ply_and_its_frames(relit_capture, tmp_path, capsys):
         (("--split", "train"), "truth must be a capture whose train views have exact channels"),
     ],
 )
-def test_what_is_refused(folder, relit_capture, capsys, words, said):
-    assert run(folder, "--truth", relit_capture.folder, *words) == 2
-    assert said in capsys.readouterr().err
+def test_what_is_refused(folder, relit_capture, refused, words, said):
+    refused("evaluate", folder, "--truth", relit_capture.folder, *words, "--device", "cpu", says=said)
 
 
 def test_quiet_prints_nothing(folder, relit_capture, capsys):

@@ -150,12 +150,11 @@ def test_large_canonical_mesh_is_fused_again(sequence, tmp_path, capsys, monkeyp
     assert frame["canonical"]["voxel"] > frame["voxel"]
 
 
-def test_mistakes(sequence, tmp_path, capsys):
+def test_mistakes(sequence, tmp_path, refused):
     for words, says in (
         (("--frames", "7"), "frames must be an integer in [0, 1], got 7"),
         (("--voxel", "-1"), "voxel must be a number in"),
         (("--out", tmp_path / "none" / "out"), "out must be a folder that can be made"),
         (("--confirmations", "99"), "depth must be seen"),
     ):
-        assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", *words) == 2
-        assert says in capsys.readouterr().err
+        refused("mesh", sequence, "--out", tmp_path, *FAST, "--frames", "0", *words, says=says)

@@ -382,7 +382,7 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
         ("x.mp4 --crf 99", "crf must be an integer in [0, 51], got 99"),
     ],
 )
-def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words, message):
+def test_refusals_are_one_line(walk, light, tmp_path, monkeypatch, refused, words, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "area.json").write_text(json.dumps([{"type": "area"}]))
     lamp = {"type": "point", "position": [0, float("nan"), 0], "intensity": [1, 1, 1]}
@@ -390,30 +390,24 @@ def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words
     pose = np.eye(4).tolist()
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps([{"time": 0, "camera_to_world": pose}]))
-    before = sorted(tmp_path.iterdir())
-    assert run(walk, "--environment", light, "--out", *words.split()) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before
+    refused("render", walk, "--environment", light, "--out", *words.split(), says=message)
 
 
-def test_one_stage_or_several_assets(walk, light, tmp_path, capsys):
+def test_one_stage_or_several_assets(walk, light, tmp_path, refused):
     stage = tmp_path / "stage.json"
     stage.write_text("{}")
-    words = ["--environment", light, "--out", tmp_path / "x.png"]
-    assert run(walk, stage, *words) == 2
-    assert "asset must be one stage, or several assets, got" in capsys.readouterr().err
-    assert run(stage, *words, "--spacing", 1) == 2
-    assert "spacing must be left out with a stage, got 1.0" in capsys.readouterr().err
-    assert run(walk, "--background", "environment", "--out", tmp_path / "x.png") == 2
-    assert "environment must be given, got none. Pass --environment with a lat-long" in capsys.readouterr().err
+    for words, says in (
+        ([walk, stage, "--environment", light], "asset must be one stage, or several assets, got"),
+        ([stage, "--environment", light, "--spacing", 1], "spacing must be left out with a stage, got 1.0"),
+        ([walk, "--background", "environment"], "environment must be given, got none. Pass --environment with a lat"),
+    ):
+        refused("render", *words, "--out", tmp_path / "x.png", says=says)
 
 
-def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch):
+def test_a_folder_that_is_closed(common, tmp_path, refused, monkeypatch):
     monkeypatch.setattr("beam_warp.stage.output.os.access", lambda *_: False)
-    assert run(*common, "--out", tmp_path / "x.png", "--frame", 0) == 2
-    assert "out must be in a folder that can be written" in capsys.readouterr().err
+    words = [*common, "--out", tmp_path / "x.png", "--frame", 0]
+    refused("render", *words, says="out must be in a folder that can be written")
 
 
 def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):

@@ -201,19 +201,16 @@ def test_large_relighting_is_run_on_request(leaking_front, monkeypatch, capsys):
     assert run("--only", "relighting", "--large", "--quiet") == 1
 
 
-def test_results_that_are_none_are_refused(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--out none/page.md", "out must be in a folder that exists"),
+        ("--device cuda:99", "device must be one of cpu"),
+        ("--beside other.json", "beside must be what beam stability --json printed, got other.json"),
+        ("--beside none.json", "beside must be a file, got"),
+    ],
+)
+def test_mistakes(tmp_path, monkeypatch, refused, words, says):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "other.json").write_text('{"cases": [{}]}', encoding="utf-8")
-    assert run("--beside", tmp_path / "other.json") == 2
-    assert "beside must be what beam stability --json printed, got other.json" in capsys.readouterr().err
-    assert run("--beside", tmp_path / "none.json") == 2
-    assert "beside must be a file, got" in capsys.readouterr().err
-
-
-def test_a_folder_that_is_not_there_is_refused(tmp_path, capsys):
-    assert run("--out", tmp_path / "none" / "page.md") == 2
-    assert "out must be in a folder that exists" in capsys.readouterr().err
-
-
-def test_a_device_that_is_not_there_is_refused(capsys):
-    assert main(["stability", "--device", "cuda:99"]) == 2
-    assert "device must be one of cpu" in capsys.readouterr().err
+    refused("stability", *words.split(), says=says)
