@@ -50,23 +50,10 @@ def test_every_module_is_in_the_wheel(wheel_names, folder):
 
 
 @pytest.mark.slow
-def test_schema_files_and_type_marker_are_in_the_wheel(wheel_names):
-    for name in (
-        "schema/plugInfo.json",
-        "schema/generatedSchema.usda",
-        "schema/schema.usda",
-        "schema/SPEC.md",
-        "py.typed",
-        "__init__.pyi",
-        "raster/__init__.pyi",
-        "study/page.js",
-        "capture/page.js",
-    ):
-        assert f"beam_warp/{name}" in wheel_names
-
-
-@pytest.mark.slow
-def test_licence_is_in_the_wheel(wheel_names):
+def test_licence_and_files_that_are_no_modules_are_in_the_wheel(wheel_names):
+    schema = {f"schema/{name}" for name in ("plugInfo.json", "generatedSchema.usda", "schema.usda", "SPEC.md")}
+    typing, pages = {"py.typed", "__init__.pyi", "raster/__init__.pyi"}, {"study/page.js", "capture/page.js"}
+    assert {f"beam_warp/{name}" for name in schema | typing | pages} <= wheel_names
     assert any(name.endswith("/licenses/LICENSE") for name in wheel_names)
 
 

@@ -158,7 +158,7 @@ def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(white_light, tmp_pa
 
 def test_look_at_and_size(ball, white_light, tmp_path):
     out = tmp_path / "x.exr"
-    look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, "--aov"]
+    look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, *PLAIN, "--aov"]
     assert run(ball, "--environment", white_light, "--out", out, *look) == 0
     image = read_image(out)
     assert (image.width, image.height) == (60, 30)
@@ -241,7 +241,7 @@ def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_ligh
 def test_the_capture_brings_its_light(ball, white_light, tmp_path):
     write_capture(tmp_path / "capture", [("b", 0, "test")])
     white_light.rename(tmp_path / "capture" / "environment.exr")
-    assert run(ball, "--capture", tmp_path / "capture", "--out", tmp_path / "out") == 0
+    assert run(ball, "--capture", tmp_path / "capture", "--out", tmp_path / "out", *PLAIN) == 0
     assert read_image(tmp_path / "out" / "b_0000.exr").channels["G"].max() > 0.3
 
 
@@ -274,7 +274,7 @@ def test_broken_rows_are_refused_or_left_out_and_counted(ball, white_light, tmp_
     start = content.index(b"end_header\n") + len(b"end_header\n")
     content[start : start + 4] = np.float32(np.nan).tobytes()
     ball.write_bytes(content)
-    words = (ball, "--environment", white_light, "--out", tmp_path / "x.png", *SIDE, "--device", "cpu")
+    words = (ball, "--environment", white_light, "--out", tmp_path / "x.png", *SIDE, *PLAIN, "--device", "cpu")
     assert run(*words) == 2
     assert "must be finite" in capsys.readouterr().err
     assert run(*words, "--drop-invalid") == 0

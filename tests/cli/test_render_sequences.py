@@ -129,10 +129,6 @@ class TestFrames:
         shown = read_image(tmp_path / "f" / "003.exr").channels
         np.testing.assert_allclose(shown["G"][0], 0.1 * (1 + 3.0 + points(0).positions[:, 0].mean()), rtol=1e-5)
 
-    def test_negative_numbers_count_from_the_end(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--frames=-2:") == 0
-        np.testing.assert_allclose(recorder.places(), [2.0, 3.0], atol=POSITION)
-
     def test_part_of_a_sequence_is_seen_like_the_whole(self, common, recorder, tmp_path):
         assert run(*common, "--out", tmp_path / "a%d.png") == 0
         assert run(*common, "--out", tmp_path / "b%d.png", "--frames", "2:3", "--turntable", 0) == 0
@@ -171,35 +167,35 @@ class TestFrames:
         np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3], atol=POSITION)
 
 
-class TestTime:
-    def test_another_rate_blends_frames(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--fps", 20) == 0
-        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5, 2, 2.5, 3, 3], atol=POSITION)
-
-    def test_half_speed(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--speed", 0.5, "--frames", "0:2") == 0
-        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5], atol=POSITION)
-
-    def test_loop_and_hold(self, common, recorder, tmp_path):
-        for name, more in (("a", ["--loop"]), ("b", [])):
-            assert run(*common, "--out", tmp_path / f"{name}%d.png", "--seconds", 0.6, *more) == 0
-        np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3, 0, 1, 0, 1, 2, 3, 3, 3], atol=POSITION)
+@pytest.mark.parametrize(
+    ("words", "places"),
+    [
+        ("--frames=-2:", [2, 3]),
+        ("--fps 20", [0, 0.5, 1, 1.5, 2, 2.5, 3, 3]),
+        ("--speed 0.5 --frames 0:2", [0, 0.5, 1, 1.5]),
+        ("--seconds 0.6", [0, 1, 2, 3, 3, 3]),
+        ("--seconds 0.6 --loop", [0, 1, 2, 3, 0, 1]),
+    ],
+    ids=["numbers from the end", "blended frames", "half speed", "the last is held", "all again"],
+)
+def test_moments(common, recorder, tmp_path, words, places):
+    assert run(*common, "--out", tmp_path / "%d.png", *words.split()) == 0
+    np.testing.assert_allclose(recorder.places(), places, atol=POSITION)
 
 
 class TestCamera:
-    def test_a_turntable_goes_around(self, common_still, recorder, tmp_path):
-        more = ["--turntable", 90, "--seconds", 2, "--fps", 2, "--orbit", 10, 0]
-        assert run(*common_still, "--out", tmp_path / "%d.png", *more) == 0
-        np.testing.assert_allclose(recorder.azimuths(), [10, 55, 100, 145], atol=1e-6)
-
-    def test_turns_are_spread_over_all(self, common_still, recorder, tmp_path):
-        assert run(*common_still, "--out", tmp_path / "%d.png", "--turns", 1, "--seconds", 2, "--fps", 2) == 0
-        np.testing.assert_allclose(recorder.azimuths(), [0, 90, 180, 270], atol=1e-6)
-
-    def test_a_turntable_lasts_a_turn(self, common_still, recorder, tmp_path):
-        assert run(*common_still, "--out", tmp_path / "%d.png", "--turntable", 1800) == 0
-        assert len(recorder.shots) == 6  # 0.2 s at 30 a second
-        np.testing.assert_allclose(recorder.azimuths(), np.arange(6) * 60.0, atol=1e-6)
+    @pytest.mark.parametrize(
+        ("words", "azimuths"),
+        [
+            ("--turntable 90 --seconds 2 --fps 2 --orbit 10 0", [10, 55, 100, 145]),
+            ("--turns 1 --seconds 2 --fps 2", [0, 90, 180, 270]),
+            ("--turntable 1800", [0, 60, 120, 180, 240, 300]),  # a turn of 0.2 s at 30 a second
+        ],
+        ids=["so fast", "so often", "a turn"],
+    )
+    def test_a_turntable_goes_around(self, common_still, recorder, tmp_path, words, azimuths):
+        assert run(*common_still, "--out", tmp_path / "%d.png", *words.split()) == 0
+        np.testing.assert_allclose(recorder.azimuths(), azimuths, atol=1e-6)
 
     def test_it_goes_by_the_films_seconds(self, common, recorder, tmp_path):
         """The asset takes twice as long at half speed, and the camera goes around twice as far."""

@@ -8,13 +8,14 @@ import urllib.request
 
 import numpy as np
 import pytest
-from support.figure_asset import figure_asset
+from support.drawn_ball import drawn_ball
 
 from beam_warp import converters
 from beam_warp.cli.main import main
 from beam_warp.cli.view import environments
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.files import write_exr
+from beam_warp.world.gaussians import GaussianSequence
 
 
 def beam(*words):
@@ -24,7 +25,7 @@ def beam(*words):
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("person")
-    converters.write(figure_asset(frame_count=2), folder / "asset.usda")
+    converters.write(GaussianSequence.from_clouds([drawn_ball()] * 2), folder / "asset.usda")
     return folder
 
 

@@ -249,6 +249,7 @@ def done(discs, studio, capture, tmp_path_factory):
     return out
 
 
+@pytest.mark.usefixtures("coarse_irradiance", "trusted_files")
 class TestWithACapture:
     """Discs on the demo figure, decomposed by the images of its capture."""
 

@@ -1,5 +1,7 @@
 """Pictures of states: those of the renderers, frame by frame as they are wanted, whatever the cloud holds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.figure_asset import changed, figure_asset
@@ -18,7 +20,9 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.shot import RenderedImage
 
-LIGHTS = {"sunset": sunset, "white": lambda: EnvironmentMap.constant([1.0, 1.0, 1.0])}
+pytestmark = pytest.mark.usefixtures("coarse_irradiance")
+
+LIGHTS = {"sunset": sunset, "white": lambda: EnvironmentMap.constant([1.0, 1.0, 1.0], height=4)}
 
 
 @pytest.fixture(scope="module")
@@ -147,9 +151,9 @@ def test_an_unknown_light(painter, camera):
 
 
 def test_splats_are_drawn_as_the_asset_says(sequence, camera):
-    said = figure_asset(frame_count=1, metadata=RasterOptions(antialiased=True, low_pass=4.0).as_metadata())
-    painter = CloudPainter(said, LIGHTS, device="cpu")
-    buffer = rasterize(said[0], camera, options=RasterOptions(antialiased=True, low_pass=4.0), device="cpu")
+    options = RasterOptions(antialiased=True, low_pass=4.0)
+    painter = CloudPainter(replace(sequence, metadata=options.as_metadata()), LIGHTS, device="cpu")
+    buffer = rasterize(sequence[0], camera, options=options, device="cpu")
     drawn = painter.draw(ViewState(channel=DEPTH), camera).layers()
     np.testing.assert_array_equal(drawn["A"], buffer.alpha)
 
