@@ -1,8 +1,7 @@
 """Fixtures of all commands: light that is soon ready, files that are trusted, and what a mistake comes to."""
 
 import pytest
-
-from beam_warp.cli.main import main
+from support.commands import beam
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +16,7 @@ def refused(capsys, tmp_path):
     def check(*words, says):
         before = sorted(tmp_path.rglob("*"))
         capsys.readouterr()
-        assert main([str(word) for word in words]) == 2
+        assert beam(*words) == 2
         said = capsys.readouterr()
         assert said.out == ""
         (line,) = said.err.strip().splitlines()

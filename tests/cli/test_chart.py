@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from support.commands import beam
 
 from beam_warp import GaussianSequence, write
-from beam_warp.cli.main import main
 from beam_warp.image.files import write_exr
 from beam_warp.study.table import read_table
 from beam_warp.world.shapes import still_life
@@ -27,10 +27,6 @@ def scene(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene") / "still.ply"
     write(GaussianSequence.from_clouds([still_life(400)]), path)
     return path
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 def test_measure_then_draw_again(scene, tmp_path, capsys):

@@ -7,13 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
+from support.commands import beam
 from support.sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
-
-from beam_warp.cli.main import main
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 @pytest.fixture(scope="module")
@@ -124,9 +119,3 @@ def test_the_page_needs_nothing_and_its_script_runs(pages, tmp_path):
     assert said["lines"] == CAMERAS * said["pointed"]
     assert said["faces"] > 0
     assert said["faces"] % 2 == 0
-
-
-def test_help_has_an_example(capsys):
-    with pytest.raises(SystemExit):
-        beam("inspect", "--help")
-    assert "Example: beam inspect captures/walker --out report" in capsys.readouterr().out

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.main import main
 from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
@@ -30,10 +30,6 @@ def asked(monkeypatch):
     monkeypatch.setattr("beam_warp.cli.reconstruct.steps_of", steps_of)
     monkeypatch.setattr("beam_warp.cli.run.steps_of", steps_of)
     return found
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 class TestReconstruct:
@@ -134,29 +130,28 @@ def test_the_words_reach_the_optimiser(folder):
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
     assert steps.device == "cpu"
-    assert (
-        steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu").options()
-    )
+    fast = steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu")
+    assert steps.options() != fast.options()
 
 
-class TestWords:
-    def test_frames(self):
-        there = (0, 2, 4, 6, 8)
-        assert frames_of("2:6", there) == (2, 4)
-        assert frames_of(":3", there) == (0, 2)
-        assert frames_of("3:", there) == (4, 6, 8)
-        assert frames_of("::2", there) == (0, 4, 8)
-        assert frames_of(":", there) == there
+@pytest.mark.parametrize(
+    ("words", "frames"),
+    [("2:6", (2, 4)), (":3", (0, 2)), ("3:", (4, 6, 8)), ("::2", (0, 4, 8)), (":", (0, 2, 4, 6, 8))],
+)
+def test_words_for_frames(words, frames):
+    assert frames_of(words, (0, 2, 4, 6, 8)) == frames
 
-    @pytest.mark.parametrize("words", ["", "3", "a:b", "1:2:0", "1:2:3:4"])
-    def test_no_frames(self, words):
-        with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
-            frames_of(words, (0, 1, 2))
 
-    @pytest.mark.parametrize("words", ["", "1/", "0/1", "2/1", "-1/2", "a/b"])
-    def test_no_part(self, words):
-        with pytest.raises(InvalidOptionError, match="part must be I/N"):
-            part_of(words)
+@pytest.mark.parametrize("words", ["", "3", "a:b", "1:2:0", "1:2:3:4"])
+def test_words_for_no_frames(words):
+    with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
+        frames_of(words, (0, 1, 2))
+
+
+@pytest.mark.parametrize("words", ["", "1/", "0/1", "2/1", "-1/2", "a/b"])
+def test_words_for_no_part(words):
+    with pytest.raises(InvalidOptionError, match="part must be I/N"):
+        part_of(words)
 
 
 @pytest.mark.slow

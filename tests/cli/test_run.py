@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from support.commands import beam
 from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, write
-from beam_warp.cli.main import main
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import write_exr
 
@@ -30,10 +30,6 @@ def environment(path, radiance):
 @pytest.fixture
 def sky(tmp_path):
     return environment(tmp_path / "sky.exr", np.ones((16, 32, 3), np.float32))
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
@@ -89,5 +85,5 @@ def test_environment_with_a_bad_texel(ball, tmp_path, refused, value):
 
 
 def test_version(capsys):
-    assert main(["--version"]) == 0
+    assert beam("--version") == 0
     assert capsys.readouterr().out.startswith("beam 0.")

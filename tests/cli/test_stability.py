@@ -34,8 +34,10 @@ def run(*words):
     return main(["stability", "--device", "cpu", *map(str, words)])
 
 
-def run_beside(page, capsys, *words, code=0, **changes):
-    """Run for JSON, let a GPU have found the same but for some changes, and run again beside it."""
+def run_beside(page, capsys, *words, before="", code=0, **changes):
+    """Run for JSON, let a GPU have found the same but for some changes, and run again beside it on a page."""
+    if before:
+        page.write_text(before, encoding="utf-8")
     assert run(*words, "--json") == code
     record = json.loads(capsys.readouterr().out)
     rows = [row for part in record.values() if isinstance(part, list) for row in part]
@@ -106,12 +108,9 @@ def one_capture(monkeypatch, tiny_capture):
 
 @pytest.mark.slow
 def test_captures_alone_of_two_devices(one_capture, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n", encoding="utf-8"
-    )
-    fault = "not detected: black-image of train_03"
-    _, said, text = run_beside(page, capsys, "--only", "reconstruction", faults=[fault])
+    before = "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n"
+    words, fault = ("--only", "reconstruction"), "not detected: black-image of train_03"
+    _, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, faults=[fault])
     assert "stress captures on cpu" in said.out
     assert "black-image of" in said.out
     assert "coaxial disc" not in said.out
@@ -145,24 +144,22 @@ def one_light(monkeypatch):
 
 
 def test_materials_alone_of_two_devices(one_light, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    captures = "## Captures on which reconstructions fail\n\nkept\n"
-    page.write_text(f"# Stability\n\nrays\n\n{captures}", encoding="utf-8")
-    fault = "must be refused, and was not"
-    _, said, text = run_beside(page, capsys, "--only", "materials", faults=[fault])
+    before = "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nkept\n"
+    words, fault = ("--only", "materials"), "must be refused, and was not"
+    _, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, faults=[fault])
     assert "materials on cpu" in said.out
     assert "coaxial disc" not in said.out
-    assert text.startswith(f"# Stability\n\nrays\n\n{captures}\n## Materials\n")
+    assert text.startswith(f"{before}\n## Materials\n")
     assert "refused: environment must shed light" in text
     assert text.index("cpu: 42 Gaussians") < text.index("Some GPU: 42 Gaussians")
     assert f"| {fault} |" in text
 
 
 def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
-    def build(studio):
-        return dataclasses.replace(one_light.build(studio), refused=False)
-
-    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [dataclasses.replace(one_light, build=build)])
+    broken = dataclasses.replace(
+        one_light, build=lambda studio: dataclasses.replace(one_light.build(studio), refused=False)
+    )
+    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [broken])
     assert run("--only", "materials", "--quiet") == 1
     assert "failed: black environment on cpu: refused: environment must shed light" in capsys.readouterr().err
 
@@ -177,16 +174,15 @@ def leaking_front(monkeypatch):
 
 
 def test_relighting_alone_of_two_devices(leaking_front, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text("# Stability\n\nrays\n\n## Materials\n\nkept\n", encoding="utf-8")
-    record, said, text = run_beside(page, capsys, "--only", "relighting", code=1)
+    before, words = "# Stability\n\nrays\n\n## Materials\n\nkept\n", ("--only", "relighting")
+    record, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, code=1)
     assert [row["renderer"] for row in record["relighting"]] == ["deferred", "path"]
     assert "relighting on cpu" in said.out
     assert "coaxial disc" not in said.out
     failed = "failed: a leaking front before a dark inside on cpu, deferred: radiance, of the front's own"
     assert said.err.startswith(failed)
     assert said.err.count("\n") == 1
-    assert text.startswith("# Stability\n\nrays\n\n## Materials\n\nkept\n\n## Relighting\n")
+    assert text.startswith(f"{before}\n## Relighting\n")
     by_paths = next(line for line in text.splitlines() if "| path |" in line)
     assert by_paths.startswith("| a leaking front before a dark inside |")
     assert by_paths.endswith("| ok |")

@@ -8,18 +8,14 @@ import urllib.request
 
 import numpy as np
 import pytest
+from support.commands import beam
 from support.drawn_ball import drawn_ball
 
 from beam_warp import converters
-from beam_warp.cli.main import main
 from beam_warp.cli.view import environments
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.files import write_exr
 from beam_warp.world.gaussians import GaussianSequence
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from beam_warp.view.renderers import displayed
 from beam_warp.view.state import ALPHA, DEPTH, LIT, NO_ENVIRONMENT, SubjectBox, ViewState
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.shot import RenderedImage
 
 pytestmark = pytest.mark.usefixtures("coarse_irradiance")
@@ -104,15 +104,10 @@ def test_the_cache_has_a_size(sequence):
     assert len(tiny) == 1
 
 
-def without_materials(cloud):
-    names = ("positions", "orientations", "scales", "opacities", "radiance")
-    return GaussianCloud(
-        **{name: getattr(cloud, name) for name in names}, radiance_color_space=cloud.radiance_color_space
-    )
-
-
 def test_an_asset_without_materials_has_channels(sequence, camera):
-    painter = CloudPainter(changed(sequence, lambda _, cloud: without_materials(cloud)), LIGHTS, device="cpu")
+    materials = dict.fromkeys(("base_color", "roughness", "ambient_occlusion", "normals"))
+    bare = changed(sequence, lambda _, cloud: cloud.with_arrays(**materials))
+    painter = CloudPainter(bare, LIGHTS, device="cpu")
     assert painter.channels[0] == "radiance"
     assert LIT not in painter.channels
     assert not painter.can_trace
