@@ -17,16 +17,14 @@ QUOTED = re.compile(f"[\"']{BARE.pattern}")
 
 def docstrings(tree: ast.Module) -> list[tuple[int, str]]:
     """Line and text of every docstring, those below constants and fields included."""
-    found = []
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            continue
-        before: list[ast.stmt | None] = [None, *node.body]
-        for above, here in zip(before, node.body, strict=False):
-            stated = above is None or isinstance(above, ast.Assign | ast.AnnAssign)
-            if stated and isinstance(here, ast.Expr) and isinstance(here.value, ast.Constant):
-                found += [(here.lineno, here.value.value)] if isinstance(here.value.value, str) else []
-    return found
+    return [
+        (here.lineno, here.value.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        for above, here in zip([None, *node.body], node.body, strict=False)
+        if above is None or isinstance(above, ast.Assign | ast.AnnAssign)
+        if isinstance(here, ast.Expr) and isinstance(here.value, ast.Constant) and isinstance(here.value.value, str)
+    ]
 
 
 def test_no_docstring_begins_with_a_bare_preposition_or_pronoun():

@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image as PillowImage
 from support.commands import beam
 from support.sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
@@ -17,12 +18,8 @@ def sound(tmp_path_factory):
     folder.mkdir()
     content = write_sound(folder)
     content["ply_file_path"] = "points.ply"
-    properties = "".join(f"property float {n}\n" for n in "xyz") + "".join(
-        f"property uchar {n}\n" for n in ("red", "green", "blue")
-    )
-    (folder / "points.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n0.3 -0.2 0.9 255 0 0\n9 9 9 0 255 0\n"
-    )
+    points = trimesh.PointCloud([[0.3, -0.2, 0.9], [9, 9, 9]], colors=[[255, 0, 0], [0, 255, 0]])
+    points.export(folder / "points.ply")
     save(folder, content)
     return folder
 

@@ -89,9 +89,11 @@ def serving(**state):
     """A loop with its painter and its pages; it ends whatever happened."""
     painter, pages = FakePainter(), Pages()
     loop = FrameLoop(painter, Schedule(ViewState(**state), traced=Pace(500.0)), pages.deliver, pages.report)
-    yield loop, painter, pages
-    painter.gate.set()
-    loop.close()
+    try:
+        yield loop, painter, pages
+    finally:
+        painter.gate.set()
+        loop.close()
     assert not loop._thread.is_alive()
 
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.drawn_ball import drawn_ball
 
 from beam_warp.errors import InvalidOptionError
@@ -23,22 +24,12 @@ from beam_warp.view.state import (
     turn_to,
 )
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 
 
-def quaternion(matrix):
-    """The quaternion wxyz of a rotation by less than half a turn."""
-    w = 0.5 * math.sqrt(1.0 + np.trace(matrix))
-    x = (matrix[2, 1] - matrix[1, 2]) / (4 * w)
-    y = (matrix[0, 2] - matrix[2, 0]) / (4 * w)
-    z = (matrix[1, 0] - matrix[0, 1]) / (4 * w)
-    return w, x, y, z
-
-
 def seen_by(camera, fov):
-    turned = quaternion(camera.camera_to_world[:3, :3])
-    return Viewpoint(turned, tuple(camera.position), math.radians(fov), camera.width, camera.height)
+    x, y, z, w = Rotation.from_matrix(camera.camera_to_world[:3, :3]).as_quat()
+    return Viewpoint((w, x, y, z), tuple(camera.position), math.radians(fov), camera.width, camera.height)
 
 
 @pytest.mark.parametrize("size", [(320, 200), (200, 320), (1, 1), (1, 7)])
@@ -168,8 +159,8 @@ def test_channels_are_those_that_there_are():
     assert names[0] == LIT
     assert {"base_color", "roughness", "ambient_occlusion", "normals", "radiance", DEPTH, ALPHA} <= set(names)
     assert not {"base_color_error", "observability"} & set(names)
-    shape = ("positions", "orientations", "scales", "opacities")
-    bare = GaussianCloud(**{name: getattr(cloud, name) for name in shape})
+    materials = ("base_color", "roughness", "ambient_occlusion", "normals")
+    bare = cloud.with_arrays(**dict.fromkeys((*materials, "radiance", "radiance_color_space")))
     assert channels_of(bare) == ("surface_normals", DEPTH, ALPHA)
 
 
