@@ -139,14 +139,13 @@ def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, ca
     assert "3 of 3 planned settings measured" in capsys.readouterr().out
 
 
-def test_materials_of_an_asset(tiny_capture, tmp_path, capsys):
+def test_materials_of_an_asset(tiny_capture, tmp_path, capsys, monkeypatch):
     from beam_warp.study.materials import MaterialsSubject
     from beam_warp.world.environment import EnvironmentMap
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 300})
-        light = EnvironmentMap.read(tiny_capture.environment_path)
-        cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud
+    monkeypatch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 300})
+    light = EnvironmentMap.read(tiny_capture.environment_path)
+    cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud
     (tmp_path / "figure").mkdir()
     write(GaussianSequence.from_clouds([cloud]), tmp_path / "figure" / "asset.usda")
     words = (tmp_path / "figure" / "asset.usda", "--capture", tiny_capture.folder, "--out", tmp_path / "chart")

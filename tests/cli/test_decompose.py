@@ -71,8 +71,7 @@ def test_with_the_light_of_the_capture_and_again(figure, small, tmp_path, capsys
 
 
 def test_without_images_the_gaussians_own_colour_is_explained(figure, small, tmp_path, capsys):
-    light = next(small.glob("environment*"))
-    assert beam(figure, "--environment", light, "--out", tmp_path / "out", *FEW, "--quiet") == 0
+    assert beam(figure, "--environment", *small.glob("environment*"), "--out", tmp_path / "out", *FEW, "--quiet") == 0
     said = capsys.readouterr()
     assert said.out == said.err == ""
 

@@ -73,12 +73,15 @@ def test_everything_that_is_written(folder, truth, tmp_path, capsys):
         assert (renders / f"deferred_{light}" / f"{names[0]}.exr").is_file()
 
 
-def test_json_of_a_ply_and_its_frames(truth, tmp_path, capsys):
+def test_json_and_quiet_of_a_ply_and_its_frames(truth, tmp_path, capsys):
     """One frame of the asset as PLY: which one of the capture it shows is said, and so is what is left out."""
     (path,) = converters.write(
         figure_asset(frame_count=1), tmp_path / "figure.ply", converters.WriteOptions(profile="beam")
     )
-    words = (path, "--truth", truth, "--relight", "none", "--json", "--samples", "1")
+    quick = (path, "--truth", truth, "--relight", "none", "--samples", "1")
+    assert run(*quick, "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+    words = (*quick, "--json")
     assert run(*words, "--capture-frames", "0") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["conditions"]["frames"] == [0]
@@ -103,9 +106,3 @@ def test_json_of_a_ply_and_its_frames(truth, tmp_path, capsys):
 )
 def test_what_is_refused(folder, truth, refused, words, said):
     refused("evaluate", folder, "--truth", truth, *words, "--device", "cpu", says=said)
-
-
-def test_quiet_prints_nothing(folder, truth, capsys):
-    assert run(folder, "--truth", truth, "--relight", "none", "--quiet", "--samples", "1") == 0
-    printed = capsys.readouterr()
-    assert (printed.out, printed.err) == ("", "")

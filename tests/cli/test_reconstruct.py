@@ -86,20 +86,19 @@ def test_mistakes_cost_no_reconstruction(folder, asked, tmp_path, refused, words
     refused(*words.split(), "--out", tmp_path / "out", says=says)
 
 
-class TestRunOfACapture:
-    def test_from_images_to_an_asset_and_again(self, folder, asked, tmp_path, capsys):
-        words = ("run", folder, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", ":2")
-        assert beam(*words) == 0
-        said = capsys.readouterr()
-        assert "2 frames, 1 segment, 60 Gaussians" in said.out
-        assert "asset.usda: 2 frames" in said.out
-        assert "exposure of the light +0.00 stops" in said.out
-        assert (tmp_path / "out" / "reconstruction" / "gaussians.usda").is_file()
-        assert (tmp_path / "out" / "asset.usda").is_file()
-        assert beam(*words, "--json") == 0
-        report = json.loads(capsys.readouterr().out)
-        assert report["resumed_frames"] == report["reconstruction"]["resumed_frames"] == 2
-        assert report["persistent"]
+def test_a_run_from_images_to_an_asset_and_again(folder, asked, tmp_path, capsys):
+    words = ("run", folder, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", ":2")
+    assert beam(*words) == 0
+    said = capsys.readouterr()
+    assert "2 frames, 1 segment, 60 Gaussians" in said.out
+    assert "asset.usda: 2 frames" in said.out
+    assert "exposure of the light +0.00 stops" in said.out
+    assert (tmp_path / "out" / "reconstruction" / "gaussians.usda").is_file()
+    assert (tmp_path / "out" / "asset.usda").is_file()
+    assert beam(*words, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["resumed_frames"] == report["reconstruction"]["resumed_frames"] == 2
+    assert report["persistent"]
 
 
 class TestDetection:

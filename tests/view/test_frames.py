@@ -75,13 +75,8 @@ class Pages:
         with self._news:
             assert self._news.wait_for(lambda: condition(self), PATIENCE), (len(self.frames), self.errors)
 
-    def wait_for_frame(self, client, shown, is_last=True):
-        def is_there(pages):
-            return any(
-                c == client and f.picture.pixels.flat[0] == shown and f.is_last >= is_last for c, f in pages.frames
-            )
-
-        self.wait(is_there)
+    def wait_for_frame(self, client, shown):
+        self.wait(lambda p: any(c == client and f.picture.pixels.flat[0] == shown and f.is_last for c, f in p.frames))
 
 
 @contextmanager
