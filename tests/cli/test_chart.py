@@ -8,7 +8,10 @@ from support.commands import beam
 
 from beam_warp import GaussianSequence, write
 from beam_warp.image.files import write_exr
+from beam_warp.study import tracing
+from beam_warp.study.materials import MaterialsSubject
 from beam_warp.study.table import read_table
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.shapes import still_life
 
 QUICK = (
@@ -67,8 +70,6 @@ def test_quiet_and_budget(scene, tmp_path, capsys):
 
 
 def test_stop_keeps_what_was_measured(scene, tmp_path, capsys, monkeypatch):
-    from beam_warp.study import tracing
-
     measure, measured = tracing._Bench.measure, []
 
     def stop_later(self, settings):
@@ -140,9 +141,6 @@ def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, ca
 
 
 def test_materials_of_an_asset(tiny_capture, tmp_path, capsys, monkeypatch):
-    from beam_warp.study.materials import MaterialsSubject
-    from beam_warp.world.environment import EnvironmentMap
-
     monkeypatch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 300})
     light = EnvironmentMap.read(tiny_capture.environment_path)
     cloud = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu").cloud

@@ -55,19 +55,14 @@ def test_a_file(person, capsys):
     assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
 
 
-def test_a_sequence(person, capsys):
-    code, out, err = run(person / "take", person / "out" / "g.ply", "--profile", "beam", "--quiet", capsys=capsys)
-    assert (code, out, err) == (0, "", "")
+def test_a_sequence_quietly_and_as_json(person, capsys):
+    words = (person / "take", person / "out" / "g.ply")
+    assert run(*words, "--profile", "beam", "--quiet", capsys=capsys) == (0, "", "")
     assert len(converters.read(person / "out")) == 3
-
-
-def test_json(person, capsys):
-    code, out, _ = run(person / "take", person / "out" / "g.ply", "--json", capsys=capsys)
+    code, out, _ = run(*words, "--json", capsys=capsys)
     result = json.loads(out)
     assert code == 0
-    assert result["frame_count"] == 3
-    assert result["gaussian_count"] == 9
-    assert result["source_axes"] == "rfu"
+    assert (result["frame_count"], result["gaussian_count"], result["source_axes"]) == (3, 9, "rfu")
     assert len(result["outputs"]) == 3
     assert result["notes"] == ["materials are not in a standard PLY: --profile beam keeps them"]
 

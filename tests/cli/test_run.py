@@ -8,6 +8,7 @@ from support.commands import beam
 from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, write
+from beam_warp.cli.validate import main as validate
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import write_exr
 
@@ -50,8 +51,6 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
     plain = ("--width", 32, "--environment-shadows", 0, "--bounces", 0, "--quiet")
     assert beam("render", out / "asset.usda", "--environment", sky, "--out", shown, *plain) == 0
     assert shown.is_file()
-    from beam_warp.cli.validate import main as validate
-
     assert validate([str(out / "asset.usda"), "--quiet"]) == 0
 
 

@@ -168,11 +168,9 @@ def test_exposures_that_no_light_has(stops):
 
 
 def test_frames_without_radiance_or_gaussians_are_refused(tmp_path, light):
+    bare = frame().with_arrays(radiance=None, radiance_color_space=None)
     for cloud, complaint in (
-        (
-            frame().with_arrays(radiance=None, radiance_color_space=None),
-            "radiance must be given to decompose materials",
-        ),
+        (bare, "radiance must be given to decompose materials"),
         (frame().select(np.arange(0)), "a frame must hold at least one Gaussian"),
     ):
         with pytest.raises(InvalidArrayError, match=f"{complaint}, got none at frame 0"):
