@@ -32,6 +32,18 @@ def rng():
     return np.random.default_rng(20260)
 
 
+@pytest.fixture
+def coarse_irradiance(monkeypatch):
+    """Irradiance of lights from a quarter of the rows: a sixteenth of the time, errors of 5e-5 of uniform light."""
+    monkeypatch.setattr("beam_warp.world.environment.IRRADIANCE_ROWS", 128)
+
+
+@pytest.fixture
+def trusted_files(monkeypatch):
+    """Open USD files without the trial in a process of its own, which takes longer than reading those of tests."""
+    monkeypatch.setattr("beam_warp.schema.stage_queries.require_opens", lambda path: None)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of external captures and splats; tests that need it skip, saying so, where it is absent."""

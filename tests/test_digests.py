@@ -29,15 +29,12 @@ def wheel(tmp_path):
 
 def test_a_checkout_has_the_digest_of_its_wheel(wheel, tmp_path):
     """There, some packages lie beside the others, lines may end as on Windows, and compiled files lie around."""
-    inside = {
-        name: content.replace(b"\n", b"\r\n") for name, content in SOURCES.items() if name in ("a.py", "trace/rays.py")
-    }
+    as_on_windows = {name: SOURCES[name].replace(b"\n", b"\r\n") for name in ("a.py", "trace/rays.py")}
+    others = {"__pycache__/a.pyc": b"?", "py.typed": b"", "page.js": b""}
     checkout = {
         "schema": write(tmp_path / "checkout" / "schema", {"s.usda": SOURCES["schema/s.usda"]}),
         "kernels": write(tmp_path / "checkout" / "kernels", {"bvh.py": SOURCES["kernels/bvh.py"]}),
-        "": write(
-            tmp_path / "checkout" / "beam_warp", inside | {"__pycache__/a.pyc": b"?", "py.typed": b"", "page.js": b""}
-        ),
+        "": write(tmp_path / "checkout" / "beam_warp", as_on_windows | others),
     }
     assert source_digest(checkout) == source_digest(wheel)
     assert source_digest({**wheel, "kernels": wheel[""] / "kernels"}) == source_digest(wheel)

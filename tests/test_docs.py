@@ -5,11 +5,12 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+from support.drawn_ball import relightable
 
 from beam_warp import converters
 from beam_warp.image.files import write_exr
 from beam_warp.stage import files
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import LIGHT_TYPES
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -23,18 +24,8 @@ def blocks(page):
 def standing_cloud(x):
     """Six relightable Gaussians on a frame that stands off the origin."""
     places = np.array([(i, 3.0 + j, 1.0 + k) for i in (x, x + 1.0) for j, k in ((0, 0), (1, 0.5), (0.5, 2))])
-    return GaussianCloud(
-        positions=places,
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (6, 1)),
-        scales=np.full((6, 3), 0.1),
-        opacities=np.ones(6),
-        base_color=np.full((6, 3), 0.5),
-        roughness=np.full(6, 0.5),
-        ambient_occlusion=np.ones(6),
-        normals=np.tile([0.0, -1.0, 0.0], (6, 1)),
-        ids=np.arange(6),
-        axes="rfu",
-    )
+    normals = np.tile([0.0, -1.0, 0.0], (6, 1))
+    return relightable(places, scales=np.full((6, 3), 0.1), normals=normals, ids=np.arange(6), axes="rfu")
 
 
 def test_the_fit_of_the_rasterizer_page(capsys):
@@ -62,7 +53,7 @@ def test_the_example_of_the_tracking_page():
     assert abs(scope["to_positions"].numpy().sum(axis=0) - 5000.0).max() < 0.1
 
 
-def test_the_example_of_the_stages_page(tmp_path, monkeypatch, capsys):
+def test_the_example_of_the_stages_page(tmp_path, monkeypatch, capsys, trusted_files):
     """The stage reads, and what it shows is what the page says of it."""
     clouds = [standing_cloud(0.1 * frame) for frame in range(4)]
     converters.write(GaussianSequence.from_clouds(clouds, frames_per_second=24.0), tmp_path / "walker.usdz")

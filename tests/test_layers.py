@@ -1,6 +1,8 @@
 """Imports point one way: a package imports only packages of lower floors, and no modules of a package form a circle."""
 
 import ast
+from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -54,19 +56,20 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Every statement below a node, at any depth, type-checking blocks left out."""
+    for part in ("body", "orelse", "handlers", "finalbody", "cases"):
+        for inner in getattr(node, part, ()):
+            if not (isinstance(inner, ast.If) and "TYPE_CHECKING" in ast.unparse(inner.test)):
+                yield inner
+                yield from statements(inner)
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """Every module that a file imports, at any depth, type-checking blocks left out."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    skipped = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        for inner in ast.walk(node)
-    }
     names = set()
-    for node in ast.walk(tree):
-        if id(node) in skipped:
-            continue
+    for node in statements(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -75,29 +78,20 @@ def imports(path: Path) -> set[str]:
     return names
 
 
-def heights(table: str, place: int) -> dict[str, int]:
-    """Name → floor; fails where the table and the folders disagree."""
-    floors = {name: height for height, row in enumerate(table.strip().splitlines()) for name in row.split()}
-    there = {name.split(".")[place] for name in MODULES if name.count(".") >= place}
-    there -= {"_version"} if place == 1 else set()
-    if place == 2:
-        there = {n.split(".")[2] for n in MODULES if n.startswith("beam_warp.kernels.")}
-    assert there == set(floors), "the table of floors must name every package once"
-    return floors
+def homes(place: int) -> dict[str, str]:
+    """Module → its package (place 1), or its family of kernels (place 2)."""
+    inside = "beam_warp." if place == 1 else "beam_warp.kernels."
+    return {module: module.split(".")[place] for module in MODULES if module.startswith(inside)}
 
 
 @pytest.mark.parametrize(("table", "place"), [(FLOORS, 1), (KERNEL_FLOORS, 2)], ids=["packages", "kernels"])
 def test_imports_point_down(table, place):
-    floors = heights(table, place)
-    for module, path in MODULES.items():
-        parts = module.split(".")
-        if len(parts) <= place or parts[place] not in floors or (place == 2 and parts[1] != "kernels"):
-            continue
-        for name in imports(path) & set(MODULES):
-            other = name.split(".")
-            if len(other) <= place or other[place] not in floors or (place == 2 and other[1] != "kernels"):
-                continue
-            here, there = parts[place], other[place]
+    floors = {name: height for height, row in enumerate(table.strip().splitlines()) for name in row.split()}
+    home = {module: name for module, name in homes(place).items() if name != "_version"}
+    assert set(home.values()) == set(floors), "the table of floors must name every package once"
+    for module, here in home.items():
+        for name in imports(MODULES[module]) & set(home):
+            there = home[name]
             down = floors[there] < floors[here] or here == there or (here, there) in ALLOWED
             assert down, f"{module} imports {name}, which is not below it"
 

@@ -50,40 +50,20 @@ def test_every_module_is_in_the_wheel(wheel_names, folder):
 
 
 @pytest.mark.slow
-def test_schema_files_and_type_marker_are_in_the_wheel(wheel_names):
-    for name in (
-        "schema/plugInfo.json",
-        "schema/generatedSchema.usda",
-        "schema/schema.usda",
-        "schema/SPEC.md",
-        "py.typed",
-        "__init__.pyi",
-        "raster/__init__.pyi",
-        "study/page.js",
-        "capture/page.js",
-    ):
-        assert f"beam_warp/{name}" in wheel_names
-
-
-@pytest.mark.slow
-def test_licence_is_in_the_wheel(wheel_names):
+def test_licence_and_files_that_are_no_modules_are_in_the_wheel(wheel_names):
+    schema = {f"schema/{name}" for name in ("plugInfo.json", "generatedSchema.usda", "schema.usda", "SPEC.md")}
+    typing, pages = {"py.typed", "__init__.pyi", "raster/__init__.pyi"}, {"study/page.js", "capture/page.js"}
+    assert {f"beam_warp/{name}" for name in schema | typing | pages} <= wheel_names
     assert any(name.endswith("/licenses/LICENSE") for name in wheel_names)
 
 
-def modules_after(code):
-    script = f"{code}\nimport sys\nprint(*sys.modules)"
-    return set(
-        subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.split()
-    )
-
-
-def test_import_costs_neither_warp_nor_usd_nor_scipy():
-    assert not modules_after("import beam_warp") & {"warp", "pxr", "scipy", "trimesh", "h5py", "OpenEXR", "skimage"}
-
-
-def test_records_need_no_warp():
-    code = "from beam_warp import GaussianCloud, Camera, EnvironmentMap, Capture, read, write"
-    assert not modules_after(code) & {"warp", "pxr"}
+def test_neither_import_nor_records_cost_warp_or_usd():
+    records = "from beam_warp import GaussianCloud, Camera, EnvironmentMap, Capture, read, write"
+    script = f"import sys, beam_warp\nprint(*sys.modules)\n{records}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    after_import, after_records = (set(line.split()) for line in done.stdout.splitlines())
+    assert not after_import & {"warp", "pxr", "scipy", "trimesh", "h5py", "OpenEXR", "skimage"}
+    assert not after_records & {"warp", "pxr"}
 
 
 FACES = sorted(

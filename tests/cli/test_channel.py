@@ -99,21 +99,16 @@ def test_a_channel_from_the_cameras_of_a_capture(judged, tmp_path):
         (["roughness", "--out", "no/x.png"], "out must be in a folder that exists, got no"),
     ],
 )
-def test_refusals_are_one_line(tmp_path, capsys, monkeypatch, words, message):
+def test_refusals_are_one_line(tmp_path, monkeypatch, refused, words, message):
     monkeypatch.chdir(tmp_path)
     save([drawn_ball()], tmp_path / "ball.ply")
-    assert run("ball.ply", "--out", "x.png", *words) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply"]
+    refused("channel", "ball.ply", "--out", "x.png", *words, says=message)
 
 
-def test_the_option_that_it_was_names_the_command(tmp_path, capsys):
+def test_the_option_that_it_was_names_the_command(tmp_path, refused):
+    says = "error: channel must be drawn by a command of its own. Use beam channel ASSET NAME --out FILE."
     for words in (["--channel", "roughness"], ["--channel=roughness"]):
-        assert main(["render", "x.ply", *words, "--out", str(tmp_path / "x.png")]) == 2
-        expected = "error: channel must be drawn by a command of its own. Use beam channel ASSET NAME --out FILE.\n"
-        assert capsys.readouterr().err == expected
+        refused("render", "x.ply", *words, "--out", tmp_path / "x.png", says=says)
 
 
 def test_records_are_those_that_the_asset_says_it_shows(tmp_path, capsys):

@@ -55,36 +55,22 @@ def test_a_file(person, capsys):
     assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
 
 
-def test_a_sequence(person, capsys):
-    code, out, err = run(person / "take", person / "out" / "g.ply", "--profile", "beam", "--quiet", capsys=capsys)
-    assert (code, out, err) == (0, "", "")
+def test_a_sequence_quietly_and_as_json(person, capsys):
+    words = (person / "take", person / "out" / "g.ply")
+    assert run(*words, "--profile", "beam", "--quiet", capsys=capsys) == (0, "", "")
     assert len(converters.read(person / "out")) == 3
-
-
-def test_json(person, capsys):
-    code, out, _ = run(person / "take", person / "out" / "g.ply", "--json", capsys=capsys)
+    code, out, _ = run(*words, "--json", capsys=capsys)
     result = json.loads(out)
     assert code == 0
-    assert result["frame_count"] == 3
-    assert result["gaussian_count"] == 9
-    assert result["source_axes"] == "rfu"
+    assert (result["frame_count"], result["gaussian_count"], result["source_axes"]) == (3, 9, "rfu")
     assert len(result["outputs"]) == 3
     assert result["notes"] == ["materials are not in a standard PLY: --profile beam keeps them"]
 
 
 def test_every_option_reaches_the_reader_and_the_writer(person, capsys):
-    options = (
-        "--source-axes",
-        "rub",
-        "--meters-per-unit",
-        "0.5",
-        "--sh-degree",
-        "3",
-        "--material-activation",
-        "linear",
-    )
-    options += ("--activation", "log", "--drop-invalid", "--profile", "beam", "--target", "usd")
-    code, _, _ = run(person / "person.ply", person / "out" / "a.ply", *options, capsys=capsys)
+    options = "--source-axes rub --meters-per-unit 0.5 --sh-degree 3 --material-activation linear"
+    options += " --activation log --drop-invalid --profile beam --target usd"
+    code, _, _ = run(person / "person.ply", person / "out" / "a.ply", *options.split(), capsys=capsys)
     before, after = (converters.read(path)[0] for path in (person / "person.ply", person / "out" / "a.ply"))
     assert code == 0
     assert (after.axes, after.sh_degree) == ("rub", 3)
@@ -105,19 +91,23 @@ def test_the_input_is_never_written_over(person, capsys):
 
 
 @pytest.mark.parametrize(
-    ("source", "output", "message"),
+    ("words", "message"),
     [
-        ("gone.ply", "out/a.ply", "error: input must be an existing file or folder, got "),
-        ("person.ply", "nowhere/a.ply", "error: output folder must exist, got "),
-        ("person.ply", "out/a.obj", "error: file name must end in one of .ply, .usd, "),
-        ("person.ply", "out/a.compressed.ply", "error: output must be a plain .ply, got a.compressed.ply"),
-        ("person.ply", "out", "error: file name must end in one of .ply, .usd, "),
-        ("out", "out/a.ply", "error: folder out must hold numbered files"),
+        ("gone.ply out/a.ply", "error: input must be an existing file or folder, got "),
+        ("person.ply nowhere/a.ply", "error: output folder must exist, got "),
+        ("person.ply out/a.obj", "error: file name must end in one of .ply, .usd, "),
+        ("person.ply out/a.compressed.ply", "error: output must be a plain .ply, got a.compressed.ply"),
+        ("person.ply out", "error: file name must end in one of .ply, .usd, "),
+        ("out out/a.ply", "error: folder out must hold numbered files"),
+        ("person.ply out/a.ply --sh-degree 4", "error: sh_degree must be "),
+        ("person.ply out/a.ply --source-axes xyz", "error: source_axes must be "),
+        ("person.ply out/a.ply --meters-per-unit -1", "error: meters_per_unit must be "),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(person, capsys, source, output, message):
+def test_mistakes_are_one_line_and_leave_nothing(person, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(person)
     started = time.perf_counter()
-    code, out, err = run(person / source, person / output, capsys=capsys)
+    code, out, err = run(*words.split(), capsys=capsys)
     assert time.perf_counter() - started < 2.0
     assert (code, out) == (2, "")
     assert err.startswith(message)
@@ -131,13 +121,6 @@ def test_a_closed_folder(person, capsys):
     code, _, err = run(person / "person.ply", person / "out" / "a.ply", capsys=capsys)
     assert code == 2
     assert err.startswith("error: output folder must be writable, got ")
-
-
-@pytest.mark.parametrize("option", [("--sh-degree", "4"), ("--source-axes", "xyz"), ("--meters-per-unit", "-1")])
-def test_options_out_of_range(person, capsys, option):
-    code, _, err = run(person / "person.ply", person / "out" / "a.ply", *option, capsys=capsys)
-    assert code == 2
-    assert err.startswith(f"error: {option[0][2:].replace('-', '_')} must be ")
 
 
 def test_inspect(person, capsys):
@@ -165,12 +148,9 @@ def test_ply_to_ply_costs_neither_warp_nor_usd(person):
     script = (
         "import sys\n"
         "from beam_warp.cli.convert import main\n"
-        "code = main(sys.argv[1:])\n"
+        "code = main(['person.ply', 'out/a.ply', '--target', 'unreal']) or main(['inspect', 'person.ply'])\n"
         "heavy = {'warp', 'pxr', 'OpenEXR', 'scipy', 'trimesh', 'h5py'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else code)\n"
     )
-    for arguments in (["person.ply", "out/a.ply", "--target", "unreal"], ["inspect", "person.ply"]):
-        finished = subprocess.run(
-            [sys.executable, "-c", script, *arguments], cwd=person, capture_output=True, text=True, timeout=30
-        )
-        assert finished.returncode == 0, finished.stderr
+    done = subprocess.run([sys.executable, "-c", script], cwd=person, capture_output=True, text=True, timeout=30)
+    assert done.returncode == 0, done.stderr

@@ -6,14 +6,10 @@ import subprocess
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image as PillowImage
+from support.commands import beam
 from support.sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
-
-from beam_warp.cli.main import main
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 @pytest.fixture(scope="module")
@@ -22,30 +18,32 @@ def sound(tmp_path_factory):
     folder.mkdir()
     content = write_sound(folder)
     content["ply_file_path"] = "points.ply"
-    properties = "".join(f"property float {n}\n" for n in "xyz") + "".join(
-        f"property uchar {n}\n" for n in ("red", "green", "blue")
-    )
-    (folder / "points.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n0.3 -0.2 0.9 255 0 0\n9 9 9 0 255 0\n"
-    )
+    points = trimesh.PointCloud([[0.3, -0.2, 0.9], [9, 9, 9]], colors=[[255, 0, 0], [0, 255, 0]])
+    points.export(folder / "points.ply")
     save(folder, content)
     return folder
 
 
-def test_a_sound_capture(sound, tmp_path, capsys):
-    out = tmp_path / "made" / "here"
-    assert beam("inspect", sound, "--out", out) == 0
-    said = capsys.readouterr().out
-    assert "ready (12 cameras, 3 frames, 36 images (36 train); 36 looked at)" in said
-    assert {path.name for path in out.iterdir()} == {"capture.png", "capture.html"}
-    with PillowImage.open(out / "capture.png") as picture:
+@pytest.fixture(scope="module")
+def pages(sound, tmp_path_factory):
+    """What is written of it."""
+    out = tmp_path_factory.mktemp("pages") / "made" / "here"
+    assert beam("inspect", sound, "--out", out, "--quiet") == 0
+    return out
+
+
+def test_the_picture_of_a_sound_capture(pages):
+    assert {path.name for path in pages.iterdir()} == {"capture.png", "capture.html"}
+    with PillowImage.open(pages / "capture.png") as picture:
         assert picture.width == 1200
         pixels = np.asarray(picture.convert("RGB"))
-    shades = {tuple(color) for color in pixels.reshape(-1, 3)}
-    assert {(0, 114, 178), (46, 139, 87)} <= shades  # frustums of trained cameras, the common volume
+    for color in ((0, 114, 178), (46, 139, 87)):  # frustums of trained cameras, the common volume
+        assert (pixels == color).all(axis=-1).any()
 
 
-def test_json_and_quiet(sound, capsys):
+def test_words_json_and_quiet(sound, capsys):
+    assert beam("inspect", sound) == 0
+    assert "ready (12 cameras, 3 frames, 36 images (36 train); 36 looked at)" in capsys.readouterr().out
     assert beam("inspect", sound, "--json", "--max-images", CAMERAS) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["cameras"], report["frames"], report["images_read"]) == (CAMERAS, FRAMES, CAMERAS)
@@ -62,9 +60,7 @@ def test_an_error_is_exit_code_1(tmp_path, capsys):
     save(tmp_path, content)
     assert beam("inspect", tmp_path, "--out", tmp_path / "out") == 1
     said = capsys.readouterr().out
-    assert (
-        "error: the cameras do not look at a common place, and would with their axes changed. Probably OpenCV" in said
-    )
+    assert "error: the cameras do not look at a common place, and would with their axes changed. Probably" in said
     assert "cannot be reconstructed: " in said
     assert (tmp_path / "out" / "capture.png").is_file()
 
@@ -79,18 +75,15 @@ def test_left_out_cameras_are_drawn_so(tmp_path):
     assert {camera["name"]: camera["kind"] for camera in data["cameras"]}["c03"] == "left out"
 
 
-def test_what_cannot_be_read_is_exit_code_2(tmp_path, capsys):
-    assert beam("inspect", tmp_path / "nowhere") == 2
-    assert "error: capture must be a folder with transforms.json, a COLMAP model" in capsys.readouterr().err
+def test_what_cannot_be_read_or_written(tmp_path, refused):
+    refused("inspect", tmp_path / "nowhere", says="capture must be a folder with transforms.json, a COLMAP model")
     (tmp_path / "file").touch()
     write_sound(tmp_path)
-    assert beam("inspect", tmp_path, "--out", tmp_path / "file") == 2
-    assert "error: out must be a folder" in capsys.readouterr().err
+    refused("inspect", tmp_path, "--out", tmp_path / "file", says="out must be a folder")
 
 
-def test_the_page_needs_nothing_and_its_script_runs(sound, tmp_path):
-    assert beam("inspect", sound, "--out", tmp_path, "--quiet") == 0
-    text = (tmp_path / "capture.html").read_text(encoding="utf-8")
+def test_the_page_needs_nothing_and_its_script_runs(pages, tmp_path):
+    text = (pages / "capture.html").read_text(encoding="utf-8")
     start = text.index("<body>")
     assert "dancer &lt;1&gt;" in text[start:]
     assert set(re.findall(r'(?:src|href)="(.{10})', text[start:])) == {"data:image"}
@@ -123,9 +116,3 @@ def test_the_page_needs_nothing_and_its_script_runs(sound, tmp_path):
     assert said["lines"] == CAMERAS * said["pointed"]
     assert said["faces"] > 0
     assert said["faces"] % 2 == 0
-
-
-def test_help_has_an_example(capsys):
-    with pytest.raises(SystemExit):
-        beam("inspect", "--help")
-    assert "Example: beam inspect captures/walker --out report" in capsys.readouterr().out

@@ -36,17 +36,15 @@ def write_capture(folder, frames):
     """Cameras around the ball, without images: none are needed."""
     folder.mkdir()
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    records = []
-    for i, split in enumerate(["train"] * 8 + ["test"]):
-        camera = Camera.orbit((0, 0, 0), 3.0, 45.0 * i, 40.0 * (-1) ** i, width=64, height=64, vertical_fov=30.0)
-        records += [
-            {
-                "file_path": f"images/{i}/{frame:04d}.exr", "camera": f"cam{i}", "frame": frame, "split": split,
-                "transform_matrix": (camera.camera_to_world @ flip).tolist(),
-            }
-            for frame in frames
-        ]  # fmt: skip
-    content = {"w": 64, "h": 64, "fl_x": camera.focal_x, "fl_y": camera.focal_y, "cx": 32, "cy": 32, "frames": records}
+    seen = {"width": 64, "height": 64, "vertical_fov": 30.0}
+    cameras = [Camera.orbit((0, 0, 0), 3.0, 45.0 * i, 40.0 * (-1) ** i, **seen) for i in range(9)]
+    records = [
+        {"file_path": f"images/{i}/{frame:04d}.exr", "camera": f"cam{i}", "frame": frame,
+         "split": "train" if i < 8 else "test", "transform_matrix": (camera.camera_to_world @ flip).tolist()}
+        for i, camera in enumerate(cameras) for frame in frames
+    ]  # fmt: skip
+    focal = {"fl_x": cameras[0].focal_x, "fl_y": cameras[0].focal_y}
+    content = {"w": 64, "h": 64, **focal, "cx": 32, "cy": 32, "frames": records}
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
@@ -150,12 +148,11 @@ def test_large_canonical_mesh_is_fused_again(sequence, tmp_path, capsys, monkeyp
     assert frame["canonical"]["voxel"] > frame["voxel"]
 
 
-def test_mistakes(sequence, tmp_path, capsys):
+def test_mistakes(sequence, tmp_path, refused):
     for words, says in (
         (("--frames", "7"), "frames must be an integer in [0, 1], got 7"),
         (("--voxel", "-1"), "voxel must be a number in"),
         (("--out", tmp_path / "none" / "out"), "out must be a folder that can be made"),
         (("--confirmations", "99"), "depth must be seen"),
     ):
-        assert run(sequence, "--out", tmp_path / "out", *FAST, "--frames", "0", *words) == 2
-        assert says in capsys.readouterr().err
+        refused("mesh", sequence, "--out", tmp_path, *FAST, "--frames", "0", *words, says=says)

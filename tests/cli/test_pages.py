@@ -87,6 +87,12 @@ def test_options_of_the_second_page_are_read_like_others(capsys):
     assert options_of(help_of(lambda words: parse(Outer, words, "x"), ["--help"], capsys)) == {"help", "out", "low"}
 
 
-def test_help_does_not_wait_for_warp():
-    code = "import sys; from beam_warp.cli.main import main; main(['--help']); sys.exit('warp' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+def test_help_and_mistakes_do_not_wait_for_warp(tmp_path):
+    script = (
+        "import sys\nfrom beam_warp.cli.main import main\n"
+        "assert main(['--help']) == 0\nassert 'warp' not in sys.modules\n"
+        "assert main(['run', 'none.ply', '--environment', 'x.exr', '--out', 'y']) == 2\n"
+        "assert not {'warp', 'pxr'} & set(sys.modules), sorted(sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.main import main
 from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
@@ -30,10 +30,6 @@ def asked(monkeypatch):
     monkeypatch.setattr("beam_warp.cli.reconstruct.steps_of", steps_of)
     monkeypatch.setattr("beam_warp.cli.run.steps_of", steps_of)
     return found
-
-
-def beam(*words):
-    return main([str(word) for word in words])
 
 
 class TestReconstruct:
@@ -63,73 +59,46 @@ class TestReconstruct:
         assert beam(*words, "--json") == 0
         assert json.loads(capsys.readouterr().out)["resumed_frames"] == 4
 
-    @pytest.mark.parametrize(
-        ("words", "says"),
-        [
-            (("--part", "3/2", "--segment-length", 2), "part must be I/N with 1 <= I <= N, got 3/2"),
-            (("--part", "one"), "part must be I/N with 1 <= I <= N, got one"),
-            (("--part", "1/2"), "segment_length must be at least 1 to work in parts"),
-            (("--frames", "7:9"), "frames must hold some of the capture's 4 from 0 to 3, got 7:9"),
-            (("--frames", "3"), "frames must be A:B or A:B:S, got 3"),
-            (("--segment-length", -2), "segment_length must be"),
-        ],
-    )
-    def test_mistakes(self, folder, asked, tmp_path, capsys, words, says):
-        assert beam("reconstruct", folder, "--out", tmp_path / "out", *words) == 2
-        said = capsys.readouterr()
-        (line,) = said.err.strip().splitlines()
-        assert line.startswith("error: ")
-        assert says in line
-        assert not (tmp_path / "out").exists()
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("reconstruct {folder} --part 3/2 --segment-length 2", "part must be I/N with 1 <= I <= N, got 3/2"),
+        ("reconstruct {folder} --part one", "part must be I/N with 1 <= I <= N, got one"),
+        ("reconstruct {folder} --part 1/2", "segment_length must be at least 1 to work in parts"),
+        ("reconstruct {folder} --frames 7:9", "frames must hold some of the capture's 4 from 0 to 3, got 7:9"),
+        ("reconstruct {folder} --frames 3", "frames must be A:B or A:B:S, got 3"),
+        ("reconstruct {folder} --segment-length -2", "segment_length must be"),
+        ("run {folder} --source-axes rdf", "source-axes, drop-invalid and persistent must be left out for a capture"),
+        ("run {folder} --persistent", "source-axes, drop-invalid and persistent must be left out for a capture"),
+        ("run {folder} --samples 0", "sample_count must be"),
+        ("run {folder} --fps 0", "frames_per_second must be"),
+        ("run {folder} --frames 9:", "frames must hold some"),
+        ("run {folder} --environment none.exr", "none.exr"),
+        ("run {dark}", "environment must be given, got none for"),
+        ("run some.ply", "Gaussians come without their light"),
+        ("run some.ply --gaussians 9", "must be left out unless the input is a capture"),
+    ],
+)
+def test_mistakes_cost_no_reconstruction(folder, asked, tmp_path, refused, words, says):
+    dark = write_capture(tmp_path / "dark", (0,), environment=False)
+    words = words.format(folder=folder, dark=dark)
+    refused(*words.split(), "--out", tmp_path / "out", says=says)
 
 
-class TestRunOfACapture:
-    def test_from_images_to_an_asset_and_again(self, folder, asked, tmp_path, capsys):
-        words = ("run", folder, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", ":2")
-        assert beam(*words) == 0
-        said = capsys.readouterr()
-        assert "2 frames, 1 segment, 60 Gaussians" in said.out
-        assert "asset.usda: 2 frames" in said.out
-        assert "exposure of the light +0.00 stops" in said.out
-        assert (tmp_path / "out" / "reconstruction" / "gaussians.usda").is_file()
-        assert (tmp_path / "out" / "asset.usda").is_file()
-        assert beam(*words, "--json") == 0
-        report = json.loads(capsys.readouterr().out)
-        assert report["resumed_frames"] == report["reconstruction"]["resumed_frames"] == 2
-        assert report["persistent"]
-
-    def test_another_light_may_be_named(self, folder, asked, tmp_path, capsys):
-        words = ("run", folder, "--out", tmp_path / "out", "--environment", tmp_path / "none.exr")
-        assert beam(*words) == 2
-        assert "none.exr" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
-
-    def test_a_capture_without_light(self, asked, tmp_path, capsys):
-        dark = write_capture(tmp_path / "dark", (0,), environment=False)
-        assert beam("run", dark, "--out", tmp_path / "out") == 2
-        assert "environment must be given, got none for" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
-
-    @pytest.mark.parametrize(
-        ("words", "says"),
-        [
-            (("--source-axes", "rdf"), "source-axes, drop-invalid and persistent must be left out for a capture"),
-            (("--persistent",), "source-axes, drop-invalid and persistent must be left out for a capture"),
-            (("--samples", 0), "sample_count must be"),
-            (("--fps", 0), "frames_per_second must be"),
-            (("--frames", "9:"), "frames must hold some"),
-        ],
-    )
-    def test_mistakes_cost_no_reconstruction(self, folder, asked, tmp_path, capsys, words, says):
-        assert beam("run", folder, "--out", tmp_path / "out", *words) == 2
-        assert says in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
-
-    def test_gaussians_need_a_light_and_no_modelling(self, tmp_path, capsys):
-        assert beam("run", tmp_path / "some.ply", "--out", tmp_path / "out") == 2
-        assert "Gaussians come without their light" in capsys.readouterr().err
-        assert beam("run", tmp_path / "some.ply", "--out", tmp_path / "out", "--gaussians", 9) == 2
-        assert "must be left out unless the input is a capture" in capsys.readouterr().err
+def test_a_run_from_images_to_an_asset_and_again(folder, asked, tmp_path, capsys):
+    words = ("run", folder, "--out", tmp_path / "out", "--samples", 4, "--device", "cpu", "--frames", ":2")
+    assert beam(*words) == 0
+    said = capsys.readouterr()
+    assert "2 frames, 1 segment, 60 Gaussians" in said.out
+    assert "asset.usda: 2 frames" in said.out
+    assert "exposure of the light +0.00 stops" in said.out
+    assert (tmp_path / "out" / "reconstruction" / "gaussians.usda").is_file()
+    assert (tmp_path / "out" / "asset.usda").is_file()
+    assert beam(*words, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["resumed_frames"] == report["reconstruction"]["resumed_frames"] == 2
+    assert report["persistent"]
 
 
 class TestDetection:
@@ -160,29 +129,28 @@ def test_the_words_reach_the_optimiser(folder):
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
     assert steps.device == "cpu"
-    assert (
-        steps.options() != steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu").options()
-    )
+    fast = steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu")
+    assert steps.options() != fast.options()
 
 
-class TestWords:
-    def test_frames(self):
-        there = (0, 2, 4, 6, 8)
-        assert frames_of("2:6", there) == (2, 4)
-        assert frames_of(":3", there) == (0, 2)
-        assert frames_of("3:", there) == (4, 6, 8)
-        assert frames_of("::2", there) == (0, 4, 8)
-        assert frames_of(":", there) == there
+@pytest.mark.parametrize(
+    ("words", "frames"),
+    [("2:6", (2, 4)), (":3", (0, 2)), ("3:", (4, 6, 8)), ("::2", (0, 4, 8)), (":", (0, 2, 4, 6, 8))],
+)
+def test_words_for_frames(words, frames):
+    assert frames_of(words, (0, 2, 4, 6, 8)) == frames
 
-    @pytest.mark.parametrize("words", ["", "3", "a:b", "1:2:0", "1:2:3:4"])
-    def test_no_frames(self, words):
-        with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
-            frames_of(words, (0, 1, 2))
 
-    @pytest.mark.parametrize("words", ["", "1/", "0/1", "2/1", "-1/2", "a/b"])
-    def test_no_part(self, words):
-        with pytest.raises(InvalidOptionError, match="part must be I/N"):
-            part_of(words)
+@pytest.mark.parametrize("words", ["", "3", "a:b", "1:2:0", "1:2:3:4"])
+def test_words_for_no_frames(words):
+    with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
+        frames_of(words, (0, 1, 2))
+
+
+@pytest.mark.parametrize("words", ["", "1/", "0/1", "2/1", "-1/2", "a/b"])
+def test_words_for_no_part(words):
+    with pytest.raises(InvalidOptionError, match="part must be I/N"):
+        part_of(words)
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def test_it_is_drawn_as_the_asset_says_unless_told_otherwise(white_light, tmp_pa
 
 def test_look_at_and_size(ball, white_light, tmp_path):
     out = tmp_path / "x.exr"
-    look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, "--aov"]
+    look = ["--look-at", 0, -5, 0, 0, 0, 0, "--fov", 20, "--width", 60, "--height", 30, *PLAIN, "--aov"]
     assert run(ball, "--environment", white_light, "--out", out, *look) == 0
     image = read_image(out)
     assert (image.width, image.height) == (60, 30)
@@ -241,39 +241,32 @@ def test_bent_photographs_are_drawn_as_their_undistorted_images(ball, white_ligh
 def test_the_capture_brings_its_light(ball, white_light, tmp_path):
     write_capture(tmp_path / "capture", [("b", 0, "test")])
     white_light.rename(tmp_path / "capture" / "environment.exr")
-    assert run(ball, "--capture", tmp_path / "capture", "--out", tmp_path / "out") == 0
+    assert run(ball, "--capture", tmp_path / "capture", "--out", tmp_path / "out", *PLAIN) == 0
     assert read_image(tmp_path / "out" / "b_0000.exr").channels["G"].max() > 0.3
 
 
-def test_what_is_missing_is_named(ball, white_light, tmp_path, capsys):
-    out = tmp_path / "x.png"
-    assert run(ball, "--out", out) == 2
-    assert "environment must be given, got none" in capsys.readouterr().err
-    assert run(ball, "--environment", tmp_path / "no.exr", "--out", out) == 2
-    assert "no.exr" in capsys.readouterr().err
+def test_what_is_missing_is_named(ball, white_light, tmp_path, refused):
     converters.write(GaussianSequence.from_clouds([drawn_ball()]), tmp_path / "plain.ply")
-    assert run(tmp_path / "plain.ply", "--environment", white_light, "--out", out) == 2
-    error = capsys.readouterr().err
-    assert (
-        "asset must be relightable, got one without base_color, roughness, ambient_occlusion in frame 0 of plain"
-        in error
-    )
-    assert "beam run" in error
-    assert not out.exists()
+    lacking = "one without base_color, roughness, ambient_occlusion in frame 0 of plain"
+    for words, says in (
+        ([ball], "environment must be given, got none"),
+        ([ball, "--environment", tmp_path / "no.exr"], "no.exr"),
+        ([tmp_path / "plain.ply", "--environment", white_light], f"asset must be relightable, got {lacking}"),
+        ([tmp_path / "plain.ply", "--environment", white_light], "beam run"),
+    ):
+        refused("render", *words, "--out", tmp_path / "x.png", says=says)
 
 
-def test_capture_refusals(ball, white_light, tmp_path, capsys):
+def test_capture_refusals(ball, white_light, tmp_path, refused):
     write_capture(tmp_path / "late", [("b", 5, "test")])
-    out = tmp_path / "out"
-    common = [ball, "--environment", white_light, "--out", out]
-    assert run(*common, "--capture", tmp_path / "late") == 2
-    assert "asset must have a frame that the records of split 'test' show, got 1 frames" in capsys.readouterr().err
-    assert run(*common, "--capture", tmp_path / "late", "--split", "val") == 2
-    assert "split must name records of the capture, got 'val' (it has test)" in capsys.readouterr().err
-    assert not out.exists()
-    out.touch()
-    assert run(*common, "--capture", tmp_path / "late") == 2
-    assert "out must be a folder with --capture, got the file" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    for words, says in (
+        (["out"], "asset must have a frame that the records of split 'test' show, got 1 frames"),
+        (["out", "--split", "val"], "split must name records of the capture, got 'val' (it has test)"),
+        (["file"], "out must be a folder with --capture, got the file"),
+    ):
+        common = [ball, "--environment", white_light, "--capture", tmp_path / "late"]
+        refused("render", *common, "--out", tmp_path / words[0], *words[1:], says=says)
 
 
 def test_broken_rows_are_refused_or_left_out_and_counted(ball, white_light, tmp_path, capsys):
@@ -281,7 +274,7 @@ def test_broken_rows_are_refused_or_left_out_and_counted(ball, white_light, tmp_
     start = content.index(b"end_header\n") + len(b"end_header\n")
     content[start : start + 4] = np.float32(np.nan).tobytes()
     ball.write_bytes(content)
-    words = (ball, "--environment", white_light, "--out", tmp_path / "x.png", *SIDE, "--device", "cpu")
+    words = (ball, "--environment", white_light, "--out", tmp_path / "x.png", *SIDE, *PLAIN, "--device", "cpu")
     assert run(*words) == 2
     assert "must be finite" in capsys.readouterr().err
     assert run(*words, "--drop-invalid") == 0

@@ -129,10 +129,6 @@ class TestFrames:
         shown = read_image(tmp_path / "f" / "003.exr").channels
         np.testing.assert_allclose(shown["G"][0], 0.1 * (1 + 3.0 + points(0).positions[:, 0].mean()), rtol=1e-5)
 
-    def test_negative_numbers_count_from_the_end(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--frames=-2:") == 0
-        np.testing.assert_allclose(recorder.places(), [2.0, 3.0], atol=POSITION)
-
     def test_part_of_a_sequence_is_seen_like_the_whole(self, common, recorder, tmp_path):
         assert run(*common, "--out", tmp_path / "a%d.png") == 0
         assert run(*common, "--out", tmp_path / "b%d.png", "--frames", "2:3", "--turntable", 0) == 0
@@ -148,13 +144,11 @@ class TestFrames:
         assert run(*words) == 0
         np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3, 1], atol=POSITION)
 
-    def test_another_render_is_refused_unless_it_may_overwrite(self, common, recorder, tmp_path, capsys):
+    def test_another_render_is_refused_unless_it_may_overwrite(self, common, recorder, tmp_path, refused):
         words = [*common, "--out", tmp_path / "%d.png"]
-        assert run(*words) == 0
-        assert run(*words, "--view", "agx") == 2
-        captured = capsys.readouterr()
-        assert "frames that are there must be of the same render" in captured.err
-        assert captured.err.count("\n") == 1
+        assert run(*words) == run(*words, "--samples", 2) == 0
+        for other in (["--view", "agx"], ["--samples", 1]):
+            refused("render", *words, *other, says="frames that are there must be of the same render")
         assert run(*words, "--view", "agx", "--overwrite") == 0
         assert len(recorder.shots) == 8
 
@@ -171,35 +165,35 @@ class TestFrames:
         np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3], atol=POSITION)
 
 
-class TestTime:
-    def test_another_rate_blends_frames(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--fps", 20) == 0
-        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5, 2, 2.5, 3, 3], atol=POSITION)
-
-    def test_half_speed(self, common, recorder, tmp_path):
-        assert run(*common, "--out", tmp_path / "%d.png", "--speed", 0.5, "--frames", "0:2") == 0
-        np.testing.assert_allclose(recorder.places(), [0, 0.5, 1, 1.5], atol=POSITION)
-
-    def test_loop_and_hold(self, common, recorder, tmp_path):
-        for name, more in (("a", ["--loop"]), ("b", [])):
-            assert run(*common, "--out", tmp_path / f"{name}%d.png", "--seconds", 0.6, *more) == 0
-        np.testing.assert_allclose(recorder.places(), [0, 1, 2, 3, 0, 1, 0, 1, 2, 3, 3, 3], atol=POSITION)
+@pytest.mark.parametrize(
+    ("words", "places"),
+    [
+        ("--frames=-2:", [2, 3]),
+        ("--fps 20", [0, 0.5, 1, 1.5, 2, 2.5, 3, 3]),
+        ("--speed 0.5 --frames 0:2", [0, 0.5, 1, 1.5]),
+        ("--seconds 0.6", [0, 1, 2, 3, 3, 3]),
+        ("--seconds 0.6 --loop", [0, 1, 2, 3, 0, 1]),
+    ],
+    ids=["numbers from the end", "blended frames", "half speed", "the last is held", "all again"],
+)
+def test_moments(common, recorder, tmp_path, words, places):
+    assert run(*common, "--out", tmp_path / "%d.png", *words.split()) == 0
+    np.testing.assert_allclose(recorder.places(), places, atol=POSITION)
 
 
 class TestCamera:
-    def test_a_turntable_goes_around(self, common_still, recorder, tmp_path):
-        more = ["--turntable", 90, "--seconds", 2, "--fps", 2, "--orbit", 10, 0]
-        assert run(*common_still, "--out", tmp_path / "%d.png", *more) == 0
-        np.testing.assert_allclose(recorder.azimuths(), [10, 55, 100, 145], atol=1e-6)
-
-    def test_turns_are_spread_over_all(self, common_still, recorder, tmp_path):
-        assert run(*common_still, "--out", tmp_path / "%d.png", "--turns", 1, "--seconds", 2, "--fps", 2) == 0
-        np.testing.assert_allclose(recorder.azimuths(), [0, 90, 180, 270], atol=1e-6)
-
-    def test_a_turntable_lasts_a_turn(self, common_still, recorder, tmp_path):
-        assert run(*common_still, "--out", tmp_path / "%d.png", "--turntable", 1800) == 0
-        assert len(recorder.shots) == 6  # 0.2 s at 30 a second
-        np.testing.assert_allclose(recorder.azimuths(), np.arange(6) * 60.0, atol=1e-6)
+    @pytest.mark.parametrize(
+        ("words", "azimuths"),
+        [
+            ("--turntable 90 --seconds 2 --fps 2 --orbit 10 0", [10, 55, 100, 145]),
+            ("--turns 1 --seconds 2 --fps 2", [0, 90, 180, 270]),
+            ("--turntable 1800", [0, 60, 120, 180, 240, 300]),  # a turn of 0.2 s at 30 a second
+        ],
+        ids=["so fast", "so often", "a turn"],
+    )
+    def test_a_turntable_goes_around(self, common_still, recorder, tmp_path, words, azimuths):
+        assert run(*common_still, "--out", tmp_path / "%d.png", *words.split()) == 0
+        np.testing.assert_allclose(recorder.azimuths(), azimuths, atol=1e-6)
 
     def test_it_goes_by_the_films_seconds(self, common, recorder, tmp_path):
         """The asset takes twice as long at half speed, and the camera goes around twice as far."""
@@ -311,17 +305,16 @@ class TestRenderers:
 
 
 @needs_ffmpeg
-class TestFilm:
-    def test_a_film(self, common, recorder, tmp_path, capsys):
-        before = {path.name for path in tmp_path.iterdir()}
-        assert run(*common, "--out", tmp_path / "x.mp4", "--crf", 10, "--json") == 0
-        said = json.loads(capsys.readouterr().out)
-        assert said["outputs"] == [str(tmp_path / "x.mp4")]
-        assert (said["frames"], said["rendered"]) == ([0, 1, 2, 3], 4)
-        assert "a film has no transparency: its background is black" in said["notes"]
-        assert {path.name for path in tmp_path.iterdir()} - before == {"x.mp4"}
-        assert run(*common, "--out", tmp_path / "x.mp4") == 2
-        assert "out must be a new file" in capsys.readouterr().err
+def test_a_film(common, recorder, tmp_path, capsys):
+    before = {path.name for path in tmp_path.iterdir()}
+    assert run(*common, "--out", tmp_path / "x.mp4", "--crf", 10, "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["outputs"] == [str(tmp_path / "x.mp4")]
+    assert (said["frames"], said["rendered"]) == ([0, 1, 2, 3], 4)
+    assert "a film has no transparency: its background is black" in said["notes"]
+    assert {path.name for path in tmp_path.iterdir()} - before == {"x.mp4"}
+    assert run(*common, "--out", tmp_path / "x.mp4") == 2
+    assert "out must be a new file" in capsys.readouterr().err
 
 
 def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, capsys, monkeypatch):
@@ -382,7 +375,7 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
         ("x.mp4 --crf 99", "crf must be an integer in [0, 51], got 99"),
     ],
 )
-def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words, message):
+def test_refusals_are_one_line(walk, light, tmp_path, monkeypatch, refused, words, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "area.json").write_text(json.dumps([{"type": "area"}]))
     lamp = {"type": "point", "position": [0, float("nan"), 0], "intensity": [1, 1, 1]}
@@ -390,30 +383,24 @@ def test_refusals_are_one_line(walk, light, tmp_path, capsys, monkeypatch, words
     pose = np.eye(4).tolist()
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps([{"time": 0, "camera_to_world": pose}]))
-    before = sorted(tmp_path.iterdir())
-    assert run(walk, "--environment", light, "--out", *words.split()) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before
+    refused("render", walk, "--environment", light, "--out", *words.split(), says=message)
 
 
-def test_one_stage_or_several_assets(walk, light, tmp_path, capsys):
+def test_one_stage_or_several_assets(walk, light, tmp_path, refused):
     stage = tmp_path / "stage.json"
     stage.write_text("{}")
-    words = ["--environment", light, "--out", tmp_path / "x.png"]
-    assert run(walk, stage, *words) == 2
-    assert "asset must be one stage, or several assets, got" in capsys.readouterr().err
-    assert run(stage, *words, "--spacing", 1) == 2
-    assert "spacing must be left out with a stage, got 1.0" in capsys.readouterr().err
-    assert run(walk, "--background", "environment", "--out", tmp_path / "x.png") == 2
-    assert "environment must be given, got none. Pass --environment with a lat-long" in capsys.readouterr().err
+    for words, says in (
+        ([walk, stage, "--environment", light], "asset must be one stage, or several assets, got"),
+        ([stage, "--environment", light, "--spacing", 1], "spacing must be left out with a stage, got 1.0"),
+        ([walk, "--background", "environment"], "environment must be given, got none. Pass --environment with a lat"),
+    ):
+        refused("render", *words, "--out", tmp_path / "x.png", says=says)
 
 
-def test_a_folder_that_is_closed(common, recorder, tmp_path, capsys, monkeypatch):
+def test_a_folder_that_is_closed(common, tmp_path, refused, monkeypatch):
     monkeypatch.setattr("beam_warp.stage.output.os.access", lambda *_: False)
-    assert run(*common, "--out", tmp_path / "x.png", "--frame", 0) == 2
-    assert "out must be in a folder that can be written" in capsys.readouterr().err
+    words = [*common, "--out", tmp_path / "x.png", "--frame", 0]
+    refused("render", *words, says="out must be in a folder that can be written")
 
 
 def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):
@@ -429,11 +416,3 @@ def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):
             args = parse(record, words.split(), f"beam {word}")
             if isinstance(args, Render):
                 require_consistent(args)
-
-
-def test_other_samples_make_another_render(common, recorder, tmp_path, capsys):
-    for samples, code in ((None, 0), (2, 0), (1, 2)):
-        more = [] if samples is None else ["--samples", samples]
-        assert run(*common, "--out", tmp_path / "%d.png", *more) == code
-    assert len(recorder.shots) == 4
-    assert "frames that are there must be of the same render" in capsys.readouterr().err

@@ -34,8 +34,10 @@ def run(*words):
     return main(["stability", "--device", "cpu", *map(str, words)])
 
 
-def run_beside(page, capsys, *words, code=0, **changes):
-    """Run for JSON, let a GPU have found the same but for some changes, and run again beside it."""
+def run_beside(page, capsys, *words, before="", code=0, **changes):
+    """Run for JSON, let a GPU have found the same but for some changes, and run again beside it on a page."""
+    if before:
+        page.write_text(before, encoding="utf-8")
     assert run(*words, "--json") == code
     record = json.loads(capsys.readouterr().out)
     rows = [row for part in record.values() if isinstance(part, list) for row in part]
@@ -106,12 +108,9 @@ def one_capture(monkeypatch, tiny_capture):
 
 @pytest.mark.slow
 def test_captures_alone_of_two_devices(one_capture, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n", encoding="utf-8"
-    )
-    fault = "not detected: black-image of train_03"
-    _, said, text = run_beside(page, capsys, "--only", "reconstruction", faults=[fault])
+    before = "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nwhat was before\n"
+    words, fault = ("--only", "reconstruction"), "not detected: black-image of train_03"
+    _, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, faults=[fault])
     assert "stress captures on cpu" in said.out
     assert "black-image of" in said.out
     assert "coaxial disc" not in said.out
@@ -145,24 +144,22 @@ def one_light(monkeypatch):
 
 
 def test_materials_alone_of_two_devices(one_light, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    captures = "## Captures on which reconstructions fail\n\nkept\n"
-    page.write_text(f"# Stability\n\nrays\n\n{captures}", encoding="utf-8")
-    fault = "must be refused, and was not"
-    _, said, text = run_beside(page, capsys, "--only", "materials", faults=[fault])
+    before = "# Stability\n\nrays\n\n## Captures on which reconstructions fail\n\nkept\n"
+    words, fault = ("--only", "materials"), "must be refused, and was not"
+    _, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, faults=[fault])
     assert "materials on cpu" in said.out
     assert "coaxial disc" not in said.out
-    assert text.startswith(f"# Stability\n\nrays\n\n{captures}\n## Materials\n")
+    assert text.startswith(f"{before}\n## Materials\n")
     assert "refused: environment must shed light" in text
     assert text.index("cpu: 42 Gaussians") < text.index("Some GPU: 42 Gaussians")
     assert f"| {fault} |" in text
 
 
 def test_materials_at_fault_exit_with_one(one_light, monkeypatch, capsys):
-    def build(studio):
-        return dataclasses.replace(one_light.build(studio), refused=False)
-
-    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [dataclasses.replace(one_light, build=build)])
+    broken = dataclasses.replace(
+        one_light, build=lambda studio: dataclasses.replace(one_light.build(studio), refused=False)
+    )
+    monkeypatch.setattr(stress_materials, "MATERIAL_CASES", [broken])
     assert run("--only", "materials", "--quiet") == 1
     assert "failed: black environment on cpu: refused: environment must shed light" in capsys.readouterr().err
 
@@ -177,16 +174,15 @@ def leaking_front(monkeypatch):
 
 
 def test_relighting_alone_of_two_devices(leaking_front, tmp_path, capsys):
-    page = tmp_path / "page.md"
-    page.write_text("# Stability\n\nrays\n\n## Materials\n\nkept\n", encoding="utf-8")
-    record, said, text = run_beside(page, capsys, "--only", "relighting", code=1)
+    before, words = "# Stability\n\nrays\n\n## Materials\n\nkept\n", ("--only", "relighting")
+    record, said, text = run_beside(tmp_path / "page.md", capsys, *words, before=before, code=1)
     assert [row["renderer"] for row in record["relighting"]] == ["deferred", "path"]
     assert "relighting on cpu" in said.out
     assert "coaxial disc" not in said.out
     failed = "failed: a leaking front before a dark inside on cpu, deferred: radiance, of the front's own"
     assert said.err.startswith(failed)
     assert said.err.count("\n") == 1
-    assert text.startswith("# Stability\n\nrays\n\n## Materials\n\nkept\n\n## Relighting\n")
+    assert text.startswith(f"{before}\n## Relighting\n")
     by_paths = next(line for line in text.splitlines() if "| path |" in line)
     assert by_paths.startswith("| a leaking front before a dark inside |")
     assert by_paths.endswith("| ok |")
@@ -201,19 +197,16 @@ def test_large_relighting_is_run_on_request(leaking_front, monkeypatch, capsys):
     assert run("--only", "relighting", "--large", "--quiet") == 1
 
 
-def test_results_that_are_none_are_refused(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--out none/page.md", "out must be in a folder that exists"),
+        ("--device cuda:99", "device must be one of cpu"),
+        ("--beside other.json", "beside must be what beam stability --json printed, got other.json"),
+        ("--beside none.json", "beside must be a file, got"),
+    ],
+)
+def test_mistakes(tmp_path, monkeypatch, refused, words, says):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "other.json").write_text('{"cases": [{}]}', encoding="utf-8")
-    assert run("--beside", tmp_path / "other.json") == 2
-    assert "beside must be what beam stability --json printed, got other.json" in capsys.readouterr().err
-    assert run("--beside", tmp_path / "none.json") == 2
-    assert "beside must be a file, got" in capsys.readouterr().err
-
-
-def test_a_folder_that_is_not_there_is_refused(tmp_path, capsys):
-    assert run("--out", tmp_path / "none" / "page.md") == 2
-    assert "out must be in a folder that exists" in capsys.readouterr().err
-
-
-def test_a_device_that_is_not_there_is_refused(capsys):
-    assert main(["stability", "--device", "cuda:99"]) == 2
-    assert "device must be one of cpu" in capsys.readouterr().err
+    refused("stability", *words.split(), says=says)

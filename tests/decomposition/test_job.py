@@ -11,7 +11,6 @@ from support.figure_asset import figure_asset
 from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, RunOptions, read, run, validate
-from beam_warp.capture.capture import Capture
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.decomposition.job import OverviewOptions
 from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
@@ -27,8 +26,15 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
-FAST = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
+FAST = RunOptions(materials=MaterialOptions(sample_count=8), exposure=0.0, device="cpu")
+AUTO = replace(FAST, exposure="auto")
+"""Looks for the exposure that explains the colours, which takes longer than all the rest of a small job."""
+
 SMALL = OverviewOptions(height=48)
+
+
+def job(sequence, light, out, options=FAST, **more):
+    return run(sequence, light, out, options, overview=SMALL, **more)
 
 
 def frame(shift=0.0, ids=True, count=200):
@@ -42,9 +48,19 @@ def frame(shift=0.0, ids=True, count=200):
     )
 
 
-@pytest.fixture
+def frames(*shifts, ids=True, metadata=None):
+    return GaussianSequence.from_clouds([frame(shift, ids) for shift in shifts], metadata=metadata)
+
+
+@pytest.fixture(scope="module")
 def light():
-    return EnvironmentMap.constant((1.0, 0.9, 0.8), height=32)
+    return EnvironmentMap.constant((1.0, 0.9, 0.8), height=16)
+
+
+@pytest.fixture(scope="module")
+def whole(light, tmp_path_factory):
+    """A job of three frames, done without a stop. Read only."""
+    return job(frames(0.0, 0.1, 0.2), light, tmp_path_factory.mktemp("whole") / "out", AUTO)
 
 
 def folder_bytes(folder):
@@ -53,29 +69,27 @@ def folder_bytes(folder):
     return {p: f.read_bytes() for p, f in files.items() if p.name != "report.json" and p.parts[0] != "digests"}
 
 
-def test_everything_is_written_valid_and_readable(tmp_path, light):
-    result = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", FAST, overview=SMALL)
-    assert validate(result.asset).is_valid
-    cloud = read(result.asset)[0]
+def test_everything_is_written_valid_and_readable(whole):
+    assert validate(whole.asset).is_valid
+    cloud = read(whole.asset)[0]
     assert cloud.is_relightable
     assert cloud.axes == "rub"
     assert cloud.base_color_error is not None
     assert cloud.observability is not None
     assert np.allclose(cloud.roughness, 0.5)
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    report = json.loads((whole.asset.parent / "report.json").read_text())
     assert report["materials"]["gaussians"] == 200
     assert report["device"]["kind"] == "cpu"
-    assert read_image(result.overview).width > 48
+    assert read_image(whole.overview).width > 48
 
 
-def test_it_is_drawn_as_its_metadata_say(tmp_path, light):
+def test_it_is_drawn_as_its_metadata_say(tmp_path, light, whole):
     stated = {"raster_antialiased": "true", "raster_low_pass": "4.0", "capture_frames": "7"}
-    said = run(GaussianSequence.from_clouds([frame()], metadata=stated), light, tmp_path / "a", FAST, overview=SMALL)
-    silent = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "b", FAST, overview=SMALL)
+    said = job(frames(0.0, metadata=stated), light, tmp_path / "out")
     assert read(said.asset).metadata.items() >= stated.items()
-    assert not [key for key in read(silent.asset).metadata if key.startswith("raster")]
-    for result, options in ((said, RasterOptions(antialiased=True, low_pass=4.0)), (silent, RasterOptions())):
-        cloud = result.sequence[0]
+    assert not [key for key in read(whole.asset).metadata if key.startswith("raster")]
+    for result, options in ((said, RasterOptions(antialiased=True, low_pass=4.0)), (whole, RasterOptions())):
+        cloud = result.sequence[len(result.sequence) // 2]
         extent = np.ptp(cloud.positions, axis=0)
         width = round(SMALL.height * float(np.hypot(extent[0], extent[1]) / extent[2]))  # panels are that wide
         camera = Camera.frame_cloud(
@@ -92,8 +106,7 @@ def test_it_is_drawn_as_its_metadata_say(tmp_path, light):
 def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatch):
     monkeypatch.setattr("beam_warp.trace.rays.RAYS_AT_ONCE", 8 * 50)
     said = []
-    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
-    run(sequence, light, tmp_path / "out", FAST, overview=SMALL, progress=lambda *step: said.append(step))
+    job(frames(0.0, 0.1), light, tmp_path / "out", progress=lambda *step: said.append(step))
     for stage, total in (("normals", 400), ("materials", 400), ("decompose", 2), ("overview", 1)):
         steps = [done for name, done, count in said if name == stage and count == total]
         assert steps == sorted(steps)
@@ -101,57 +114,50 @@ def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatc
     assert len([1 for name, *_ in said if name == "materials"]) > 6
 
 
-def test_stopped_job_continues_to_identical_bytes(tmp_path, light, monkeypatch):
-    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1), frame(0.2)])
-    run(sequence, light, tmp_path / "whole", FAST, overview=SMALL)
-
+def test_stopped_job_continues_to_identical_bytes(tmp_path, light, whole):
     def stop(stage, done, total):
         if (stage, done) == ("decompose", 2):
             raise KeyboardInterrupt
 
+    sequence, out = frames(0.0, 0.1, 0.2), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL, progress=stop)
-    assert not (tmp_path / "stopped" / "asset.usda").exists()
-    result = run(sequence, light, tmp_path / "stopped", FAST, overview=SMALL)
-    assert result.report["resumed_frames"] == 2
-    assert folder_bytes(tmp_path / "whole") == folder_bytes(tmp_path / "stopped")
+        job(sequence, light, out, AUTO, progress=stop)
+    assert not (out / "asset.usda").exists()
+    assert job(sequence, light, out, AUTO).report["resumed_frames"] == 2
+    assert folder_bytes(whole.asset.parent) == folder_bytes(out)
 
 
 def test_other_input_options_or_code_start_over(tmp_path, light):
-    sequence = GaussianSequence.from_clouds([frame()])
-    run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+    out, given = tmp_path / "out", {"sequence": frames(0.0), "light": light, "options": FAST}
+    job(out=out, **given)
     for changed in (
-        {"sequence": GaussianSequence.from_clouds([frame(0.5)])},
-        {"environment": light.scaled(2.0)},
-        {"options": RunOptions(materials=MaterialOptions(sample_count=16), device="cpu")},
+        {"sequence": frames(0.5)},
+        {"light": light.scaled(2.0)},
+        {"options": replace(FAST, materials=MaterialOptions(sample_count=16))},
     ):
-        arguments = {"sequence": sequence, "environment": light, "options": FAST} | changed
-        fresh = run(out=tmp_path / "out", overview=SMALL, **arguments)
-        assert fresh.report["resumed_frames"] == 0
-    run(sequence, light, tmp_path / "out", FAST, overview=SMALL)
+        given |= changed
+        assert job(out=out, **given).report["resumed_frames"] == 0
     with changed_code():
         for resumed in (0, 1):
-            found = run(sequence, light, tmp_path / "out", FAST, overview=SMALL).report
+            found = job(out=out, **given).report
             assert found["resumed_frames"] == resumed
             assert found["versions"]["code"] == "another algorithm"
 
 
-def test_persistent_frames_share_one_base_colour(tmp_path, light):
-    sequence = GaussianSequence.from_clouds([frame(0.0), frame(0.1)])
-    joint = run(sequence, light, tmp_path / "joint", FAST, overview=SMALL).sequence
+def test_persistent_frames_share_one_base_colour(tmp_path, light, whole):
+    joint = whole.sequence
     assert joint.topology == "constant"
     assert "base_color" in joint.constant
     assert np.array_equal(joint[0].base_color, joint[1].base_color)
     assert not np.array_equal(joint[0].positions, joint[1].positions)
-    apart = GaussianSequence.from_clouds([frame(0.0, ids=False), frame(0.1, ids=False)])
-    separate = run(apart, light, tmp_path / "apart", FAST, overview=SMALL).sequence
+    separate = job(frames(0.0, 0.1, ids=False), light, tmp_path / "out").sequence
     assert separate.topology == "perFrame"
     assert "base_color" not in separate.constant
 
 
 def test_the_image_path_needs_images(tmp_path, light):
     with pytest.raises(InvalidOptionError, match="capture must be given for the image path, got none"):
-        run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", RunOptions(images=ImagePathOptions()))
+        job(frames(0.0), light, tmp_path / "out", RunOptions(images=ImagePathOptions()))
     assert not (tmp_path / "out").exists()
 
 
@@ -161,26 +167,21 @@ def test_exposures_that_no_light_has(stops):
         RunOptions(exposure=stops)
 
 
-BARE = {"radiance": None, "radiance_color_space": None}
-
-
-@pytest.mark.parametrize(
-    ("cloud", "complaint"),
-    [
-        (frame().with_arrays(**BARE), "radiance must be given to decompose materials, got none at frame 0"),
-        (frame().select(np.arange(0)), "a frame must hold at least one Gaussian, got none at frame 0"),
-    ],
-)
-def test_frames_without_radiance_or_gaussians_are_refused(tmp_path, light, cloud, complaint):
-    with pytest.raises(InvalidArrayError, match=complaint):
-        run(GaussianSequence.from_clouds([cloud]), light, str(tmp_path / "out"), FAST)
-    assert not (tmp_path / "out" / "asset.usda").exists()
+def test_frames_without_radiance_or_gaussians_are_refused(tmp_path, light):
+    bare = frame().with_arrays(radiance=None, radiance_color_space=None)
+    for cloud, complaint in (
+        (bare, "radiance must be given to decompose materials"),
+        (frame().select(np.arange(0)), "a frame must hold at least one Gaussian"),
+    ):
+        with pytest.raises(InvalidArrayError, match=f"{complaint}, got none at frame 0"):
+            job(GaussianSequence.from_clouds([cloud]), light, str(tmp_path / "out"))
+        assert not (tmp_path / "out" / "asset.usda").exists()
 
 
 def test_a_folder_that_cannot_be_made(tmp_path, light):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="out must be a folder that can be made"):
-        run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "file", FAST)
+        job(frames(0.0), light, tmp_path / "file")
 
 
 def test_roughness_from_a_texture(tmp_path, light):
@@ -198,15 +199,18 @@ def test_roughness_from_a_texture(tmp_path, light):
         process=False,
     )
     square.export(tmp_path / "square.obj")
-    options = RunOptions(
-        materials=MaterialOptions(sample_count=8),
-        roughness=RoughnessTexture(tmp_path / "rough.png", tmp_path / "square.obj"),
-        device="cpu",
-    )
-    cloud = run(GaussianSequence.from_clouds([frame()]), light, tmp_path / "out", options, overview=SMALL).sequence[0]
+    options = replace(FAST, roughness=RoughnessTexture(tmp_path / "rough.png", tmp_path / "square.obj"))
+    cloud = job(frames(0.0), light, tmp_path / "out", options).sequence[0]
     clear = np.abs(cloud.positions[:, 0]) > 0.2
     expected = np.where(cloud.positions[:, 0] < 0.0, 0.8, 0.2)
     assert np.allclose(cloud.roughness[clear], expected[clear], atol=1e-6)
+
+
+def bare(cloud, step=4):
+    """Some of the discs, larger, as a reconstruction would know them: without materials."""
+    cloud = cloud.select(np.arange(0, len(cloud), step))
+    unknown = dict.fromkeys(("base_color", "roughness", "ambient_occlusion", "normals"))
+    return cloud.with_arrays(**unknown, scales=np.tile(np.float32([0.02, 0.02, 0.002]), (len(cloud), 1)))
 
 
 @pytest.fixture(scope="module")
@@ -214,30 +218,39 @@ def figure():
     return figure_asset(64, 2, metadata={"capture_frames": "0 1"})
 
 
+@pytest.fixture(scope="module")
+def discs(figure):
+    """A twelfth of them: enough for all that does not look at colours."""
+    return GaussianSequence.from_clouds([bare(cloud, 12) for cloud in figure], metadata=figure.metadata)
+
+
+@pytest.fixture(scope="module")
+def studio(tiny_capture):
+    return EnvironmentMap.read(tiny_capture.environment_path).resized(16, 32)
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_capture):
+    """Two cameras of the capture."""
+    records = tuple(r for r in tiny_capture.records if r.camera_name in ("train_00", "train_03"))
+    return replace(tiny_capture, records=records)
+
+
+@pytest.fixture(scope="module")
+def done(discs, studio, capture, tmp_path_factory):
+    """The folder of a job of two frames. Read only."""
+    out = tmp_path_factory.mktemp("done") / "out"
+    job(discs, studio, out, capture=capture)
+    return out
+
+
+@pytest.mark.usefixtures("coarse_irradiance", "trusted_files")
 class TestWithACapture:
     """Discs on the demo figure, decomposed by the images of its capture."""
 
-    @pytest.fixture
-    def discs(self, figure):
-        """Every fourth disc, larger, as a reconstruction would know it: without materials."""
-        return GaussianSequence.from_clouds([self.bare(cloud) for cloud in figure], metadata=figure.metadata)
-
-    @staticmethod
-    def bare(cloud, **changed):
-        cloud = cloud.select(np.arange(0, len(cloud), 4))
-        unknown = dict.fromkeys(("base_color", "roughness", "ambient_occlusion", "normals"))
-        scales = np.tile(np.float32([0.02, 0.02, 0.002]), (len(cloud), 1))
-        return cloud.with_arrays(**unknown, scales=scales, **changed)
-
-    @pytest.fixture
-    def studio(self, tiny_capture):
-        return EnvironmentMap.read(tiny_capture.environment_path).resized(32, 64)
-
-    def run(self, sequence, light, out, capture, options=FAST):
-        return run(sequence, light, out, options, capture=capture, overview=SMALL)
-
-    def test_it_finds_the_materials(self, figure, discs, studio, tiny_capture, tmp_path):
-        result = self.run(discs, studio, tmp_path / "out", tiny_capture)
+    def test_it_finds_the_materials(self, figure, studio, tiny_capture, tmp_path):
+        many = GaussianSequence.from_clouds([bare(cloud) for cloud in figure], metadata=figure.metadata)
+        result = job(many, studio, tmp_path / "out", AUTO, capture=tiny_capture)
         assert validate(result.asset).is_valid
         back = read(result.asset)
         assert back.metadata["capture_frames"] == "0 1"
@@ -265,31 +278,29 @@ class TestWithACapture:
         found = []
         for threads in ("1", "3"):
             monkeypatch.setenv("BEAM_WARP_THREADS", threads)
-            self.run(discs, studio, tmp_path / threads, tiny_capture)
+            job(discs, studio, tmp_path / threads, AUTO, capture=tiny_capture)
             found.append(folder_bytes(tmp_path / threads))
         assert found[0] == found[1]
 
-    def test_what_results_depend_on_starts_over(self, discs, studio, tiny_capture, tmp_path):
+    def test_what_results_depend_on_starts_over(self, discs, studio, capture, done, tmp_path):
         """A frame's images, how splats are drawn, whether there are images at all."""
-        moved = tmp_path / "capture"
-        shutil.copytree(tiny_capture.folder, moved)
-        capture = Capture.read(moved)
-        self.run(discs, studio, tmp_path / "out", capture)
-        changed = next(r for r in capture.select(split="train", frames={1}))
-        image = changed.image()
-        channels = {name: values * np.float32(0.5) for name, values in image.channels.items()}
-        write_exr(changed.image_path, channels)
-        assert self.run(discs, studio, tmp_path / "out", capture).report["resumed_frames"] == 1
+        out, file = tmp_path / "out", tmp_path / "darker.exr"
+        shutil.copytree(done, out)
+        changed = next(r for r in capture.records if r.frame == 1)
+        write_exr(file, {name: values * np.float32(0.5) for name, values in changed.image().channels.items()})
+        records = tuple(replace(r, image_path=file) if r is changed else r for r in capture.records)
+        darker = replace(capture, records=records)
+        assert job(discs, studio, out, capture=darker).report["resumed_frames"] == 1
         drawn = replace(discs, metadata=discs.metadata | {"raster_antialiased": "true", "raster_low_pass": "0.1"})
-        assert self.run(drawn, studio, tmp_path / "out", capture).report["resumed_frames"] == 0
-        assert self.run(drawn, studio, tmp_path / "out", None).report["resumed_frames"] == 0
+        assert job(drawn, studio, out, capture=darker).report["resumed_frames"] == 0
+        assert job(drawn, studio, out).report["resumed_frames"] == 0
 
-    def test_gaussians_of_every_frame_their_own(self, discs, studio, tiny_capture, tmp_path):
+    def test_gaussians_of_every_frame_their_own(self, discs, studio, capture, tmp_path):
         apart = [cloud.with_arrays(ids=None) for cloud in discs]
-        sequence = GaussianSequence.from_clouds([apart[0], apart[1].select(np.arange(1000))], metadata=discs.metadata)
-        found = self.run(sequence, studio, tmp_path / "out", tiny_capture).sequence
+        sequence = GaussianSequence.from_clouds([apart[0], apart[1].select(np.arange(300))], metadata=discs.metadata)
+        found = job(sequence, studio, tmp_path / "out", capture=capture).sequence
         assert found.topology == "perFrame"
-        assert [len(cloud) for cloud in found] == [1500, 1000]
+        assert [len(cloud) for cloud in found] == [500, 300]
 
     def test_some_frames_of_a_capture(self, discs, tiny_capture):
         """The frames that the sequence names are read, not those in the same place."""
@@ -299,21 +310,23 @@ class TestWithACapture:
         assert len(views) == len(expected) == 6
         assert all(np.array_equal(a.color, b.color) for a, b in zip(views, expected, strict=True))
 
-    def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, tiny_capture, tmp_path):
+    def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, capture, tmp_path):
         """8-bit images carry no scale: the same light twice as bright gives the same base colour."""
-        assert not CaptureImages(tiny_capture, discs).is_display_referred(0)
-        records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in tiny_capture.records)
-        display = replace(tiny_capture, records=records)
+        assert not CaptureImages(capture, discs).is_display_referred(0)
+        records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in capture.records)
+        display = replace(capture, records=records)
         images = CaptureImages(display, discs)
         assert images.ceiling(0, images.views(0)) == 1.0
         one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
-        plain, brighter = (self.run(one, studio.scaled(scale), tmp_path / str(scale), display) for scale in (1.0, 4.0))
+        plain, brighter = (
+            job(one, studio.scaled(scale), tmp_path / str(scale), AUTO, capture=display) for scale in (1.0, 4.0)
+        )
         # candidates are a sixteenth of a stop apart
         difference = plain.report["exposure_stops"] - brighter.report["exposure_stops"]
         assert difference == pytest.approx(2.0, abs=1.5 / 16.0)
 
     @pytest.mark.parametrize("what", ["black", "elsewhere", "transparent", "single"])
-    def test_what_cannot_be_decomposed_is_refused_at_once(self, discs, studio, tiny_capture, tmp_path, what):
+    def test_what_cannot_be_decomposed_is_refused_at_once(self, discs, studio, capture, tmp_path, what):
         """Without light, or where the images show something else, nothing is measured and no asset is left."""
         cloud, light, complaint = discs[0], studio, "sequence must show what the capture shows"
         if what == "black":
@@ -326,15 +339,14 @@ class TestWithACapture:
             cloud = cloud.select(np.arange(1))
         sequence = GaussianSequence.from_clouds([cloud], metadata={"capture_frames": "0"})
         with pytest.raises(InvalidOptionError, match=complaint):
-            self.run(sequence, light, tmp_path / "out", tiny_capture)
+            job(sequence, light, tmp_path / "out", AUTO, capture=capture)
         assert not (tmp_path / "out" / "asset.usda").exists()
 
-    def test_the_image_path_follows_its_first_frame(self, discs, studio, tiny_capture, tmp_path):
+    def test_the_image_path_follows_its_first_frame(self, discs, studio, capture, tmp_path):
         """Colours are drawn towards those of the frame before: when that frame changes, the next is done again."""
         options = replace(FAST, images=ImagePathOptions(occlusion_samples=4, light_samples=4))
-        self.run(discs, studio, tmp_path / "out", tiny_capture, options)
-        again = self.run(discs, studio, tmp_path / "out", tiny_capture, options)
-        assert again.report["resumed_frames"] == 2
-        other = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
-        changed = GaussianSequence.from_clouds([other, discs[1]], metadata=discs.metadata)
-        assert self.run(changed, studio, tmp_path / "out", tiny_capture, options).report["resumed_frames"] == 0
+        darker = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
+        changed = GaussianSequence.from_clouds([darker, discs[1]], metadata=discs.metadata)
+        for sequence, resumed in ((discs, 0), (discs, 2), (changed, 0)):
+            report = job(sequence, studio, tmp_path / "out", options, capture=capture).report
+            assert report["resumed_frames"] == resumed

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -74,23 +75,27 @@ class Pages:
         with self._news:
             assert self._news.wait_for(lambda: condition(self), PATIENCE), (len(self.frames), self.errors)
 
-    def wait_for_frame(self, client, shown, is_last=True):
-        def is_there(pages):
-            return any(
-                c == client and f.picture.pixels.flat[0] == shown and f.is_last >= is_last for c, f in pages.frames
-            )
+    def wait_for_frame(self, client, shown):
+        self.wait(lambda p: any(c == client and f.picture.pixels.flat[0] == shown and f.is_last for c, f in p.frames))
 
-        self.wait(is_there)
+
+@contextmanager
+def serving(**state):
+    """A loop with its painter and its pages; it ends whatever happened."""
+    painter, pages = FakePainter(), Pages()
+    loop = FrameLoop(painter, Schedule(ViewState(**state), traced=Pace(500.0)), pages.deliver, pages.report)
+    try:
+        yield loop, painter, pages
+    finally:
+        painter.gate.set()
+        loop.close()
+    assert not loop._thread.is_alive()
 
 
 @pytest.fixture
 def served():
-    painter, pages = FakePainter(), Pages()
-    loop = FrameLoop(painter, Schedule(ViewState(), traced=Pace(500.0)), pages.deliver, pages.report)
-    yield loop, painter, pages
-    painter.gate.set()
-    loop.close()
-    assert not loop._thread.is_alive()
+    with serving() as parts:
+        yield parts
 
 
 def test_a_page_gets_its_picture(served):
@@ -207,20 +212,15 @@ def test_a_picture_to_keep_is_of_full_size(served):
 
 
 def test_a_first_state_that_cannot_be_drawn():
-    pages = Pages()
-    loop = FrameLoop(FakePainter(), Schedule(ViewState(frame=13)), pages.deliver, pages.report)
-    try:
+    with serving(frame=13) as (loop, _, pages):
         loop.look(1, PAGE)
         pages.wait(lambda p: any(client == 1 for client, _ in p.errors))
         loop.change(frame=1)
         pages.wait_for_frame(1, 1)
-    finally:
-        loop.close()
 
 
-def test_it_ends_while_it_draws():
-    painter, pages = FakePainter(), Pages()
-    loop = FrameLoop(painter, Schedule(ViewState()), pages.deliver, pages.report)
+def test_it_ends_while_it_draws(served):
+    loop, painter, pages = served
     loop.look(1, PAGE)
     pages.wait_for_frame(1, 0)
     painter.gate.clear()

@@ -1,5 +1,7 @@
 """Pictures of states: those of the renderers, frame by frame as they are wanted, whatever the cloud holds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.figure_asset import changed, figure_asset
@@ -15,10 +17,12 @@ from beam_warp.view.renderers import displayed
 from beam_warp.view.state import ALPHA, DEPTH, LIT, NO_ENVIRONMENT, SubjectBox, ViewState
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.shot import RenderedImage
 
-LIGHTS = {"sunset": sunset, "white": lambda: EnvironmentMap.constant([1.0, 1.0, 1.0])}
+pytestmark = pytest.mark.usefixtures("coarse_irradiance")
+
+LIGHTS = {"sunset": sunset, "white": lambda: EnvironmentMap.constant([1.0, 1.0, 1.0], height=4)}
 
 
 @pytest.fixture(scope="module")
@@ -100,15 +104,10 @@ def test_the_cache_has_a_size(sequence):
     assert len(tiny) == 1
 
 
-def without_materials(cloud):
-    names = ("positions", "orientations", "scales", "opacities", "radiance")
-    return GaussianCloud(
-        **{name: getattr(cloud, name) for name in names}, radiance_color_space=cloud.radiance_color_space
-    )
-
-
 def test_an_asset_without_materials_has_channels(sequence, camera):
-    painter = CloudPainter(changed(sequence, lambda _, cloud: without_materials(cloud)), LIGHTS, device="cpu")
+    materials = dict.fromkeys(("base_color", "roughness", "ambient_occlusion", "normals"))
+    bare = changed(sequence, lambda _, cloud: cloud.with_arrays(**materials))
+    painter = CloudPainter(bare, LIGHTS, device="cpu")
     assert painter.channels[0] == "radiance"
     assert LIT not in painter.channels
     assert not painter.can_trace
@@ -147,9 +146,9 @@ def test_an_unknown_light(painter, camera):
 
 
 def test_splats_are_drawn_as_the_asset_says(sequence, camera):
-    said = figure_asset(frame_count=1, metadata=RasterOptions(antialiased=True, low_pass=4.0).as_metadata())
-    painter = CloudPainter(said, LIGHTS, device="cpu")
-    buffer = rasterize(said[0], camera, options=RasterOptions(antialiased=True, low_pass=4.0), device="cpu")
+    options = RasterOptions(antialiased=True, low_pass=4.0)
+    painter = CloudPainter(replace(sequence, metadata=options.as_metadata()), LIGHTS, device="cpu")
+    buffer = rasterize(sequence[0], camera, options=options, device="cpu")
     drawn = painter.draw(ViewState(channel=DEPTH), camera).layers()
     np.testing.assert_array_equal(drawn["A"], buffer.alpha)
 

@@ -155,11 +155,7 @@ def test_paths_are_traced_when_still_up_to_a_limit():
     assert count == 3
     schedule.show(ViewState(mode=TRACED, samples=16), now=2.0)  # more paths: what there is goes on
     assert schedule.next(2.0).kind == "traced"
-    assert schedule.next(2.0).version == order_version(schedule)
-
-
-def order_version(schedule):
-    return schedule.seen(1)[1]
+    assert schedule.next(2.0).version == schedule.seen(1)[1]
 
 
 def test_a_traced_picture_grows_while_it_has_few_paths():

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from support.figure_asset import figure_asset
+from scipy.spatial.transform import Rotation
+from support.drawn_ball import drawn_ball
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.view.state import (
@@ -23,27 +24,12 @@ from beam_warp.view.state import (
     turn_to,
 )
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 
 
-def quaternion(matrix):
-    """The quaternion wxyz of a rotation by less than half a turn."""
-    w = 0.5 * math.sqrt(1.0 + np.trace(matrix))
-    x = (matrix[2, 1] - matrix[1, 2]) / (4 * w)
-    y = (matrix[0, 2] - matrix[2, 0]) / (4 * w)
-    z = (matrix[1, 0] - matrix[0, 1]) / (4 * w)
-    return w, x, y, z
-
-
 def seen_by(camera, fov):
-    return Viewpoint(
-        quaternion(camera.camera_to_world[:3, :3]),
-        tuple(camera.position),
-        math.radians(fov),
-        camera.width,
-        camera.height,
-    )
+    x, y, z, w = Rotation.from_matrix(camera.camera_to_world[:3, :3]).as_quat()
+    return Viewpoint((w, x, y, z), tuple(camera.position), math.radians(fov), camera.width, camera.height)
 
 
 @pytest.mark.parametrize("size", [(320, 200), (200, 320), (1, 1), (1, 7)])
@@ -52,11 +38,8 @@ def test_a_page_sees_what_our_camera_sees(size):
     theirs = seen_by(ours, 35.0).camera(1.0, 4096)
     # quaternions from and to float64 matrices: a few roundings of 1e-16 on entries of 1
     np.testing.assert_allclose(theirs.camera_to_world, ours.camera_to_world, atol=1e-14)
-    np.testing.assert_allclose(
-        [theirs.focal_x, theirs.focal_y, theirs.center_x, theirs.center_y],
-        [ours.focal_x, ours.focal_y, ours.center_x, ours.center_y],
-        rtol=1e-12,
-    )
+    for name in ("focal_x", "focal_y", "center_x", "center_y"):
+        assert getattr(theirs, name) == pytest.approx(getattr(ours, name), rel=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.375, 0.1, 1e-6])
@@ -171,14 +154,13 @@ def test_a_box_around_nothing():
 
 
 def test_channels_are_those_that_there_are():
-    cloud = figure_asset(frame_count=1)[0]
+    cloud = drawn_ball()
     names = channels_of(cloud)
     assert names[0] == LIT
     assert {"base_color", "roughness", "ambient_occlusion", "normals", "radiance", DEPTH, ALPHA} <= set(names)
     assert not {"base_color_error", "observability"} & set(names)
-    bare = GaussianCloud(
-        positions=cloud.positions, orientations=cloud.orientations, scales=cloud.scales, opacities=cloud.opacities
-    )
+    materials = ("base_color", "roughness", "ambient_occlusion", "normals")
+    bare = cloud.with_arrays(**dict.fromkeys((*materials, "radiance", "radiance_color_space")))
     assert channels_of(bare) == ("surface_normals", DEPTH, ALPHA)
 
 
