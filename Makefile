@@ -8,8 +8,9 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: demo test test-all lint types unit slow install clean
 
-# A worker a core, each with one launch thread; -P: the checkout in the working folder is not the installed package.
-PYTEST := BEAM_WARP_THREADS=1 $(BIN)/python -P -m pytest -n auto --dist loadfile
+# A worker a core, each with one thread of launches and of BLAS; -P: the checkout in the working folder is not the
+# installed package.
+PYTEST := BEAM_WARP_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n auto --dist loadfile
 
 $(VENV)/.dependencies: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; set PYTHON=python3.x"; exit 1; }
@@ -34,7 +35,7 @@ lint: install
 	$(BIN)/ruff format --check .
 
 types: install
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --pythonpath $(BIN)/python --threads
 
 unit: install
 	$(PYTEST) -m "not slow"
