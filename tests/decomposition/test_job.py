@@ -114,14 +114,20 @@ def test_progress_moves_within_a_frame_and_ends_full(tmp_path, light, monkeypatc
     assert len([1 for name, *_ in said if name == "materials"]) > 6
 
 
-def test_stopped_job_continues_to_identical_bytes(tmp_path, light, whole):
+def stop_after(frame_count):
+    """Progress that is interrupted once so many frames are decomposed."""
+
     def stop(stage, done, total):
-        if (stage, done) == ("decompose", 2):
+        if (stage, done) == ("decompose", frame_count):
             raise KeyboardInterrupt
 
+    return stop
+
+
+def test_stopped_job_continues_to_identical_bytes(tmp_path, light, whole):
     sequence, out = frames(0.0, 0.1, 0.2), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        job(sequence, light, out, AUTO, progress=stop)
+        job(sequence, light, out, AUTO, progress=stop_after(2))
     assert not (out / "asset.usda").exists()
     assert job(sequence, light, out, AUTO).report["resumed_frames"] == 2
     assert folder_bytes(whole.asset.parent) == folder_bytes(out)
@@ -281,6 +287,12 @@ class TestWithACapture:
             job(discs, studio, tmp_path / threads, AUTO, capture=tiny_capture)
             found.append(folder_bytes(tmp_path / threads))
         assert found[0] == found[1]
+
+    def test_stopped_job_continues_to_identical_bytes(self, discs, studio, capture, done, tmp_path):
+        with pytest.raises(KeyboardInterrupt):
+            job(discs, studio, tmp_path / "out", FAST, capture=capture, progress=stop_after(1))
+        assert job(discs, studio, tmp_path / "out", FAST, capture=capture).report["resumed_frames"] == 1
+        assert folder_bytes(done) == folder_bytes(tmp_path / "out")
 
     def test_what_results_depend_on_starts_over(self, discs, studio, capture, done, tmp_path):
         """A frame's images, how splats are drawn, whether there are images at all."""
