@@ -43,7 +43,7 @@ class Mesh:
     """Fuse the depth of a Gaussian sequence into one mesh a frame, watertight where it is seen.
 
     Depth is drawn from the training cameras of a capture, or without one from 32 cameras around the cloud; pixels that
-    no second camera confirms are left out. Writes OUT/mesh_0000.ply, one a frame, and OUT/mesh_0000.json with its
+    no second camera confirms are left out. Writes OUT/mesh000000.ply, one a frame, and OUT/mesh000000.json with its
     counts of boundary edges and holes. Frames whose files are there, made of the same Gaussians and options, are kept.
 
     PLY and OBJ are in the world's axes, z up; GLB is y up, as glTF demands. Units are metres.
