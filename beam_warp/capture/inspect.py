@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from beam_warp.capture.rigs import up_direction
 from beam_warp.checks import require_count
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.files import image_size
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.world.camera import Camera
 
 SPLIT = "train"
@@ -136,10 +137,7 @@ def require_reconstructable(capture: Capture, *, max_images: int = QUICK_IMAGES)
 
 
 def inspect_capture(
-    capture: Capture,
-    *,
-    max_images: int = MAX_IMAGES,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    capture: Capture, *, max_images: int = MAX_IMAGES, progress: StageProgress = no_progress
 ) -> CaptureReport:
     """Inspect a capture.
 

@@ -13,10 +13,11 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number, require_package
-from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.flags import Device, Json, Quiet, SourceAxes, make_folder
 from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
+from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.study.page import write_page
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import Settings, Study, Table, read_table, run_study, table_paths
@@ -201,7 +202,7 @@ def chart(command: Chart) -> int:
     return 0
 
 
-def _measure(args: TracingChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+def _measure(args: TracingChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
     from beam_warp.device.arrays import resolve_device
@@ -244,7 +245,7 @@ def _options_of(args: TracingChart | MaterialsChart, plan: type) -> dict[str, An
     return {option.name: getattr(args, option.name) for option in fields(plan)}
 
 
-def _run(study: Study, out: Path, seconds: float, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+def _run(study: Study, out: Path, seconds: float, report: NotedProgress) -> tuple[Table, list[Settings]]:
     """Measure a study; say what is kept if it is stopped."""
     try:
         return run_study(study, out, budget_seconds=seconds, progress=report)
@@ -254,7 +255,7 @@ def _run(study: Study, out: Path, seconds: float, report: ProgressCallback) -> t
         raise
 
 
-def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[Table, list[Settings]]:
+def _measure_materials(args: MaterialsChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
     """Read or make the inputs, prepare the study and measure it."""
     require_number("budget-seconds", args.budget_seconds, 0.0)
     from beam_warp.device.arrays import resolve_device
@@ -270,7 +271,7 @@ def _measure_materials(args: MaterialsChart, report: ProgressCallback) -> tuple[
         return _run(study, args.out, args.budget_seconds, report)
 
 
-def _materials_subject(args: MaterialsChart, folder: Path, report: ProgressCallback) -> Any:
+def _materials_subject(args: MaterialsChart, folder: Path, report: NotedProgress) -> Any:
     """Return what is decomposed; a built-in capture is written to the folder."""
     from beam_warp.capture.capture import Capture
     from beam_warp.decomposition.capture_images import CaptureImages

@@ -6,9 +6,10 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from beam_warp.errors import BeamError
+from beam_warp.jobs.listeners import NotedProgress
 
 
 def run_command(command: Callable[[], int]) -> int:
@@ -38,13 +39,6 @@ def print_notes(notes: Iterable[str], warnings: Iterable[str] = ()) -> None:
         print(line, file=sys.stderr)
 
 
-class ProgressCallback(Protocol):
-    """Hears how far a stage is; a stage that starts over begins at less than it had."""
-
-    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
-
-
 SPEED_PERIOD = 600.0
 """Time over which rates and times left are averaged, so that a step of a minute still counts [s]."""
 
@@ -60,7 +54,7 @@ def rate_in_words(steps_per_second: float | None) -> str:
 
 
 @contextmanager
-def progress(quiet: bool, *, compiles: bool = True) -> Iterator[ProgressCallback]:
+def progress(quiet: bool, *, compiles: bool = True) -> Iterator[NotedProgress]:
     """Show stages with rate and time left on a terminal; nothing when quiet or elsewhere.
 
     Args:

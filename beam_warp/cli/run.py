@@ -12,12 +12,13 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
-from beam_warp.cli.console import ProgressCallback, print_json, print_notes, progress
+from beam_warp.cli.console import print_json, print_notes, progress
 from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
 from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
 from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
 from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def _check_words(args: Run, capture: Capture | None) -> None:
         )
 
 
-def _reconstruct(args: Run, capture: Capture, report: ProgressCallback) -> Reconstruction:
+def _reconstruct(args: Run, capture: Capture, report: NotedProgress) -> Reconstruction:
     from beam_warp.jobs.store import make_folders
     from beam_warp.reconstruction.job import reconstruct
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from beam_warp.cli.console import ProgressCallback, print_json, progress
+from beam_warp.cli.console import print_json, progress
 from beam_warp.cli.flags import Device, Json, Quiet
 from beam_warp.errors import OutputError
+from beam_warp.jobs.listeners import NotedProgress
 
 if TYPE_CHECKING:
     from beam_warp.stability.page import StabilityResult
@@ -76,7 +77,7 @@ def stability(args: Stability) -> int:
     return 0 if result.passed else 1
 
 
-def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
+def _trace(args: Stability, report: NotedProgress) -> StabilityResult:
     """Trace the scenes and the shapes."""
     from beam_warp.stability.analytic_occlusion import SHAPES, measure_refinements
     from beam_warp.stability.page import StabilityResult
@@ -91,7 +92,7 @@ def _trace(args: Stability, report: ProgressCallback) -> StabilityResult:
     )
 
 
-def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
+def _reconstruct(args: Stability, report: NotedProgress) -> StabilityResult:
     """Reconstruct the captures."""
     from beam_warp.stability.capture_cases import CAPTURE_CASES
     from beam_warp.stability.captures import run_capture_case
@@ -109,7 +110,7 @@ def _reconstruct(args: Stability, report: ProgressCallback) -> StabilityResult:
         return StabilityResult(captures=tuple(outcomes))
 
 
-def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
+def _decompose(args: Stability, report: NotedProgress) -> StabilityResult:
     """Measure materials."""
     from beam_warp.stability.material_cases import MATERIAL_CASES, MaterialStudio
     from beam_warp.stability.materials import Bench, run_material_case
@@ -121,7 +122,7 @@ def _decompose(args: Stability, report: ProgressCallback) -> StabilityResult:
     return StabilityResult(materials=tuple(outcomes))
 
 
-def _relight(args: Stability, report: ProgressCallback) -> StabilityResult:
+def _relight(args: Stability, report: NotedProgress) -> StabilityResult:
     """Render subjects and lights with both renderers."""
     from beam_warp.stability.page import StabilityResult
     from beam_warp.stability.relighting import RelightingBench, run_both_renderers

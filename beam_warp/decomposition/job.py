@@ -36,7 +36,8 @@ from beam_warp.decomposition.source import Source
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
-from beam_warp.jobs.progress import JobLog, Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
+from beam_warp.jobs.progress import JobLog
 from beam_warp.jobs.report import write_report
 from beam_warp.jobs.store import make_folders
 from beam_warp.materials.direct import ColorEvidence
@@ -74,7 +75,7 @@ def run(
     *,
     capture: Capture | None = None,
     overview: OverviewOptions | None = None,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> RunResult:
     """Decompose a sequence; write ``out/asset.usda``, its layers, ``out/report.json`` and ``out/overview.png``.
 

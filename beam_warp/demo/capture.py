@@ -25,7 +25,7 @@ from beam_warp.demo.figure import Figure, build_figure
 from beam_warp.demo.lights import studio
 from beam_warp.errors import OutputError
 from beam_warp.image.files import write_exr
-from beam_warp.jobs.progress import Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.trace.mesh_paths import TracedMesh, trace_channels, trace_radiance
 from beam_warp.world.camera import MAX_SIDE, Camera
 from beam_warp.world.environment import EnvironmentMap
@@ -85,7 +85,7 @@ def write_demo_capture(
     relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> Capture:
     """Path trace the demo figure's dance for a dome of cameras and write it as a capture.
 
@@ -142,7 +142,7 @@ def write_capture(
     relit: Mapping[str, EnvironmentMap] | None = None,
     device: str | None = None,
     seed: int = 0,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> Capture:
     """Path trace meshes, one a frame, for some cameras and write them as a capture; see `write_demo_capture`.
 

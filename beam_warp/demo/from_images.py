@@ -22,7 +22,8 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
 from beam_warp.image.panels import Panel, lay_out, over_background
-from beam_warp.jobs.progress import Progress, StageTimer
+from beam_warp.jobs.listeners import StageProgress
+from beam_warp.jobs.progress import StageTimer
 from beam_warp.jobs.report import write_json
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
@@ -107,7 +108,7 @@ def demo_from_images(
     *,
     device: str | None,
     seed: int,
-    progress: Progress,
+    progress: StageProgress,
 ) -> FromImages:
     """Photograph the figure, reconstruct it from the photographs, make it relightable, and score all of that.
 
@@ -200,7 +201,9 @@ def demo_steps(options: FromImagesOptions, *, device: str | None, seed: int) -> 
     )
 
 
-def demo_capture(out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: Progress) -> Capture:
+def demo_capture(
+    out: Path, options: FromImagesOptions, device: str | None, seed: int, progress: StageProgress
+) -> Capture:
     """Write ``out/capture``, or read it if it was written with the same options.
 
     Raises:
@@ -262,7 +265,7 @@ def _decompose(
     sequence: GaussianSequence,
     lights: Mapping[str, EnvironmentMap],
     device: str | None,
-    progress: Progress,
+    progress: StageProgress,
 ) -> RunResult:
     """Make the reconstructed sequence relightable, under the first of the lights."""
     light, *others = lights

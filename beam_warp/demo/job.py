@@ -16,7 +16,7 @@ from beam_warp.demo.lights import demo_environments
 from beam_warp.demo.stand_in import sample_surface, trained_gaussians
 from beam_warp.demo.truth import DemoTruth, comparison, relit_views, score_views
 from beam_warp.image.files import write_exr, write_png
-from beam_warp.jobs.progress import Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
@@ -74,7 +74,7 @@ class DemoScene:
     truth_frame: int
 
 
-def build_demo(options: DemoOptions, progress: Progress = no_progress) -> DemoScene:
+def build_demo(options: DemoOptions, progress: StageProgress = no_progress) -> DemoScene:
     """Build the figure, capture it as Gaussians, and path trace the truth."""
     rng = np.random.default_rng(options.seed)
     figure = build_figure()
@@ -103,7 +103,7 @@ def build_demo(options: DemoOptions, progress: Progress = no_progress) -> DemoSc
     return DemoScene(sequence, lights, truth, truth_frame)
 
 
-def run_demo(out: Path, options: DemoOptions | None = None, progress: Progress = no_progress) -> RunResult:
+def run_demo(out: Path, options: DemoOptions | None = None, progress: StageProgress = no_progress) -> RunResult:
     """Build the demo, run the main job on it, score the result and draw it; then do the same from images.
 
     Writes what `beam_warp.run` writes, ``out/lights/*.exr`` and ``out/relit.png``: ours above, truth below; and what

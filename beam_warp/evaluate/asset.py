@@ -16,7 +16,7 @@ from beam_warp.evaluate.scores import MaterialScores
 from beam_warp.evaluate.sheet import evaluation_sheet
 from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.files import write_exr, write_png
-from beam_warp.jobs.progress import Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.report import device_facts, versions, write_json
 from beam_warp.jobs.store import make_folders
 from beam_warp.reconstruction.preview import opposite_cameras
@@ -46,7 +46,7 @@ def evaluate_asset(
     *,
     out: Path | None = None,
     renders: Path | None = None,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> Evaluation:
     """Score an asset; write a report and a picture, and the images that were scored, as far as they are asked for.
 

@@ -25,7 +25,7 @@ from beam_warp.evaluate.relighters import RELIGHTERS, Relighter
 from beam_warp.evaluate.scores import MaterialScores, MaterialViewScores, Scales, as_triple
 from beam_warp.evaluate.steadiness import TemporalScores, gaussian_deviation, surface_scores
 from beam_warp.evaluate.views import ScoredView, ViewScorer
-from beam_warp.jobs.progress import Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
@@ -82,7 +82,7 @@ def score_materials(
     relighters: Mapping[str, Relighter] | None = None,
     metrics: PerceptualMetrics | None = None,
     observe: Observer | None = None,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> MaterialScores:
     """Score an asset against the views of a capture whose truth is known.
 
@@ -161,7 +161,7 @@ def _score_views(
     frames: Sequence[int],
     lights: Mapping[str, EnvironmentMap],
     observe: Observer | None,
-    progress: Progress,
+    progress: StageProgress,
 ) -> tuple[list[MaterialViewScores], dict[int, NDArray[np.float64]]]:
     """Draw, relight and score the views of all frames, one at a time; return also color sums by frame."""
     views: list[MaterialViewScores] = []
@@ -187,7 +187,7 @@ def _with_scale(
     views: Sequence[MaterialViewScores],
     scale: Scales,
     lights: Mapping[str, EnvironmentMap],
-    progress: Progress,
+    progress: StageProgress,
 ) -> list[MaterialViewScores]:
     """Score base colour once more, scaled, and relighting with it if lights are given."""
     by_name = {view.name: view for view in views}
@@ -209,7 +209,7 @@ def _with_scale(
     return list(by_name.values())
 
 
-def _temporal(asset: ComparedAsset, scorer: ViewScorer, progress: Progress) -> TemporalScores:
+def _temporal(asset: ComparedAsset, scorer: ViewScorer, progress: StageProgress) -> TemporalScores:
     """Measure how steady base colour is."""
     numbers = [number for number, _ in sorted(asset.matched.items(), key=lambda pair: pair[1])]
     gaussians = gaussian_deviation(asset.sequence, numbers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -15,6 +15,7 @@ from beam_warp.checks import require_count
 from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.drawn import SAMPLES, draw_materials
 from beam_warp.image.color import linear_to_srgb
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
@@ -34,7 +35,6 @@ LEAST_LASTING = 0.9
 """Part of the triangles that must stay: exporters cut a few squares along the other diagonal as they bend."""
 
 FloatArray = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def surface_scores(
     samples: int = SAMPLES,
     point_count: int = POINT_COUNT,
     device: str | None = None,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
 ) -> SurfaceScores | str:
     """Follow points of the true surface through the test views, or say why that cannot be.
 

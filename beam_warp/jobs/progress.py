@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import warp as wp
 
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
-
-
-def no_progress(stage: str, done: int, total: int) -> None:
-    """Report to nobody."""
+from beam_warp.jobs.listeners import CountProgress, StageProgress
 
 
 class StageTimer:
@@ -45,7 +40,7 @@ class JobLog:
         timer: Seconds by stage.
     """
 
-    def __init__(self, progress: Progress, frame_count: int, device: Any) -> None:
+    def __init__(self, progress: StageProgress, frame_count: int, device: Any) -> None:
         """Report to ``progress`` about that many frames on a Warp device."""
         self.timer = StageTimer(device)
         self._progress = progress
@@ -55,7 +50,7 @@ class JobLog:
         """Pass progress on."""
         self._progress(stage, done, total)
 
-    def within(self, stage: str, frame: int) -> Callable[[int, int], None]:
+    def within(self, stage: str, frame: int) -> CountProgress:
         """Return a reporter of progress inside a frame, which counts the Gaussians of all frames."""
         frames = self._frame_count
         return lambda done, total: self._progress(stage, frame * total + done, frames * total)

@@ -19,6 +19,7 @@ from beam_warp.checks import require_choice, require_count
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.light.product_sampling import launch_accumulate_block_weights
 from beam_warp.kernels.materials.residues import (
     ALBEDO_SCALING,
@@ -40,7 +41,7 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.incident import DENSITIES, Density, techniques
-from beam_warp.trace.occlusion import Progress, ambient_occlusion
+from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
 from beam_warp.trace.sampling import SAMPLERS, Sampler
 from beam_warp.trace.scene import Scene
@@ -202,7 +203,7 @@ def measure_materials(
     views: ViewEvidence | None = None,
     frame: int = 0,
     rows: NDArray[np.integer[Any]] | None = None,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
 ) -> MaterialMeasurement:
     """Trace one frame and accumulate its evidence on base colour.
 
@@ -332,7 +333,7 @@ def light_batches(
     options: MaterialOptions,
     hit_radiance: NDArray[np.float32] | None,
     frame: int,
-    progress: Progress,
+    progress: CountProgress,
 ) -> Iterator[tuple[RayBatch, LightRays]]:
     """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
 

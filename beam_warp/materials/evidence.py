@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -21,6 +21,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.view_evidence import (
     PIXEL_CHANNELS,
     CapturedPixels,
@@ -102,7 +103,7 @@ def view_evidence(
     options: RasterOptions | None = None,
     ceiling: float = float("inf"),
     device: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: CountProgress | None = None,
 ) -> ViewEvidence:
     """Draw a cloud for cameras and spread what their pixels see back over its Gaussians.
 

@@ -33,6 +33,7 @@ from beam_warp.checks import (
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.jobs.progress import StageTimer
 from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixels, launch_write_bake_targets
 from beam_warp.light.prepared import PreparedEnvironment
@@ -51,7 +52,7 @@ from beam_warp.materials.residues import (
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
-from beam_warp.trace.occlusion import Progress, ambient_occlusion
+from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 from beam_warp.world.harmonics import SH_C0
@@ -164,7 +165,7 @@ def decompose_by_images(
     raster_options: RasterOptions | None = None,
     previous: NDArray[np.float32] | None = None,
     frame: int = 0,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
 ) -> ImageMaterials:
     """Decompose one frame.
 

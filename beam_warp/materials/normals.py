@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.device.arrays import upload
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.neighborhoods import (
     launch_consult_neighbors,
     launch_reach_above,
     launch_thinnest_direction,
 )
 from beam_warp.materials.evidence import ViewEvidence
-from beam_warp.trace.occlusion import Progress, ambient_occlusion
+from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
@@ -142,7 +143,7 @@ class SurfacePoints:
 
 
 def estimate_normals(
-    cloud: GaussianCloud, scene: Scene, *, seed: int = 0, progress: Progress | None = None
+    cloud: GaussianCloud, scene: Scene, *, seed: int = 0, progress: CountProgress | None = None
 ) -> SurfaceNormals:
     """Estimate the surface normal at every Gaussian.
 
@@ -210,7 +211,11 @@ def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def _open_side(
-    scene: Scene, positions: NDArray[np.float32], normals: NDArray[np.float32], seed: int, progress: Progress | None
+    scene: Scene,
+    positions: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    seed: int,
+    progress: CountProgress | None,
 ) -> NDArray[np.float32]:
     """Return how much more open the normal's side is than the other, in [-1, 1]."""
     sides = []

@@ -33,12 +33,12 @@ from scipy.spatial import cKDTree
 from beam_warp.checks import require_number
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions, light_batches, lit_points, mean_radiance
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.trace.occlusion import Progress
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -178,7 +178,7 @@ def measure_roughness_profile(
     *,
     options: MaterialOptions,
     frame: int = 0,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
 ) -> RoughnessProfile:
     """Trace the light of one frame and try every candidate on what its views show.
 

@@ -21,11 +21,12 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.graphs import StepGraphs
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
+from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.parameters import GaussianParameters, require_something
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, chosen_samples, disc_spacing, shuffled_views

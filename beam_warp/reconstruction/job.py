@@ -36,11 +36,12 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
+from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.jobs.report import device_facts, versions, write_report
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.model import model_frame
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
-from beam_warp.reconstruction.frames.protocols import FrameSteps, Progress, no_progress
+from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
 from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, key_of_frame, stored_cloud, stored_sequence
@@ -116,7 +117,7 @@ def reconstruct(
     steps: FrameSteps,
     options: ReconstructOptions | None = None,
     *,
-    progress: Progress = no_progress,
+    progress: NotedProgress = no_progress,
 ) -> Reconstruction:
     """Reconstruct a capture; write ``out/gaussians.usda``, its layers, ``out/report.json`` and ``out/previews``.
 
@@ -157,7 +158,7 @@ def reconstruct_part(
     part: SegmentShare,
     options: ReconstructOptions | None = None,
     *,
-    progress: Progress = no_progress,
+    progress: NotedProgress = no_progress,
 ) -> tuple[int, ...]:
     """Reconstruct some segments into ``out/frames`` and ``out/previews``; `reconstruct` then finds them there.
 
@@ -199,10 +200,12 @@ class _Job:
     device: Any
     store: FrameStore
     common_inputs: str
-    progress: Progress
+    progress: NotedProgress
 
 
-def _prepare(capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions, progress: Progress) -> _Job:
+def _prepare(
+    capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions, progress: NotedProgress
+) -> _Job:
     """Check everything, and then make the folders."""
     device = resolve_device(steps.device)
     plan = plan_frames(capture, options.frames, options.segment_length)

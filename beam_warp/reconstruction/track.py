@@ -20,9 +20,10 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.fit import NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
-from beam_warp.reconstruction.frames.protocols import StepProgress, no_progress
+from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
 from beam_warp.reconstruction.joints.selection import select_joints

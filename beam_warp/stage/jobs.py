@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -16,19 +16,13 @@ from beam_warp.digests import code_digest
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
+from beam_warp.jobs.listeners import CountProgress, NotedProgress
 from beam_warp.stage.output import Film, FrameLog, FramePattern, require_folder
 from beam_warp.stage.pictures import PictureWriter
 from beam_warp.stage.shot_digests import ShotDigests
 from beam_warp.stage.stage import Stage
 from beam_warp.world.camera import Camera
 from beam_warp.world.shot import RenderedImage, Shot
-
-
-class RenderProgress(Protocol):
-    """Called as the work goes on."""
-
-    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +37,7 @@ class FrameContext:
 
     number: int
     checkpoint: Path
-    report: Callable[[int, int], None]
+    report: CountProgress
 
 
 class FrameRenderer(Protocol):
@@ -100,7 +94,7 @@ class RenderInterruptedError(KeyboardInterrupt):
 class RenderJob:
     """Renders frames of a stage with one renderer into files of one kind."""
 
-    def __init__(self, stage: Stage, renderer: FrameRenderer, writer: PictureWriter, report: RenderProgress) -> None:
+    def __init__(self, stage: Stage, renderer: FrameRenderer, writer: PictureWriter, report: NotedProgress) -> None:
         """Take the stage, the renderer, the writer of images, and a callback for progress."""
         self._stage, self._renderer, self._writer, self._report = stage, renderer, writer, report
         self._digests = ShotDigests(code_digest(), renderer.decisive, writer.options)

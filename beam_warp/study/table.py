@@ -23,6 +23,7 @@ from beam_warp.checks import require_number
 from beam_warp.converters.staging import require_writable
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import replacing
+from beam_warp.jobs.listeners import StageProgress
 
 Level = str | int | float
 
@@ -255,11 +256,7 @@ def pareto_frontier(costs: ArrayLike, errors: ArrayLike, tolerance: float = 0.0)
 
 
 def run_study(
-    study: Study,
-    folder: Path,
-    *,
-    budget_seconds: float = math.inf,
-    progress: Callable[[str, int, int], None] | None = None,
+    study: Study, folder: Path, *, budget_seconds: float = math.inf, progress: StageProgress | None = None
 ) -> tuple[Table, list[Settings]]:
     """Measure a study's plan into ``folder/NAME.csv``.
 

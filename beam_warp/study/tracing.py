@@ -14,11 +14,12 @@ import warp as wp
 
 from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.jobs.listeners import StageProgress
 from beam_warp.kernels.common.launching import thread_count
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing_plan import DEFAULT_PLAN, TracingPlan
-from beam_warp.study.tracing_truth import Progress, References, find_references
+from beam_warp.study.tracing_truth import References, find_references
 from beam_warp.trace.incident import irradiance
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import LIFT_IN_THICKNESSES
@@ -46,7 +47,7 @@ def tracing_study(
     device: str | None = None,
     references_file: Path | None = None,
     reference_seconds: float = np.inf,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> Study:
     """Prepare the tracing study: scenes, points, normals and references; measuring is left to `run_study`.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from beam_warp.device.arrays import upload
 from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.files import replacing
+from beam_warp.jobs.listeners import StageProgress
 from beam_warp.kernels.trace.surface_rays import launch_local_surface
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.normals import estimate_normals
@@ -37,8 +37,6 @@ BLOCK = {False: 16, True: 1024}
 
 SEED = 1 << 31
 """References draw other samples than every measurement, whose seeds count up from 0."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +87,7 @@ def find_references(
     *,
     file: Path | None = None,
     seconds: float = np.inf,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> References:
     """Choose points and trace their references, or take them from an earlier run's file if nothing has changed.
 
@@ -110,7 +108,7 @@ def find_references(
     kept = _load(file, fingerprint) if file is not None else None
     if kept is not None:
         return kept
-    report: Progress = progress or (lambda stage, done, total: None)
+    report: StageProgress = progress or (lambda stage, done, total: None)
     seen = np.flatnonzero(cloud.opacities > 1.0 / 255.0)
     if len(seen) < 2:
         raise InvalidArrayError(

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import warp as wp
 
 from beam_warp.device.arrays import download_like
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.trace.ambient_occlusion import launch_draw_occlusion, launch_reduce_visibility
 from beam_warp.trace.rays import checked_points, ray_batches, room_for_rays
 from beam_warp.trace.sampling import Sampler, sample_set
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT, TraceOptions, trace_rays
-
-Progress = Callable[[int, int], None]
-"""Called with (points done, points in all)."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ def ambient_occlusion(
     options: TraceOptions = EXACT,
     seed: int = 0,
     frame: int = 0,
-    progress: Progress | None = None,
+    progress: CountProgress | None = None,
     sampler: Sampler = "owen",
 ) -> AmbientOcclusion:
     """Estimate how open the hemisphere above each surface point is.

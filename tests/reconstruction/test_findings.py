@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction import steps
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.steps import MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
 

@@ -10,9 +10,9 @@ from support.moving_ball import ball_cloud, ball_view, ball_views, rig
 from support.threads import require_same_on_any_threads
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction import fit as fit_module
 from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, fit_gaussians
-from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
 

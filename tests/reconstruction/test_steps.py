@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.moving_ball import ball_views, rig
 
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.frames.protocols import no_progress
 from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from beam_warp.capture.views import CapturedView
-from beam_warp.reconstruction.frames.protocols import FrameSteps, FrameTrack, Progress, StepProgress
+from beam_warp.jobs.listeners import NotedProgress
+from beam_warp.reconstruction.frames.protocols import FrameSteps, FrameTrack, StepProgress
 from beam_warp.reconstruction.frames.report import known_numbers
 
 
@@ -34,7 +35,7 @@ def model_frame(
     frame: int,
     views: Sequence[CapturedView],
     previous: tuple[FrameTrack, int] | None,
-    progress: Progress,
+    progress: NotedProgress,
 ) -> FrameModel:
     """Find the Gaussians of a frame; a frame in which tracking is lost is fitted as a key frame.
 
@@ -72,7 +73,7 @@ def model_frame(
     )
 
 
-def _within(progress: Progress, stage: str, frame: int) -> StepProgress:
+def _within(progress: NotedProgress, stage: str, frame: int) -> StepProgress:
     """Return a reporter of progress inside a frame."""
 
     def report(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:

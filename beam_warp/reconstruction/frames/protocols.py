@@ -13,13 +13,6 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianCloud
 
 
-class Progress(Protocol):
-    """Hears how far a stage is."""
-
-    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Take ``done`` of ``total`` steps of a stage, and words about the latest one."""
-
-
 class StepProgress(Protocol):
     """Hears how far the iterations of a frame are."""
 
@@ -76,7 +69,3 @@ class FrameSteps(Protocol):
     def restore(self, arrays: dict[str, NDArray[Any]]) -> FrameTrack:
         """Return the track whose `FrameTrack.arrays` these are."""
         ...
-
-
-def no_progress(*step: Any, **facts: Any) -> None:
-    """Report to nobody: a `Progress` and a `StepProgress`."""

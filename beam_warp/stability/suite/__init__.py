@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from beam_warp.errors import BeamError
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.world.gaussians import GaussianCloud
 
 Case = TypeVar("Case")
@@ -127,7 +128,7 @@ def attempt(work: Callable[[], Result]) -> Attempt[Result]:
 
 
 def run_suite(
-    cases: Sequence[Case], run: Callable[[Case], Iterable[Row]], progress: Callable[[int, int], None] | None = None
+    cases: Sequence[Case], run: Callable[[Case], Iterable[Row]], progress: CountProgress | None = None
 ) -> Iterator[Row]:
     """Run case after case.
 
