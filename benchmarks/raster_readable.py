@@ -8,19 +8,12 @@ from functools import cache
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import (
-    MEDIAN,
-    TRANSMITTANCE_STOP,
-    alpha_of,
-    depth_function,
-    log_alpha_of,
-    offset_from,
-    whiten,
-)
+from beam_warp.kernels.raster.splat_rows import MEDIAN, alpha_of, depth_function, log_alpha_of, offset_from, whiten
 from beam_warp.raster.forward import composite
 from beam_warp.raster.rasterizer import Rasterizer
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import DomeCamera, dome_cameras, write_capture
-from beam_warp.jobs.progress import Progress, no_progress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh, vertex_normals
@@ -103,7 +103,7 @@ def write_large_capture(
     samples: int = 16,
     subdivisions: int = 2,
     device: str | None = None,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> Capture:
     """Path trace a known surface for a dome of cameras and write it as a capture; frames are numbered from 0."""
     meshes, surfaces = textured_meshes(source, frames, subdivisions)

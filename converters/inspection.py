@@ -11,9 +11,7 @@ from beam_warp.converters.compressed_ply import is_compressed
 from beam_warp.converters.numbering import numbered_files
 from beam_warp.converters.ply_container import PlyHeader, read_header
 from beam_warp.world.axes import handedness
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-
-_MATERIALS = ("base_color", "roughness", "ambient_occlusion", "normals")
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud, GaussianSequence
 
 _INVISIBLE = 1.0 / 255.0
 """Opacities below this are invisible in an 8-bit picture."""
@@ -133,7 +131,7 @@ def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
         opacities=_value_range(cloud.opacities),
         sh_degree=cloud.sh_degree,
         color_state=_color_state(cloud, header),
-        materials=tuple(name for name in _MATERIALS if getattr(cloud, name) is not None),
+        materials=tuple(name for name in MATERIAL_CHANNELS if getattr(cloud, name) is not None),
         comments=() if header is None else header.comments,
         notes=(*notes, *_oddities(cloud)),
     )

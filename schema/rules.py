@@ -29,7 +29,7 @@ from beam_warp.schema.stage_queries import (
     sequence_prim,
     splat_prims,
 )
-from beam_warp.world.gaussians import MAX_SH_DEGREE
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, MAX_SH_DEGREE
 
 
 class Fault(NamedTuple):
@@ -75,7 +75,6 @@ FIRST_RULES: list[Rule] = []
 PRIM_RULES: list[Rule] = []
 
 REQUIRED = ("positions", "orientations", "scales", "opacities", "radiance")
-RELIGHTABLE = ("base_color", "roughness", "ambient_occlusion", "normals")
 TOKENS = {
     "beam:brdf": ("ggx-metallic-roughness",),
     "beam:aoMeaning": ("hemisphericalVisibility",),
@@ -200,7 +199,7 @@ def _api_applied(prim: Usd.Prim) -> Iterator[Fault]:
 @entering(PRIM_RULES, "BEAM-MAT-001", "warning")
 def _relightable_channels(prim: Usd.Prim) -> Iterator[Fault]:
     """Base colour, roughness, ambient occlusion and normals, which relighting reads, are all authored."""
-    missing = [CHANNELS[name].usd_name for name in RELIGHTABLE if array_attribute(prim, CHANNELS[name]) is None]
+    missing = [CHANNELS[name].usd_name for name in MATERIAL_CHANNELS if array_attribute(prim, CHANNELS[name]) is None]
     if has_material_api(prim) and missing:
         yield Fault(f"relighting needs {', '.join(missing)}, got none. Decompose the asset.", missing[0])
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.findings import Findings, are, count_of, names_of
 from beam_warp.capture.records import CaptureRecord
+from beam_warp.image.color import LUMINANCE
 from beam_warp.image.files import display_image
 
 GLIMPSE_SIDE = 160
@@ -33,8 +34,6 @@ BLACK = 1e-4
 
 SOLID = 0.5
 """A pixel belongs to the subject if its alpha is above this."""
-
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
     if alpha is not None:
         color = np.divide(color, alpha[..., None], out=np.zeros_like(color), where=alpha[..., None] > 1e-6)
     subject = np.ones(color.shape[:2], bool) if alpha is None else alpha > SOLID
-    luminance = (color @ np.array(LUMINANCE, np.float32))[subject]
+    luminance = (color @ LUMINANCE.astype(np.float32))[subject]
     level = float(np.median(luminance)) if len(luminance) else 0.0
     return Glimpse(
         record=record,

@@ -33,6 +33,7 @@ from beam_warp.capture.undistort import Intrinsics
 from beam_warp.converters.ply_container import read_header, read_table
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
+from beam_warp.world.camera import OPENGL_TO_OPENCV
 
 FILE_NAME = "transforms.json"
 """Name of the file that describes the capture."""
@@ -45,8 +46,6 @@ MAX_FRAME = 10**9
 
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 """Camera models that are read; nerfstudio too treats all but the last one alike."""
-
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read(path: Path, keep: float) -> CaptureContents:
@@ -215,7 +214,7 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float)
         fields.where,
     )
     camera, undistortion = photograph.undistort(
-        fields.matrix("transform_matrix") @ _OPENGL_TO_OPENCV, "transform_matrix", keep
+        fields.matrix("transform_matrix") @ OPENGL_TO_OPENCV, "transform_matrix", keep
     )
     file_path = fields.text("file_path")
     return CaptureRecord(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.world.camera import Camera
+from beam_warp.world.camera import OPENGL_TO_OPENCV, Camera
 
 MIN_SPREAD = 1e-4
 """Least eigenvalue of the mean of I - a a^T over unit axes a that meet; axes within 0.6 degrees are below it."""
@@ -27,8 +27,6 @@ COMMON_SHARE = 0.75
 
 LEAST_SHARE = 1.0 / 3.0
 """Least share of the cameras that must see a point in common."""
-
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def meeting_point(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -170,12 +168,14 @@ UP_MARGIN = 0.2
 
 POSE_MISTAKES = {
     "OpenCV poses were given as OpenGL's, or the other way round: negate the second and third column": lambda q: (
-        q @ _FLIP
+        q @ OPENGL_TO_OPENCV
     ),
     "world-to-camera poses in OpenCV axes were given: invert them, and negate the second and third column": lambda q: (
-        np.linalg.inv(q @ _FLIP)
+        np.linalg.inv(q @ OPENGL_TO_OPENCV)
     ),
-    "world-to-camera poses in OpenGL axes were given: invert them": lambda q: np.linalg.inv(q @ _FLIP) @ _FLIP,
+    "world-to-camera poses in OpenGL axes were given: invert them": lambda q: (
+        np.linalg.inv(q @ OPENGL_TO_OPENCV) @ OPENGL_TO_OPENCV
+    ),
     "world-to-camera poses were given: invert them": np.linalg.inv,
 }
 """Usual mistakes in poses written for nerfstudio, each with the function that undoes it in the poses as read."""

@@ -27,7 +27,7 @@ from beam_warp.errors import OutputError
 from beam_warp.image.files import write_exr
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.trace.mesh_paths import TracedMesh, trace_channels, trace_radiance
-from beam_warp.world.camera import MAX_SIDE, Camera
+from beam_warp.world.camera import MAX_SIDE, OPENGL_TO_OPENCV, Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh
 
@@ -55,8 +55,6 @@ TEST_SAMPLES = 4
 
 CHANNEL_SAMPLES = 16
 VISIBILITY_SAMPLES = 4
-
-_OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -237,7 +235,7 @@ def transforms_record(
     """Return the record of one image, whose pose is in OpenGL axes."""
     record: dict[str, Any] = {
         "file_path": f"images/{name}/{frame:04d}.exr",
-        "transform_matrix": (camera.camera_to_world @ _OPENCV_TO_OPENGL).tolist(),
+        "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.focal_x,

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.errors import InvalidOptionError, MissingFileError
-from beam_warp.raster.gbuffer import MATERIAL_CHANNELS
 from beam_warp.world.axes import change_axes
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, WORLD_AXES, GaussianCloud, GaussianSequence
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.image.metrics import block_means
-from beam_warp.raster.channels import MATERIAL_CHANNELS, RADIANCE, UNIT_CHANNELS
+from beam_warp.raster.channels import RADIANCE, UNIT_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import seen_radiance
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
 
 SAMPLES = 2
 """Side of the square of samples of a pixel: truth is filtered by a box over the pixel, and so are the samples."""

@@ -15,6 +15,9 @@ LINEAR_REC709 = "lin_rec709_scene"
 
 COLOR_SPACES = (DISPLAY_SRGB, LINEAR_REC709)
 
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Rec.709 weights of linear R, G and B in luminance."""
+
 
 def srgb_to_linear(srgb: ArrayLike) -> NDArray[Any]:
     """Decode display sRGB to linear light (IEC 61966-2-1), any shape, odd about zero so that all values have inverses.

@@ -15,8 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-DIELECTRIC_F0 = 0.04
-"""Reflectance at normal incidence of an index of refraction of 1.5: every material here is such a dielectric."""
+from beam_warp.kernels.light.brdf import DIELECTRIC_F0
 
 TABLE_SIZE = 64
 """Nodes along each axis of `specular_albedo_table`."""

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError
+from beam_warp.image.color import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap
 
 LARGEST_HEIGHT = 256
 """Taller maps are reduced to this height, energy kept, before they are cut: a texel is then 0.7 degrees."""
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance weights: regions are cut, and texels drawn, by what the eye sees of them."""
 
 MOST_REGIONS = 256
 WIDEST = np.radians(75.0)

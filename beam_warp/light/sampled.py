@@ -9,11 +9,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.device.arrays import upload
+from beam_warp.image.color import LUMINANCE
 from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.light.product_tree import ProductTree
 from beam_warp.kernels.trace.incident_light import LightMoments
-from beam_warp.light.regions import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap
 
 BLOCK_ROWS, BLOCK_COLUMNS = 16, 32

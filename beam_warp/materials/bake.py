@@ -25,7 +25,8 @@ from beam_warp.checks import require_array, require_choice, require_count, requi
 from beam_warp.device.array_checks import device_array
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.kernels.materials.baking import launch_add_pull, launch_add_rows, launch_clamp_rows, launch_weigh_pixels
+from beam_warp.kernels.common.row_sums import launch_add_rows
+from beam_warp.kernels.materials.baking import launch_add_pull, launch_clamp_rows, launch_weigh_pixels
 from beam_warp.kernels.materials.bounded_solve import (
     ColumnState,
     Problem,
@@ -312,7 +313,7 @@ class _BlendedImages:
             launch_weigh_pixels(part.size, part, target, weights, part, self.device)
         group.rasterizer.back_project(pixels, group.rows)
         group.rasterizer.sum_views(group.rows, self._summed)
-        launch_add_rows(self._summed, out, self.device)
+        launch_add_rows(out.size, self._summed, out, self.device)
 
     def apply(self, values: wp.array, out: wp.array) -> None:
         """Write A values to ``out``, A = W' M W + ridge + temporal."""
@@ -359,7 +360,7 @@ def _solve_by_gradients(images: _BlendedImages, values: wp.array) -> tuple[float
     for name in ("gradient", "walk", "direction", "applied"):
         setattr(problem, name, wp.zeros(shape, dtype=float))
     problem.scaling = wp.clone(images.evidence)
-    launch_add_rows(images.strength, problem.scaling, device)
+    launch_add_rows(images.strength.size, images.strength, problem.scaling, device)
     problem.low, problem.high = options.low, options.high
     state = ColumnState()
     for name, dtype in (("mode", int), ("step", float), ("clipped", int), ("conjugation", float)):

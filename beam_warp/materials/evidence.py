@@ -26,7 +26,7 @@ from beam_warp.kernels.materials.view_evidence import (
     PIXEL_CHANNELS,
     CapturedPixels,
     SurfacePixels,
-    launch_add_rows,
+    launch_add_views,
     launch_finish_surface,
     launch_observe,
     launch_write_pixels,
@@ -152,7 +152,7 @@ def view_evidence(
             captured = _captured(image_shown, ceiling, target)
             launch_write_pixels(view.width * view.height, view, drawn, captured, wp.vec3(*origin), pixels, target)
         rasterizer.back_project(pixels, rows)
-        launch_add_rows(rows, len(part), SURFACE_CHANNELS, sums, target)
+        launch_add_views(rows, len(part), SURFACE_CHANNELS, sums, target)
         if images is not None:
             launch_observe(
                 len(views) * len(gaussians.positions),

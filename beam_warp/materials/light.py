@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from beam_warp.capture.findings import Finding, count_of
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import linear_to_srgb
-from beam_warp.light.regions import LUMINANCE
+from beam_warp.image.color import LUMINANCE, linear_to_srgb
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene

@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from beam_warp.world.gaussians import ATTRIBUTES
 
-MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
-"""The channels that relighting reads."""
-
 RADIANCE = "radiance"
 """The channel that is evaluated towards the camera before it is composited."""
 

@@ -13,13 +13,13 @@ from beam_warp.checks import require_array, require_choice, require_finite, requ
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.array_checks import require_cameras
-from beam_warp.raster.channels import MATERIAL_CHANNELS, UNIT_CHANNELS, channel_layers, is_vector
+from beam_warp.raster.channels import UNIT_CHANNELS, channel_layers, is_vector
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import GEOMETRY, DrawnCloud, require_world_axes, upload_gaussians
 from beam_warp.raster.view_images import ValueImages, ViewImages, host_images, view_images
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud
+from beam_warp.world.gaussians import ATTRIBUTES, MATERIAL_CHANNELS, GaussianCloud
 
 IMAGES = ("alpha", "depth", "median_depth")
 """Images besides channels that a loss may depend on."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
+from beam_warp.image.color import LUMINANCE
 from beam_warp.reconstruction.initial import view_samples
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -35,8 +36,6 @@ LARGEST_SIDE = 320
 
 MOST_POINTS = 4_096
 """Most Gaussians that are compared, evenly chosen: an exposure is the middle of hundreds of samples then."""
-
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 DARKEST = 1e-3
 """Luminance below which a sample is left out: its logarithm is that of noise."""
@@ -94,7 +93,7 @@ def view_gains(
     samples = view_samples(reduced, cloud, normals, device=device).numpy()
     seen = (samples[..., 3] > 0.0).sum(axis=0)
     picked = samples[:, np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_POINTS)).astype(int)].astype(np.float64)
-    luminance, weights = picked[..., :3] @ np.array(LUMINANCE), picked[..., 3]
+    luminance, weights = picked[..., :3] @ LUMINANCE, picked[..., 3]
     stops, residuals = agree_exposures(
         np.log2(np.maximum(luminance, DARKEST)), np.where(luminance > DARKEST, weights, 0.0)
     )

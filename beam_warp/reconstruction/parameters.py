@@ -15,8 +15,8 @@ from beam_warp.device.array_checks import float_rows
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
+from beam_warp.kernels.common.row_sums import launch_add_rows
 from beam_warp.kernels.reconstruction.activation import Shapes, launch_activate, launch_add_shape_gradients
-from beam_warp.kernels.reconstruction.gradient_sums import launch_add_rows
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, GaussianGradients
 from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
@@ -110,7 +110,8 @@ class GaussianParameters:
     def add_gradients(self, drawn: GaussianGradients) -> None:
         """Add the gradients of what was drawn, brought back to what is moved."""
         for name in ("positions", "orientations", "radiance"):
-            launch_add_rows(float_rows(getattr(drawn, name)), float_rows(self._gradients[name]), self.device)
+            rows = float_rows(getattr(drawn, name))
+            launch_add_rows(rows.size, rows, float_rows(self._gradients[name]), self.device)
         launch_add_shape_gradients(
             self._shapes,
             drawn.scales,

@@ -19,20 +19,17 @@ from beam_warp.stage.camera_paths import outline
 from beam_warp.stage.time_sampling import Blend, Moment, TimeSampler
 from beam_warp.world.axes import axes_matrix, change_axes
 from beam_warp.world.framing import bulk_of
-from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, WORLD_AXES, GaussianCloud, GaussianSequence
 
 BOUNDING_FRAMES = 3
 """What bounds a moving subject is taken from this many of its frames: first, last and between."""
-
-RELIGHTABLE = ("base_color", "roughness", "ambient_occlusion", "normals")
-"""What Gaussians need besides their shape to be lit."""
 
 _SHARED = (
     "positions",
     "orientations",
     "scales",
     "opacities",
-    *RELIGHTABLE,
+    *MATERIAL_CHANNELS,
     "normal_confidence",
     "ambient_occlusion_error",
     "base_color_error",
@@ -159,7 +156,7 @@ class StageAsset:
     def _bare(self, frame: int) -> GaussianCloud:
         """Read a frame and drop its captured radiance, which light does not look at."""
         cloud = self.sequence[frame]
-        missing = [name for name in RELIGHTABLE if getattr(cloud, name) is None]
+        missing = [name for name in MATERIAL_CHANNELS if getattr(cloud, name) is None]
         if missing and len(cloud):
             raise InvalidOptionError(
                 f"asset must be relightable, got one without {', '.join(missing)} in frame {frame} of {self.name}. "

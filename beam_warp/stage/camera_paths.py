@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from beam_warp.checks import require_array, require_choice, require_finite, require_number
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.stage.fields import Fields, placed, read_json, shown
-from beam_warp.world.camera import Camera, focal_length
+from beam_warp.world.camera import OPENGL_TO_OPENCV, Camera, focal_length
 from beam_warp.world.quaternions import matrix_of, quaternion_of, slerp
 
 DEFAULT_FOV = 35.0
@@ -43,8 +43,6 @@ LEVEL_SINE = 0.05
 
 POSE_FIELDS = ("position", "target", "camera_to_world", "fov")
 """Fields of a camera that stands somewhere: a position and a target, or a pose; and its angle of view."""
-
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Interpolation = Literal["smooth", "linear"]
 
@@ -453,7 +451,7 @@ def nerfstudio_path(content: Any, name: str) -> KeyframePath:
         with placed(where, ("camera_to_world", "fov")):
             if isinstance(value, list) and len(value) == 16:
                 value = [value[start : start + 4] for start in range(0, 16, 4)]
-            pose = require_array("camera_to_world", value, (4, 4), np.float64) @ _OPENGL_TO_OPENCV  # type: ignore[arg-type]
+            pose = require_array("camera_to_world", value, (4, 4), np.float64) @ OPENGL_TO_OPENCV  # type: ignore[arg-type]
             keyframes.append(Keyframe(time=index / rate, camera_to_world=pose, fov=entry.get("fov", NERFSTUDIO_FOV)))
     return KeyframePath(tuple(keyframes), "linear")
 

@@ -13,6 +13,7 @@ from beam_warp.checks import require_array, require_choice, require_number, requ
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.image.files import write_exr, write_png
 from beam_warp.image.tone import EXPOSURE_RANGE, TRANSFORMS, ViewTransform, display_over
+from beam_warp.raster.channels import channel_layers
 from beam_warp.stage.backdrops import Backdrop
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.shot import RenderedImage, Shot
@@ -21,9 +22,6 @@ Background: TypeAlias = tuple[float, float, float] | Literal["transparent", "env
 """A display colour in [0, 1], nothing, or the environment as the camera sees it."""
 
 BLACK = (0.0, 0.0, 0.0)
-
-_LAYER_PARTS = {"normals": ("normal", "XYZ")}
-"""Layers whose channels are named otherwise than NAME.R, NAME.G and NAME.B."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +92,7 @@ class PictureWriter:
         channels: dict[str, Any] = {}
         if self.options.layers:
             for name, layer in image.layers.items():
-                prefix, parts = _LAYER_PARTS.get(name, (name, "RGB"))
-                named = {prefix: layer} if layer.ndim == 2 else {}
-                channels |= named or {f"{prefix}.{part}": layer[..., i] for i, part in enumerate(parts)}
+                channels |= channel_layers(name, layer)
         return channels | {"R": rgb[..., 0], "G": rgb[..., 1], "B": rgb[..., 2], "A": alpha}
 
     def _composed(self, shot: Shot, image: RenderedImage) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -14,6 +14,9 @@ from beam_warp.checks import require_array, require_count, require_finite, requi
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.world.framing import bulk, orbit_directions, pose_looking_at, require_point, require_points
 
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes of OpenGL (y up, looking along -z) to those of OpenCV (y down, looking along z), and back."""
+
 MAX_SIDE = 65_536
 """Largest image side [pixel]; a larger one is taken for a mistake."""
 

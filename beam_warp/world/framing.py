@@ -109,7 +109,7 @@ def require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """
     points = require_array(name, value, (None, 3), np.float64)
     if not len(points):
-        raise InvalidArrayError(f"{name} must hold at least one point, got none. Check that the asset is not empty.")
+        raise InvalidArrayError(f"{name} must hold at least one point, got none. Check that the input is not empty.")
     require_finite(name, points)
     return points
 

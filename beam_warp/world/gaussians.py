@@ -31,6 +31,9 @@ from beam_warp.image.color import COLOR_SPACES
 WORLD_AXES = "rfu"
 """Axes of the internal world: x right, y forward, z up; right-handed."""
 
+MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
+"""The channels that relighting reads."""
+
 MAX_SH_DEGREE = 4
 
 
@@ -242,9 +245,7 @@ class GaussianCloud:
     @property
     def is_relightable(self) -> bool:
         """True if every channel that relighting reads is there."""
-        return all(
-            getattr(self, name) is not None for name in ("base_color", "roughness", "ambient_occlusion", "normals")
-        )
+        return all(getattr(self, name) is not None for name in MATERIAL_CHANNELS)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays that are there, by name, in file order."""

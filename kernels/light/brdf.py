@@ -9,7 +9,7 @@ import warp as wp
 from beam_warp.kernels.common.constants import PI
 
 DIELECTRIC_F0 = wp.constant(0.04)
-"""Reflectance at normal incidence of a dielectric of index 1.5."""
+"""Reflectance at normal incidence of an index of refraction of 1.5: every material here is such a dielectric."""
 
 ALPHA_FLOOR = wp.constant(1.0e-3)
 """Smallest GGX alpha: below it D overflows float32 at its peak."""

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,14 +50,6 @@ def add_pull_kernel(
 
 
 @wp.kernel
-def add_rows_kernel(first: int, rows: wp.array2d[float], out_sums: wp.array2d[float]):
-    item = first + wp.tid()
-    row = item / rows.shape[1]
-    c = item % rows.shape[1]
-    out_sums[row, c] += rows[row, c]
-
-
-@wp.kernel
 def clamp_rows_kernel(first: int, low: float, high: float, out_rows: wp.array2d[float]):
     item = first + wp.tid()
     row = item / out_rows.shape[1]
@@ -71,11 +63,6 @@ launch_weigh_pixels = launcher(weigh_pixels_kernel)
 
 launch_add_pull = launcher(add_pull_kernel)
 """Add the gradient of half of strength times the squared distance from the anchors."""
-
-
-def launch_add_rows(rows, out_sums, device):
-    """Add rows to sums."""
-    launch(add_rows_kernel, rows.size, inputs=[rows], outputs=[out_sums], device=device)
 
 
 launch_clamp_rows = launcher(clamp_rows_kernel)

@@ -3,15 +3,13 @@
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.raster.image_losses import SHORTEST_NORMAL
 from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
 LEAST_FACING = wp.constant(1.0e-3)
 """Least cosine between a normal and the way to the camera: normals that lean further back are turned up to it."""
-
-SHORTEST_NORMAL = wp.constant(1.0e-3)
-"""Length below which a sum of normals has no direction: those that it sums cancel."""
 
 
 @wp.struct

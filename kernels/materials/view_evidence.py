@@ -83,7 +83,7 @@ def write_pixels_kernel(
 
 
 @wp.kernel
-def add_rows_kernel(first: int, rows: wp.array2d[float], view_count: int, columns: int, out_sums: wp.array2d[float]):
+def add_views_kernel(first: int, rows: wp.array2d[float], view_count: int, columns: int, out_sums: wp.array2d[float]):
     """Add what some views spread back to each Gaussian's sums, view by view."""
     i = first + wp.tid()
     count = out_sums.shape[0]
@@ -154,9 +154,9 @@ launch_write_pixels = launcher(write_pixels_kernel)
 """Write what one view's pixels say."""
 
 
-def launch_add_rows(rows, view_count, columns, out_sums, device):
+def launch_add_views(rows, view_count, columns, out_sums, device):
     """Add the first columns of some views' rows to the Gaussians' sums."""
-    launch(add_rows_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device)
+    launch(add_views_kernel, len(out_sums), inputs=[rows, view_count, columns], outputs=[out_sums], device=device)
 
 
 launch_observe = launcher(observe_kernel)

@@ -16,11 +16,9 @@ All zeros are background. Inverse depth without weight is a surface that is not 
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.raster.depth_normals import LEAST_DEPTH
 
 wp.set_module_options({"enable_backward": False})
-
-LEAST_DEPTH = wp.constant(1.0e-6)
-"""Depth [m] that counts as none; the rasteriser draws nothing nearer than 0.01 m."""
 
 LARGEST_TILT = wp.constant(10.0)
 """Largest tangent of a surface's tilt, in pixels of depth per pixel of width: 84 degrees. Beyond it, one surface and

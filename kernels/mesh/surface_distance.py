@@ -4,11 +4,9 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launcher
+from beam_warp.kernels.mesh.surface import RAY_LIFT
 
 wp.set_module_options({"enable_backward": False})
-
-RAY_LIFT = wp.constant(2.0e-5)
-"""Lift of a ray's origin along the triangle's normal [m]; see `beam_warp.kernels.mesh.surface`."""
 
 QUERY_CHUNK = 256
 """Fewest points of one launch on the CPU: each walks a tree."""

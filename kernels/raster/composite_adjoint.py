@@ -17,9 +17,9 @@ from functools import cache
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.raster.composite import Images, channel_vector
 from beam_warp.kernels.raster.splat_rows import (
-    ALPHA_CAP,
     SMALLEST_FACING,
     Sight,
     SplatRow,
@@ -145,7 +145,7 @@ def add_pixel_function(channel_count: int, exact: bool):
         weight = alpha * before
         z = depth_at(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset)
         s = wp.dot(row, to_channels) + z * adjoint[1] + adjoint[0]
-        d = wp.where(alpha < ALPHA_CAP, alpha * (before * s - quick_divide(state.behind, open_share)), 0.0)
+        d = wp.where(alpha < ALPHA_MAX, alpha * (before * s - quick_divide(state.behind, open_share)), 0.0)
         to_depth = weight * adjoint[1] + wp.where(is_median, adjoint[2], 0.0)
         depth = depth_adjoint(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset, z, to_depth)
         d0 = d * e[0]

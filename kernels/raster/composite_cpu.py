@@ -8,13 +8,13 @@ from functools import cache
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
 from beam_warp.kernels.raster.project import LOG_CUT, RasterView
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
-    TRANSMITTANCE_STOP,
     RowReach,
     alpha_of,
     depth_function,

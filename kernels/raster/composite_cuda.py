@@ -8,6 +8,7 @@ from functools import cache
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 from beam_warp.kernels.common.lanes import (
     ballot,
     lowest_lane,
@@ -22,7 +23,6 @@ from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vect
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
-    TRANSMITTANCE_STOP,
     alpha_of,
     depth_function,
     log_alpha_of,

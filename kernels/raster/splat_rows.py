@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.raster.project import LOG_CUT
 
 EXTENT_MARGIN = wp.constant(0.01)
@@ -9,13 +10,6 @@ EXTENT_MARGIN = wp.constant(0.01)
 
 RELATIVE_MARGIN = wp.constant(1.0e-5)
 """Part of an extent added to it: single precision, a few operations, a margin of ten."""
-
-ALPHA_CAP = wp.constant(0.99)
-"""Largest alpha of one splat (Kerbl et al. 2023): light behind an opaque one keeps a gradient."""
-
-TRANSMITTANCE_STOP = wp.constant(1.0e-4)
-"""A pixel is done once less than this passes. The splat that gets it there still counts: leaving it out, as 3DGS does,
-can drop 1 % of a pixel; what is left out here is below this number."""
 
 MEDIAN = wp.constant(0.5)
 """The median depth is that of the last splat that more than this passes before."""
@@ -175,7 +169,7 @@ def sight_of(center: wp.vec4, shape: wp.vec4, position: wp.vec2) -> Sight:
 @wp.func
 def alpha_of(log_alpha: float) -> float:
     """Alpha of a splat that passes the cut."""
-    return wp.min(quick_exp(log_alpha), ALPHA_CAP)
+    return wp.min(quick_exp(log_alpha), ALPHA_MAX)
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""Gradients of Gaussians that are added up: of what is drawn, of changes since the frame before, and their lengths."""
+"""Gradients of Gaussians that are added up: of changes since the frame before, and their lengths."""
 
 from typing import Any
 
@@ -7,13 +7,6 @@ import warp as wp
 from beam_warp.kernels.common.launching import launch
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def add_rows_kernel(first: int, rows: wp.array2d[float], out_rows: wp.array2d[float]):
-    item = first + wp.tid()
-    width = rows.shape[1]
-    out_rows[item / width, item % width] += rows[item / width, item % width]
 
 
 @wp.kernel
@@ -35,11 +28,6 @@ def add_gradient_lengths_kernel(
     if length > 0.0:
         out_sums[item] += length
         out_counts[item] += 1.0
-
-
-def launch_add_rows(rows: Any, out_rows: Any, device: Any) -> None:
-    """Add rows of floats to others."""
-    launch(add_rows_kernel, rows.size, inputs=[rows], outputs=[out_rows], device=device)
 
 
 def launch_add_difference_gradients(values: Any, reference: Any, scale: float, out_gradients: Any, device: Any) -> None:

@@ -4,12 +4,13 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launcher
+from beam_warp.kernels.common.luminance import luminance
 from beam_warp.kernels.light.latlong import latlong_bilinear
 from beam_warp.kernels.light.scattering import shading_of
 from beam_warp.kernels.mesh.surface import MeshSurface, closest_hit, surface_point
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_pixels import SHADE_CHUNK, arriving_radiance, pixel_ray
-from beam_warp.kernels.render.gaussian_light import SceneLight, environment_openness, luminance, random_turn
+from beam_warp.kernels.render.gaussian_light import SceneLight, environment_openness, random_turn
 from beam_warp.kernels.render.surface_lighting import lit_irradiance, lit_radiance, unshadowed_irradiance, unturned
 
 wp.set_module_options({"enable_backward": False})

@@ -8,6 +8,7 @@ regions it is E(n) times ambient occlusion.
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.luminance import luminance
 from beam_warp.kernels.common.sampling import hash_word, unit_float
 from beam_warp.kernels.light.latlong import latlong_bilinear
 from beam_warp.kernels.light.lights import Lights
@@ -76,11 +77,6 @@ def environment_openness(regions: RegionShadows, point: wp.vec3, normal: wp.vec3
         if total[c] > 0.0:
             openness[c] = wp.min(seen[c] / total[c], 1.0)
     return openness
-
-
-@wp.func
-def luminance(rgb: wp.vec3) -> float:
-    return 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
 
 
 @wp.func

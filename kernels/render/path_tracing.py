@@ -11,6 +11,7 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launcher
+from beam_warp.kernels.common.luminance import LUMINANCE
 from beam_warp.kernels.common.pixel_sampling import PIXEL_CHUNK, PixelRays, pixel_direction, sample_pair
 from beam_warp.kernels.common.sampling import hash_combine, stream_of, tangent_frame
 from beam_warp.kernels.light.latlong import latlong_nearest
@@ -40,8 +41,6 @@ FIRST_PAIRS = wp.constant(2)
 
 VERTEX_PAIRS = wp.constant(3)
 """Pairs at a vertex besides one for each light: environment, BSDF direction, choice of lobe."""
-
-LUMINANCE = wp.constant(wp.vec3(0.2126, 0.7152, 0.0722))
 
 
 @wp.struct

@@ -16,6 +16,7 @@ from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.surface import MeshSurface
+from beam_warp.kernels.raster.depth_normals import LEAST_DEPTH
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
 from beam_warp.kernels.raster.project import RasterView
 
@@ -27,8 +28,6 @@ from the receiver itself, and little of the light arrives."""
 
 EDGE_ON = wp.constant(20.0)
 """Tangent, 87 degrees, from which on no shadow is received; it fades in between: terminators are lit, not dirty."""
-
-LEAST_DEPTH = wp.constant(1.0e-6)
 
 CURVATURE_TEXELS = wp.constant(0.5)
 """What a surface rises over its tangent plane within a texel, in texels."""

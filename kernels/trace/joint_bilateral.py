@@ -8,6 +8,7 @@ value is off, which are filtered along (Schied et al. 2017). Pixels that show no
 import warp as wp
 
 from beam_warp.kernels.common.launching import launcher
+from beam_warp.kernels.common.luminance import luminance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,11 +44,6 @@ class Guides:
     focal: wp.vec2
     center: wp.vec2
     world_to_camera: wp.mat33
-
-
-@wp.func
-def luminance(value: wp.vec3) -> float:
-    return 0.2126 * value[0] + 0.7152 * value[1] + 0.0722 * value[2]
 
 
 @wp.func

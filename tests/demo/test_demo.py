@@ -17,7 +17,7 @@ from beam_warp.demo.from_images import PANEL_HEIGHT, FromImages, FromImagesOptio
 from beam_warp.demo.job import DemoOptions, run_demo
 from beam_warp.demo.lights import demo_environments
 from beam_warp.errors import OutputError
-from beam_warp.jobs.progress import no_progress
+from beam_warp.jobs.listeners import no_progress
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.light.regions import LUMINANCE, EnvironmentRegions
+from beam_warp.image.color import LUMINANCE
+from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.world.environment import EnvironmentMap
 
 

@@ -9,11 +9,10 @@ from support.raster_clouds import cloud as make_cloud
 from support.shapes import aligned
 
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
-from beam_warp.raster.channels import MATERIAL_CHANNELS
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
 
 WEIGHT_ROUNDING = 1e-5
 """A pixel coordinate below 64 is rounded by up to 4e-6 twice (centre, offset), and a response changes by at most

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.drawing.flags import LightFlags, Render
-from beam_warp.cli.drawing.views import DEFAULT_FOV, still_camera
+from beam_warp.cli.drawing.views import still_camera
 from beam_warp.errors import InvalidOptionError
-from beam_warp.stage.camera_paths import CameraPath, FixedCamera, OrbitPath, read_camera_path
+from beam_warp.stage.camera_paths import DEFAULT_FOV, CameraPath, FixedCamera, OrbitPath, read_camera_path
 from beam_warp.stage.environments import StageEnvironment
 from beam_warp.stage.frame_times import SECONDS_RANGE, SPEED_RANGE
 from beam_warp.stage.meshes import Ground

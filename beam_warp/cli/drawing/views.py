@@ -13,15 +13,13 @@ from beam_warp.checks import require_count
 from beam_warp.cli.drawing.flags import StillCameraFlags
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.store import make_folders
+from beam_warp.stage.camera_paths import DEFAULT_FOV
 from beam_warp.world.camera import MAX_SIDE, Camera
 from beam_warp.world.framing import bulk_of
 from beam_warp.world.gaussians import GaussianCloud
 
 DEFAULT_SIDE = 1024
 """Width and height where none is given [pixel]."""
-
-DEFAULT_FOV = 35.0
-"""Vertical field of view where none is given [degree]."""
 
 FRAMING_FRAMES = 3
 """A camera that frames a moving subject looks at this many of its frames: first, last and between."""

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from beam_warp.checks import require_array, require_count, require_finite, require_number
 from beam_warp.errors import InvalidArrayError
+from beam_warp.world.framing import require_points
 
 REACH = 1.5
 """Length l of the weights exp(-d^2 / l^2), in joint spacings: on an evenly covered surface the eighth neighbour of a
@@ -174,19 +175,6 @@ def group_by(
     ordered = items[np.argsort(chosen, kind="stable")]
     starts = np.concatenate([[0], np.cumsum(np.bincount(chosen, minlength=group_count))])
     return ordered.astype(np.int32), starts.astype(np.int32)
-
-
-def require_points(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return at least one finite point as ``(N, 3)`` float64.
-
-    Raises:
-        InvalidArrayError: The shape is another, there is none, or one is not finite.
-    """
-    points = require_array(name, value, (None, 3), np.float64)
-    if not len(points):
-        raise InvalidArrayError(f"{name} must hold at least one point, got none. Pass some.")
-    require_finite(name, points)
-    return points
 
 
 def _spacing(squared: NDArray[np.float64]) -> float:

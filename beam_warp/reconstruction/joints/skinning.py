@@ -30,9 +30,9 @@ from beam_warp.reconstruction.joints.graph import (
     joint_spacing,
     nearest_joints,
     proximity_weights,
-    require_points,
 )
 from beam_warp.reconstruction.joints.rigidity import joint_poses
+from beam_warp.world.framing import require_points
 
 BLENDS = ("linear", "dual")
 """Ways to blend the motions of several joints: of the points that they move, or of dual quaternions."""
