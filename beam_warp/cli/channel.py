@@ -13,11 +13,11 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_choice, require_count
-from beam_warp.cli.console import print_json, print_notes, progress
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, asset_in, notes_of
 from beam_warp.cli.drawing.checks import kind_of, require_capture_folder, require_one_camera, require_place
 from beam_warp.cli.drawing.flags import StillCameraFlags
 from beam_warp.cli.drawing.views import PlannedView, capture_views, still_camera
-from beam_warp.cli.flags import Device, Json, Quiet, ReadingFlags, asset_in, notes_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.files import write_exr, write_png

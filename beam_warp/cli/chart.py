@@ -13,9 +13,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number, require_package
-from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.flags import Device, Json, Quiet, SourceAxes, make_folder
-from beam_warp.cli.pages import SECOND_PAGE
+from beam_warp.cli.common.console import print_json, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, SourceAxes, make_folder
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.study.page import write_page

@@ -13,9 +13,9 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.cli.console import print_json, print_notes, progress, run_command
-from beam_warp.cli.flags import Json, Quiet, notes_of
-from beam_warp.cli.pages import parse
+from beam_warp.cli.common.console import print_json, print_notes, progress, run_command
+from beam_warp.cli.common.flags import Json, Quiet, notes_of
+from beam_warp.cli.common.pages import parse
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud

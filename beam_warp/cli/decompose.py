@@ -11,9 +11,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, Json, Quiet, Seed
-from beam_warp.cli.pages import SECOND_PAGE
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.environment import EnvironmentMap
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.common.console import print_json, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 
 ROWS = {
     "ambient_occlusion": "ambient occlusion",

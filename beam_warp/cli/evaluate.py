@@ -11,8 +11,8 @@ from tyro.conf import Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in, notes_of, raster_options
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in, notes_of, raster_options
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.asset import Evaluation

@@ -13,8 +13,8 @@ from beam_warp.capture.inspect import MAX_IMAGES, inspect_capture
 from beam_warp.capture.page import write_page
 from beam_warp.capture.picture import headline, verdict, write_picture
 from beam_warp.checks import require_package
-from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.flags import make_folder
+from beam_warp.cli.common.console import print_json, progress
+from beam_warp.cli.common.flags import make_folder
 
 
 @dataclass(frozen=True)

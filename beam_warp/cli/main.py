@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from beam_warp._version import __version__
-from beam_warp.cli.console import run_command
-from beam_warp.cli.pages import parse
+from beam_warp.cli.common.console import run_command
+from beam_warp.cli.common.pages import parse
 from beam_warp.errors import InvalidOptionError
 
 _HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.

@@ -15,8 +15,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
-from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, Json, Quiet, ReadingFlags, notes_of
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, notes_of
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.files import replacing, write_png

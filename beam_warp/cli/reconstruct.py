@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
-from beam_warp.cli.console import print_json, print_notes, progress
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import raster_options, stated
 from beam_warp.cli.drawing.checks import require_consistent
 from beam_warp.cli.drawing.flags import Render
 from beam_warp.cli.drawing.stage import staged
 from beam_warp.cli.drawing.views import capture_views, image_size
-from beam_warp.cli.flags import raster_options, stated
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
 from beam_warp.render.options import LAYERS, DeferredOptions

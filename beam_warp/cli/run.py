@@ -12,10 +12,10 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
-from beam_warp.cli.console import print_json, print_notes, progress
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
-from beam_warp.cli.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
-from beam_warp.cli.pages import SECOND_PAGE
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.jobs.listeners import NotedProgress

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from beam_warp.cli.console import print_json, progress
-from beam_warp.cli.flags import Device, Json, Quiet
+from beam_warp.cli.common.console import print_json, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet
 from beam_warp.errors import OutputError
 from beam_warp.jobs.listeners import NotedProgress
 

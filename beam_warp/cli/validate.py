@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from beam_warp._version import __version__
-from beam_warp.cli.console import print_json, run_command
+from beam_warp.cli.common.console import print_json, run_command
 
 _EPILOG = """\
 exit code: 0 valid (warnings allowed), 1 a rule of severity error is broken, 2 the file cannot be read

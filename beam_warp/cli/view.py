@@ -14,8 +14,8 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.checks import require_count, require_number
-from beam_warp.cli.console import print_json, print_notes, progress
-from beam_warp.cli.flags import Device, Quiet, ReadingFlags, asset_in, notes_of
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Quiet, ReadingFlags, asset_in, notes_of
 from beam_warp.demo.lights import stage, studio, sunset
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap

@@ -5,7 +5,7 @@ import io
 import pytest
 import warp as wp
 
-from beam_warp.cli.console import COMPILING, progress, rate_in_words
+from beam_warp.cli.common.console import COMPILING, progress, rate_in_words
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.compilation import compilation_heard
 

@@ -9,9 +9,9 @@ from typing import Annotated
 import pytest
 from tyro.conf import OmitArgPrefixes, arg
 
+from beam_warp.cli.common.pages import MORE, SECOND_PAGE, parse
 from beam_warp.cli.convert import main as convert
 from beam_warp.cli.main import COMMANDS, main
-from beam_warp.cli.pages import MORE, SECOND_PAGE, parse
 
 MOST = 20
 """Options on a first page, that for help among them."""

@@ -10,10 +10,10 @@ from support.drawn_ball import relightable
 
 from beam_warp import converters
 from beam_warp.cli.channel import DrawChannel
+from beam_warp.cli.common.pages import parse
 from beam_warp.cli.drawing.checks import require_consistent
 from beam_warp.cli.drawing.flags import Render
 from beam_warp.cli.main import main
-from beam_warp.cli.pages import parse
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.video import find_ffmpeg
 from beam_warp.world.gaussians import GaussianSequence

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp.cli.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes
-from beam_warp.cli.pages import SECOND_PAGE
+from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes
+from beam_warp.cli.common.pages import SECOND_PAGE
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""What all commands share: options, pages of help, progress, and errors in one line."""
