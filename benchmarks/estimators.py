@@ -13,16 +13,14 @@ brackets: what another program measured before, with triangles, on another figur
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import warp as wp
+import record
 from numpy.typing import NDArray
 
 from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
@@ -92,17 +90,6 @@ CURVES = (
     ("product", False, "owen"),
     ("product", True, "owen"),
 )
-
-
-def commit() -> str:
-    """The checkout's commit, or 'unknown' outside one."""
-    try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
-        )
-    except OSError:
-        return "unknown"
-    return found.stdout.strip() or "unknown"
 
 
 def discs(points: NDArray, normals: NDArray, spacing: float) -> dict[str, NDArray]:
@@ -346,20 +333,15 @@ def main() -> int:
     parser.add_argument("--points", type=int, default=256)
     parser.add_argument("--skies", nargs="*", choices=list(PEAKS), default=list(PEAKS))
     parser.add_argument("--environment", type=Path, nargs="*", default=[], help="lat-long maps, reduced to 128 rows")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path)
+    record.add_arguments(parser)
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
     started = time.perf_counter()
     make = make_ball if arguments.scene == "ball" else make_figure
     scene, points, normals = make(arguments.device, arguments.points)
     result = {
-        "benchmark": "estimators",
         "scene": arguments.scene,
         "gaussians": scene.report.traced,
-        "commit": arguments.commit,
-        "device": scene.device.name,
-        "warp": wp.__version__,
         "points": len(points),
         "seeds": len(SEEDS),
         "reference_rays": REFERENCE_RAYS,
@@ -374,14 +356,9 @@ def main() -> int:
         sky = EnvironmentMap.read(path).resized(SKY_HEIGHT, 2 * SKY_HEIGHT)
         result["skies"][path.name] = measure_sky(scene, points, normals, sky, None, False)
     result["seconds"] = round(time.perf_counter() - started, 1)
-    text = json.dumps(result, indent=2) + "\n"
-    if arguments.out:
-        partial = arguments.out.with_suffix(".partial")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(arguments.out)
+    record.write_result(arguments, scene.device, result)
     if arguments.plot:
         plot(result, arguments.plot)
-    sys.stdout.write(text)
     sys.stdout.write(markdown(result))
     return 0
 

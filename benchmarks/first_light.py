@@ -10,7 +10,6 @@ its content.
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import sys
 import tempfile
@@ -19,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import record
 import warp as wp
-from timing import commit
 
 from beam_warp import Scene, ambient_occlusion, converters, visibility
 from beam_warp.decomposition.job import RunOptions, run
@@ -121,22 +120,16 @@ def main() -> int:
     parser.add_argument("--device", default=None)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--points", type=int, default=20_000, help="points for the ray rate")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path)
+    record.add_arguments(parser)
     arguments = parser.parse_args()
     result = {
-        "benchmark": "first_light",
-        "commit": arguments.commit,
         "input": arguments.input.name,
         "environment": arguments.environment.name,
         "samples": arguments.samples,
         "run": measure_run(arguments.input, arguments.environment, arguments.samples, arguments.device),
         "rays": measure_rays(arguments.input, arguments.samples, arguments.device, arguments.points),
     }
-    text = json.dumps(result, indent=2) + "\n"
-    if arguments.out:
-        arguments.out.write_text(text, encoding="utf-8")
-    print(text, end="")
+    record.write_result(arguments, resolve_device(arguments.device), result)
     return 0
 
 

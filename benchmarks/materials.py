@@ -16,7 +16,6 @@ test view; ``materials_plot.py`` draws all of it. A part that fails says so in i
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -24,10 +23,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import record
 from device_memory import peak_memory
 from materials_bench import FULL, TARGETS, Bench, quick_bench, read_lights
 from materials_contenders import AblationRow, Subject, SubjectFrame, Unavailable, ablation_rows, seen_normals
@@ -35,13 +36,12 @@ from materials_cost import PAPER, Scale, measure_cost
 from materials_perfect import measure_perfect
 from materials_truth import Row, TruthViews, row_of
 from reconstruction_contenders import follow, ours
-from timing import commit, machine
+from timing import machine
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.relighters import RELIGHTERS
-from beam_warp.jobs.report import versions
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.axes import change_axes
 
@@ -168,7 +168,6 @@ def measure(bench: Bench, *, only: Sequence[str] = (), keep: Callable[[Row], Non
         keep: Told everything so far, whenever there is more.
     """
     result: Row = {
-        "versions": versions(),
         "machine": machine(bench.device),
         "gaussians": {"perfect": bench.effort.perfect_gaussians, "cost": bench.effort.scale.gaussians},
         "failed": [],
@@ -253,8 +252,7 @@ def main() -> int:
     parser.add_argument("--gaussians", type=int, default=140_000, help="of reconstructions that are made here")
     parser.add_argument("--perfect-gaussians", type=int, help="other than by default")
     parser.add_argument("--scale", type=float, default=1.0, help="of the cost's images and views, to try it")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, help="JSON to write")
+    record.add_arguments(parser)
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="pictures of every row")
     parser.add_argument("--parts", nargs="+", default=(), choices=PARTS, metavar="PART", help="these parts only")
     parser.add_argument("--quick", action="store_true", help="the demo's capture, small: does all of it run?")
@@ -266,14 +264,7 @@ def main() -> int:
     def say(text: str) -> None:
         print(f"{time.perf_counter() - started:7.1f} s  {text}", file=sys.stderr, flush=True)
 
-    head = {"benchmark": "materials", "commit": arguments.commit, "quick": arguments.quick}
-
-    def keep(result: Row) -> None:
-        if arguments.out is not None:
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            partial = arguments.out.with_suffix(".partial")
-            partial.write_text(json.dumps({**head, **result}, indent=1) + "\n", encoding="utf-8")
-            partial.replace(arguments.out)
+    keep = partial(record.write_result, arguments, device)
 
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
@@ -299,7 +290,7 @@ def main() -> int:
                 arguments.pictures,
                 say,
             )
-        result = {**head, **measure(bench, only=arguments.parts, keep=keep)}
+        result = measure(bench, only=arguments.parts, keep=keep)
     print(markdown(result), end="")
     if arguments.plot is not None:
         from materials_plot import draw_all

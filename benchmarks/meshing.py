@@ -11,18 +11,17 @@ equal weights, unseen voxels in front of everything, marching cubes over the who
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import record
 import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
-from timing import Task, commit, machine, take_turns
+from timing import Task, take_turns
 from warp.geometry import IsoSurfaceMarchingCubes
 
 from beam_warp.demo.figure import build_figure
@@ -186,11 +185,11 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="small images and one repeat")
     parser.add_argument("--side", type=int, default=384, metavar="PX", help="of the depth images")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path)
+    record.add_arguments(parser)
     args = parser.parse_args()
     device = resolve_device(args.device)
     side, repeats, count = (96, 1, 8_000) if args.quick else (args.side, args.repeats, 45_000)
-    result: dict[str, Any] = {"commit": commit(), "machine": machine(device), "image_side": side}
+    result: dict[str, Any] = {"image_side": side}
 
     images = sphere_images(side, device)
     reach = np.full(3, RADIUS + 0.05)
@@ -223,10 +222,7 @@ def main() -> int:
     flat = unwrapped(surface)
     seconds = time.perf_counter() - started
     result["unwrap"] = {"faces": len(flat.faces), "vertices": len(flat.vertices), "seconds": seconds}
-    text = json.dumps(result, indent=2, default=float) + "\n"
-    if args.out is not None:
-        args.out.write_text(text, encoding="utf-8")
-    sys.stdout.write(text)
+    record.write_result(args, device, result)
     return 0
 
 

@@ -6,11 +6,12 @@ python benchmarks/parity.py demo/asset.usda --environment demo/lights/sunset.exr
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
+import record
+import warp as wp
 
 from beam_warp import Camera, EnvironmentMap, Scene, ambient_occlusion, rasterize, read, visibility
 from beam_warp.render.deferred import DeferredRenderer
@@ -25,8 +26,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("asset", type=Path)
     parser.add_argument("--environment", type=Path, required=True)
-    parser.add_argument("--commit", default="unknown")
-    parser.add_argument("--out", type=Path)
+    record.add_arguments(parser)
     arguments = parser.parse_args()
     cloud = change_axes(read(arguments.asset)[0], "rfu")
     environment = EnvironmentMap.read(arguments.environment)
@@ -50,14 +50,11 @@ def main() -> int:
             "base_color": buffer.channels["base_color"],
             "relit": DeferredRenderer(UNSHADOWED, device=device).draw(shot).rgb,
         }
-    result = {"benchmark": "parity", "commit": arguments.commit, "gaussians": len(cloud)}
+    result = {"gaussians": len(cloud)}
     for name, values in found[DEVICES[0]].items():
         gap = np.abs(values - found[DEVICES[1]][name])
         result[name] = {"largest": float(gap.max()), "p99.9": float(np.quantile(gap, 0.999))}
-    text = json.dumps(result, indent=2) + "\n"
-    if arguments.out:
-        arguments.out.write_text(text, encoding="utf-8")
-    print(text, end="")
+    record.write_result(arguments, wp.get_device(DEVICES[1]), result)
     return 0
 
 

@@ -8,13 +8,13 @@ from those arrays and end with a closed file. Times are the least of the repeats
 """
 
 import argparse
-import json
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+import record
+import warp as wp
 from plyfile import PlyData, PlyElement
 
 from beam_warp import converters
@@ -92,7 +92,7 @@ def main():
     parser.add_argument("--count", type=int, default=150_000)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--file", type=Path, help="also time the reading of this file")
-    parser.add_argument("--out", type=Path, help="write the JSON here instead of printing it")
+    record.add_arguments(parser)
     arguments = parser.parse_args()
 
     cloud = random_cloud(arguments.count)
@@ -123,11 +123,7 @@ def main():
         result["file_read_seconds"] = fastest({"beam": lambda: converters.read(arguments.file)}, arguments.repeats)[
             "beam"
         ]
-    text = json.dumps(result, indent=2)
-    if arguments.out:
-        arguments.out.write_text(text + "\n")
-    else:
-        sys.stdout.write(text + "\n")
+    record.write_result(arguments, wp.get_device("cpu"), result)
 
 
 if __name__ == "__main__":

@@ -21,10 +21,11 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
+import record
 from gsplat_peer import VERSION as GSPLAT_VERSION
 from gsplat_peer import GsplatPeer, GsplatUnavailableError
 from gsplat_peer import Images as PeerImages
@@ -33,10 +34,9 @@ from raster_contenders import Clocked, Drawing, Measured, Seen, captured, digits
 from raster_scenes import RasterScene, cube, figure, growth
 from raster_stages import measure_stages
 from raster_truth import Truth, brute_force
-from timing import commit, launch_threads, machine
+from timing import launch_threads, machine
 
 from beam_warp.device.arrays import resolve_device
-from beam_warp.jobs.report import versions
 from beam_warp.raster.records import RasterOptions
 
 Row = dict[str, Any]
@@ -503,7 +503,7 @@ def measure(
     keep: Callable[[Row], None] = lambda result: None,
 ) -> Row:
     """Return everything that is measured, for JSON; ``say`` hears what is being done, ``keep`` gets each state."""
-    result: Row = {"machine": machine(device), "versions": versions(), "failed": []}
+    result: Row = {"machine": machine(device), "failed": []}
     for name, run in sections(effort, device, say).items():
         if only and name not in only:
             continue
@@ -585,8 +585,7 @@ def _time_table(title: str, rows: Mapping[str, Row]) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, help="JSON to write")
+    record.add_arguments(parser)
     parser.add_argument("--only", nargs="+", default=(), metavar="SECTION", help="measure these sections only")
     parser.add_argument("--quick", action="store_true", help="small scenes and few repeats: does all of it run?")
     arguments = parser.parse_args()
@@ -596,14 +595,8 @@ def main() -> int:
     unknown = set(arguments.only) - set(sections(effort, device, say))
     if unknown:
         parser.error(f"--only must name sections of {', '.join(sections(effort, device, say))}, got {unknown}")
-    head = {"benchmark": "raster", "commit": arguments.commit, "quick": arguments.quick}
-
-    def keep(result: Row) -> None:
-        if arguments.out is not None:
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps({**head, **result}, indent=1) + "\n", encoding="utf-8")
-
-    result = {**head, **measure(effort, device, say, only=arguments.only, keep=keep)}
+    keep = partial(record.write_result, arguments, device)
+    result = measure(effort, device, say, only=arguments.only, keep=keep)
     print(markdown(result), end="")
     return 1 if result["failed"] else 0
 

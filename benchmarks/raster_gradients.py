@@ -11,7 +11,6 @@ reads single precision can be better than. Prints Markdown and writes JSON.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import record
 import warp as wp
-from timing import commit, machine
 
 from beam_warp.device.arrays import resolve_device, upload
-from beam_warp.jobs.report import versions
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 
@@ -120,16 +118,12 @@ def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=None)
-    parser.add_argument("--out", type=Path, default=None)
-    parser.add_argument("--commit", default=None)
+    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     rows = report(device)
     print(markdown(rows))
-    if arguments.out is not None:
-        facts = {"benchmark": "raster gradients", "commit": arguments.commit or commit()}
-        facts |= {"machine": machine(device), "versions": versions(), "rows": rows}
-        arguments.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    record.write_result(arguments, device, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ place, and the program returns 1. Writes the JSON after each section, and tables
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import sys
@@ -23,18 +22,18 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import record
 from reconstruction_captures import write_large_capture
 from reconstruction_contenders import Contender, ModelledFrame, follow, ours, rade_gs_like, reconstruct_stressed
-from timing import commit, machine
+from timing import machine
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device
-from beam_warp.jobs.report import versions
 from beam_warp.mesh.distances import SAMPLE_COUNT
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, truth_frames
@@ -322,7 +321,7 @@ SECTIONS: dict[str, Callable[[Bench], Row]] = {
 
 def measure(bench: Bench, *, only: Sequence[str] = (), keep: Callable[[Row], None] = lambda result: None) -> Row:
     """Return everything that is measured, for JSON; ``keep`` gets each state."""
-    result: Row = {"machine": machine(bench.device), "versions": versions(), "failed": []}
+    result: Row = {"machine": machine(bench.device), "failed": []}
     for name, run in SECTIONS.items():
         if only and name not in only:
             continue
@@ -391,8 +390,7 @@ def main() -> int:
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
     parser.add_argument("--gaussians", type=int, help="other than by default")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, help="JSON to write")
+    record.add_arguments(parser)
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"
     )
@@ -402,12 +400,7 @@ def main() -> int:
     effort = QUICK if arguments.quick else FULL
     if arguments.gaussians:
         effort = replace(effort, gaussians=arguments.gaussians)
-    head = {"benchmark": "reconstruction", "commit": arguments.commit, "quick": arguments.quick}
-
-    def keep(result: Row) -> None:
-        if arguments.out is not None:
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps({**head, **result}, indent=1, default=_plain) + "\n", encoding="utf-8")
+    keep = partial(record.write_result, arguments, device)
 
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
@@ -418,16 +411,9 @@ def main() -> int:
             capture = Capture.read(arguments.data / "captures" / "walker")
         say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
         bench = Bench(capture, effort, maker(effort, arguments.device), device, say)
-        result = {**head, **measure(bench, only=arguments.only, keep=keep)}
+        result = measure(bench, only=arguments.only, keep=keep)
     print(markdown(result), end="")
     return 1 if result["failed"] else 0
-
-
-def _plain(value: Any) -> Any:
-    """Return a NumPy scalar or array as JSON has it."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} is not JSON-able")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ row. A part that fails says so in its place; the program returns 1 then.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -23,20 +22,21 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import record
 from relight_accuracy import measure_accuracy
 from relight_cost import measure_deferred, measure_moving, measure_path
 from relight_energy import measure_furnace, measure_unbiased
 from relight_scenes import FULL, ON_CPU, QUICK, Bench, Row
-from timing import commit, machine
+from timing import machine
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.demo.lights import sunset
 from beam_warp.device.arrays import resolve_device
-from beam_warp.jobs.report import versions
 from beam_warp.world.environment import EnvironmentMap
 
 SKY = "sunrise"
@@ -60,7 +60,7 @@ def measure(bench: Bench, *, only: Sequence[str] = (), keep: Callable[[Row], Non
         only: These parts only; all where empty.
         keep: Told everything so far, whenever there is more.
     """
-    result: Row = {"versions": versions(), "machine": machine(bench.device), "failed": []}
+    result: Row = {"machine": machine(bench.device), "failed": []}
     for name, part in PARTS.items():
         if only and name not in only:
             continue
@@ -323,8 +323,7 @@ def main() -> int:
     parser.add_argument("--captures", nargs="+", default=["walker", "runner"], help="names there, or folders")
     parser.add_argument("--assets", type=Path, metavar="DIR", help="decomposed reconstructions, NAME/asset.usda")
     parser.add_argument("--gaussians", type=int, help="other than by default, everywhere")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, help="JSON to write")
+    record.add_arguments(parser)
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="images of every subject, for relight_plot.py")
     parser.add_argument("--parts", nargs="+", default=(), choices=PARTS, metavar="PART", help="these parts only")
     parser.add_argument("--quick", action="store_true", help="the demo's capture, small: does all of it run?")
@@ -335,14 +334,7 @@ def main() -> int:
     def say(text: str) -> None:
         print(f"{time.perf_counter() - started:7.1f} s  {text}", file=sys.stderr, flush=True)
 
-    head = {"benchmark": "relight", "commit": arguments.commit, "quick": arguments.quick}
-
-    def keep(result: Row) -> None:
-        if arguments.out is not None:
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            partial = arguments.out.with_suffix(".partial")
-            partial.write_text(json.dumps({**head, **result}, indent=1) + "\n", encoding="utf-8")
-            partial.replace(arguments.out)
+    keep = partial(record.write_result, arguments, device)
 
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
@@ -358,7 +350,7 @@ def main() -> int:
             assets = find_assets(arguments.assets, list(captures))
             sky = read_sky(arguments.data)
             bench = Bench(captures, assets, sky, effort, device, arguments.pictures, say)
-        result = {**head, **measure(bench, only=arguments.parts, keep=keep)}
+        result = measure(bench, only=arguments.parts, keep=keep)
     print(markdown(result), end="")
     return 1 if result["failed"] else 0
 

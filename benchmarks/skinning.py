@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import record
 import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -144,14 +145,11 @@ def main() -> None:
     parser.add_argument("--capture", default="walker")
     parser.add_argument("--skins", type=int, default=40_000)
     parser.add_argument("--device", default=None)
-    parser.add_argument("--out", type=Path)
+    record.add_arguments(parser)
     options = parser.parse_args()
     folder = Path(os.environ.get("BEAM_DATA", "../shared/data")) / "captures" / options.capture
-    result = json.dumps(measure(folder, options.skins, resolve_device(options.device)), indent=1)
-    if options.out is None:
-        print(result)
-    else:
-        options.out.write_text(result + "\n", encoding="utf-8")
+    device = resolve_device(options.device)
+    record.write_result(options, device, measure(folder, options.skins, device))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -131,17 +130,6 @@ def _timed_on_cpu(task: Task, two_threads: bool) -> tuple[float, float, float]:
         task.run()
         both = time.perf_counter() - both
     return cpu, wall, both
-
-
-def commit() -> str:
-    """The checkout's commit, or 'unknown' outside one."""
-    try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
-        )
-    except OSError:
-        return "unknown"
-    return found.stdout.strip() or "unknown"
 
 
 def machine(device: Any) -> dict[str, Any]:

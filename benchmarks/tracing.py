@@ -12,19 +12,18 @@ report says so. Writes ``tracing_<device>.json`` and ``.png`` into DIR, and the 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import record
 import warp as wp
 from numpy.typing import NDArray
-from timing import Task, Times, commit, machine, rates, take_turns
+from timing import Task, Times, machine, rates, take_turns
 from tracing_baselines import (
     BUILD_QUALITIES,
     EmbreeScene,
@@ -33,12 +32,10 @@ from tracing_baselines import (
     PlainBvh,
     pack_gaussians,
 )
-from tracing_plot import draw_growth
 from tracing_scenes import Rays, brute_force_visibility, bumpy_torus, camera_rays, cosine_rays
 
 from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.device.arrays import resolve_device
-from beam_warp.jobs.report import versions
 from beam_warp.trace.first_surface import closest_surface
 from beam_warp.trace.transmittance import ACCEPTANCES, TraceOptions
 
@@ -546,7 +543,7 @@ def _cell(value: float | None, form: str, before: str = "") -> str:
 
 def measure(effort: Effort, device: Any, say: Callable[[str], None]) -> dict[str, Any]:
     """Return everything that is measured, ready for JSON; ``say`` hears what is being done."""
-    result: dict[str, Any] = {"machine": machine(device), "versions": versions()}
+    result: dict[str, Any] = {"machine": machine(device)}
     say("torus")
     result["torus"] = measure_torus(effort, device)
     say("builds")
@@ -564,22 +561,13 @@ def measure(effort: Effort, device: Any, say: Callable[[str], None]) -> dict[str
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the JSON and the plot")
+    record.add_arguments(parser)
     parser.add_argument("--quick", action="store_true", help="fewer rays and repeats: a minute on two cores")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
-    result = {
-        "benchmark": "tracing",
-        "commit": arguments.commit,
-        "quick": arguments.quick,
-        **measure(effort, device, lambda text: print(text, file=sys.stderr, flush=True)),
-    }
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    stem = f"tracing_{device.alias.replace(':', '')}{'_quick' if arguments.quick else ''}"
-    (arguments.out / f"{stem}.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    draw_growth(result, arguments.out / f"{stem}.png")
+    result = measure(effort, device, lambda text: print(text, file=sys.stderr, flush=True))
+    record.write_result(arguments, device, result)
     print(markdown(result), end="")
     return 0
 

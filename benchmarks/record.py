@@ -1,0 +1,142 @@
+"""What a result says of how it was made: program, options, commit, date, machine, and the code that it depends on.
+
+A result file holds this under ``measured``, beside what was found. The code is every module of the package and of the
+benchmarks that the program had loaded when it wrote, each with a digest; so whether a result is still that of the code
+can be told without the history (`changed_since`). Comments, docstrings and blank lines do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import functools
+import hashlib
+import io
+import json
+import subprocess
+import sys
+import tokenize
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from timing import machine
+
+from beam_warp.jobs.report import versions
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+
+MAPPED = ("kernels", "schema", "converters")
+"""Packages that lie beside ``beam_warp`` in a checkout, and inside it where it is installed."""
+
+CANNOT_CHANGE_A_NUMBER = (
+    "beam_warp/__init__.py",
+    "beam_warp/_version.py",
+    "beam_warp/checks.py",
+    "beam_warp/errors.py",
+    "beam_warp/jobs/",
+    "beam_warp/cli/",
+    "benchmarks/record.py",
+)
+"""Code that is loaded by everything and computes nothing: messages, progress, options."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every benchmark takes: where the result goes, and of which commit it is."""
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print"
+    )
+    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+
+
+def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str, Any]) -> None:
+    """Write a result with what it says of itself; as often as there is more.
+
+    Args:
+        arguments: The program's; paths among its options are recorded by their last part.
+        device: Warp device that was measured.
+        result: What was found: JSON-able.
+    """
+    head = {
+        "program": f"benchmarks/{Path(sys.argv[0]).name}",
+        "options": {k: v for k, v in sorted(vars(arguments).items()) if k not in ("out", "commit", "device") and v},
+        "commit": arguments.commit,
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": machine(device),
+        "versions": versions(),
+        "code": loaded_code(),
+    }
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    partial = arguments.out.with_suffix(".partial")
+    partial.write_text(json.dumps({"measured": head, **result}, indent=1, default=_plain) + "\n", encoding="utf-8")
+    partial.replace(arguments.out)
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON does not know as it has it: NumPy's numbers and arrays, paths by their last part."""
+    if isinstance(value, Path):
+        return value.name
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def commit() -> str:
+    """Return the checkout's commit, or 'unknown' outside one."""
+    try:
+        found = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=ROOT)
+    except OSError:
+        return "unknown"
+    return found.stdout.strip() or "unknown"
+
+
+def loaded_code() -> dict[str, str]:
+    """Return the digest of every loaded module of the package and of the benchmarks, by its path in the repository."""
+    found = {}
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is None or not file.endswith(".py"):
+            continue
+        path = Path(file).resolve()
+        if name.partition(".")[0] == "beam_warp":
+            place = name.replace(".", "/") + ("/__init__.py" if path.name == "__init__.py" else ".py")
+            for mapped in MAPPED:
+                place = place.replace(f"beam_warp/{mapped}/", f"{mapped}/", 1)
+        elif path.parent == ROOT / "benchmarks":
+            place = f"benchmarks/{path.name}"
+        else:
+            continue
+        if not place.startswith(CANNOT_CHANGE_A_NUMBER):
+            found[place] = code_digest(path.read_text(encoding="utf-8"))
+    return dict(sorted(found.items()))
+
+
+def changed_since(measured: Mapping[str, Any]) -> list[str]:
+    """Return the files whose code is no longer what was measured; files that are gone are among them."""
+    return [place for place, digest in measured["code"].items() if _digest_now(place) != digest]
+
+
+@functools.cache
+def _digest_now(place: str) -> str | None:
+    path = ROOT / place
+    return code_digest(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def code_digest(source: str) -> str:
+    """Return a digest of Python source without its comments, docstrings and blank lines, 12 hexadecimal digits."""
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            last = node.end_lineno or node.lineno
+            lines[node.lineno - 1 : last] = [""] * (last - node.lineno + 1)
+    code = "\n".join(line.rstrip() for line in lines if line.strip())
+    return hashlib.sha256(code.encode()).hexdigest()[:12]
+
+
+def content_digest(path: Path) -> str:
+    """Return a digest of a file's bytes, 12 hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
