@@ -1,9 +1,8 @@
-"""The same splats drawn by gsplat 1.5.3, forwards and backwards: images to compare with, and seconds.
+"""The same splats drawn by gsplat, forwards and backwards: images to compare with, and seconds.
 
-    python benchmarks/gsplat_peer.py [--scene figure] [--count 140000] [--size 1920 1080] [--images images.npz]
-
-Needs torch for CUDA, ``pip install gsplat==1.5.3``, and nvcc: gsplat compiles its kernels when they are first used. It
-is run on 11 channels and depth (``RGB+ED``), which it pads to 16, with our low-pass and near plane. What differs:
+Needs torch for CUDA, gsplat 1.5.3 (``pip install gsplat==1.5.3``) or 1.6.0 (its sources on the path), and nvcc: gsplat
+compiles its kernels when they are first used. ``BUILD_3DGS=1 NUM_CHANNELS=4,12`` leaves out what 1.6.0 is not asked for
+here. It is run on 3 and 11 channels and depth (``RGB+ED``), with our low-pass and near plane. What differs:
 
 - It leaves out the splat that would bring the transmittance to 1e-4 or below, and stops; we draw that one, and stop
   after it. A splat of alpha 0.98 is left out at a transmittance of up to 1e-4 / 0.02: so values differ by up to 0.005
@@ -12,30 +11,26 @@ is run on 11 channels and depth (``RGB+ED``), which it pads to 16, with our low-
 - Its depth is that of splats' centres, ours that of their tangent planes: thin surfaces differ, by splats' sizes.
 - Tiles are 16 pixels wide, filled by boxes; exp is CUDA's fast one; backward adds floats in any order.
 - It draws neither median depth nor the identity of what is seen; ours include them.
+- The renderer for inference of 1.6.0 draws RGB alone, from half-precision arrays that it packed before.
 
-It cannot run as a CUDA graph: its forward reads the number of (tile, splat) pairs back, to size what follows
-(``item()`` in ``Intersect.cpp``), which waits for the device and which stream capture refuses. Its seconds here are
-therefore what a training loop pays, with launches and that wait, whether the host's clock or events take them.
+It cannot run as a CUDA graph: its forward reads the number of (tile, splat) pairs back, to size what follows, which
+waits for the device and which stream capture refuses. Its seconds by the host's clock or by events are therefore what a
+training loop pays, with launches and that wait. `kernel_seconds` is what its kernels alone take.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import json
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import raster_scenes
 from numpy.typing import NDArray
 
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
-VERSION = "1.5.3"
+VERSIONS = ("1.5.3", "1.6.0")
 LOW_PASS = 0.3
 NEAR = 0.01
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
@@ -54,22 +49,6 @@ class Images(NamedTuple):
     alpha: NDArray[np.float32]
 
 
-class Seconds(NamedTuple):
-    """Seconds of each repeat, by the host's clock from idle to idle, and between events on the device."""
-
-    wall: NDArray[np.float64]
-    device: NDArray[np.float64]
-
-    def summary(self) -> dict[str, float]:
-        """Return medians and the fastest repeat."""
-        return {
-            "wall_median": float(np.median(self.wall)),
-            "wall_fastest": float(self.wall.min()),
-            "device_median": float(np.median(self.device)),
-            "device_fastest": float(self.device.min()),
-        }
-
-
 def arguments(cloud: GaussianCloud, camera: Camera, values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
     """Return gsplat's arrays by its names: quaternions wxyz, world to camera and K with OpenCV's axes, as ours are."""
     intrinsics = [[camera.focal_x, 0.0, camera.center_x], [0.0, camera.focal_y, camera.center_y], [0.0, 0.0, 1.0]]
@@ -83,6 +62,21 @@ def arguments(cloud: GaussianCloud, camera: Camera, values: NDArray[np.float32])
         "Ks": np.array([intrinsics]),
     }
     return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+
+
+def kernel_seconds(work: Callable[[], Any], device: str, repeats: int = 20) -> float:
+    """Return the seconds that the kernels and copies of some work take on the device, whoever launches them.
+
+    The gaps between them, in which the device waits for the host, are left out (CUPTI, through torch's profiler).
+    """
+    torch: Any = importlib.import_module("torch")
+    work()
+    torch.cuda.synchronize(device)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(repeats):
+            work()
+        torch.cuda.synchronize(device)
+    return 1e-6 * sum(row.self_device_time_total for row in profile.key_averages()) / repeats
 
 
 class GsplatPeer:
@@ -113,8 +107,9 @@ class GsplatPeer:
             gsplat: Any = importlib.import_module("gsplat")
         except ImportError as error:
             raise GsplatUnavailableError(f"torch and gsplat must be importable, got {error}.") from error
-        if gsplat.__version__ != VERSION:
-            raise GsplatUnavailableError(f"gsplat must be {VERSION}, got {gsplat.__version__}.")
+        self.version: str = gsplat.__version__
+        if self.version not in VERSIONS:
+            raise GsplatUnavailableError(f"gsplat must be one of {', '.join(VERSIONS)}, got {self.version}.")
         if not self.torch.cuda.is_available():
             raise GsplatUnavailableError("torch must see a CUDA device, got none.")
         self.device = self.torch.device(device)
@@ -186,21 +181,25 @@ class GsplatPeer:
         """Return the seconds from one event to another, which the device has passed."""
         return 1e-3 * begin.elapsed_time(end)
 
-    def timed(self, work: Callable[[], None], repeats: int = 50, warm_up: int = 10) -> Seconds:
-        """Time work, after as much of it that kernels are compiled and memory is reserved."""
-        for _ in range(warm_up):
-            work()
-        wall, device = [], []
-        for _ in range(repeats):
-            self.torch.cuda.synchronize(self.device)
-            started = time.perf_counter()
-            begin = self.event()
-            work()
-            end = self.event()
-            self.torch.cuda.synchronize(self.device)
-            wall.append(time.perf_counter() - started)
-            device.append(self.seconds_between(begin, end))
-        return Seconds(np.array(wall), np.array(device))
+    def inference(self) -> Callable[[], Any] | None:
+        """Return what draws RGB by the renderer for inference, from arrays packed here; None before 1.6.0."""
+        if self.version == "1.5.3":
+            return None
+        scene: Any = importlib.import_module("gsplat.scene")
+        render: Any = importlib.import_module("gsplat.experimental.render.functional")
+        arrays = self.tensors
+        quaternions = self.torch.nn.functional.normalize(arrays["quats"], dim=-1)
+        colors = arrays["colors"][:, :3].contiguous()
+        shape = (arrays["means"], quaternions, arrays["scales"], arrays["opacities"], colors)
+        packed = scene.GaussianInferenceScene.from_gaussian_tensors(*shape, None, "none", id="scene")
+        request = {"viewmats": arrays["viewmats"], "Ks": arrays["Ks"], "near_plane": NEAR, "eps2d": LOW_PASS}
+        request |= {name: self._options[name] for name in ("width", "height")}
+
+        def draw() -> Any:
+            with self.torch.no_grad():
+                return render.rasterize_gaussian_inference_scene(packed, **request).frame
+
+        return draw
 
     def _training(self, upstream: Images) -> tuple[dict[str, Any], Callable[[], None]]:
         """Return tensors that ask for gradients, and what draws and adds to them."""
@@ -219,39 +218,3 @@ class GsplatPeer:
         """Return channels and depth ``(1, H, W, K + 1)``, alpha ``(1, H, W, 1)``, and what gsplat says of itself."""
         with self.torch.cuda.device(self.device):
             return self._rasterization(**tensors, **self._options)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", choices=("figure", "cube"), default="figure")
-    parser.add_argument("--count", type=int, default=140_000)
-    parser.add_argument("--size", type=int, nargs=2, default=(1920, 1080), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--repeats", type=int, default=50)
-    parser.add_argument("--packed", action="store_true")
-    parser.add_argument("--device", default="cuda:0")
-    parser.add_argument("--images", type=Path, help="Where to save what was drawn.")
-    args = parser.parse_args()
-    scene: raster_scenes.RasterScene = getattr(raster_scenes, args.scene)(args.count, *args.size)
-    peer = GsplatPeer(scene.cloud, scene.camera, scene.values(), device=args.device, packed=args.packed)
-    images = peer.draw()
-    if args.images is not None:
-        np.savez(args.images, **images._asdict())
-    found = {
-        "gsplat": VERSION,
-        "torch": peer.torch.__version__,
-        "device": peer.torch.cuda.get_device_name(peer.device),
-        "scene": scene.name,
-        "splats": len(scene.cloud),
-        "size": list(args.size),
-        "packed": args.packed,
-        "pairs": peer.pair_count(),
-        "coverage": float((images.alpha > 0.5).mean()),
-        "forward_seconds": peer.timed(peer.forward, args.repeats).summary(),
-        "training_seconds": peer.timed(peer.training(peer.random_upstream()), args.repeats).summary(),
-        "memory_mib": round(peer.torch.cuda.max_memory_allocated(peer.device) / 2**20),
-    }
-    print(json.dumps(found, indent=1))
-
-
-if __name__ == "__main__":
-    main()

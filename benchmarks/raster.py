@@ -1,6 +1,6 @@
 """The rasteriser's speed, and its error beside it: against gsplat, stage by stage, and how both grow.
 
-    python benchmarks/raster.py [--device cuda:0] [--out results.json] [--only peer stages] [--quick]
+    python benchmarks/raster.py [--device cuda:0] --out JSON [--only peer stages] [--quick]
 
 Scenes are those of ``raster_scenes.py``. On CUDA a frame is timed as `Rasterizer.redraw` launches it and as one CUDA
 graph, by the host's clock from idle to idle and between events on the device; events of what the host launches count
@@ -9,13 +9,12 @@ Contenders take turns, and ratios are medians of ratios within a turn, so that a
 Errors are against float64 brute force at some pixels, gsplat, the readable composite, and the other device.
 
 gsplat is drawn where it and torch for CUDA are importable; else the JSON says that it is absent. A section that fails
-says so in its place, and the program returns 1. Writes the JSON after each section, and tables to the terminal.
+says so in its place, and the program returns 1. Writes the JSON after each section.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 import traceback
@@ -26,8 +25,7 @@ from typing import Any
 
 import numpy as np
 import record
-from gsplat_peer import VERSION as GSPLAT_VERSION
-from gsplat_peer import GsplatPeer, GsplatUnavailableError
+from gsplat_peer import GsplatPeer, GsplatUnavailableError, kernel_seconds
 from gsplat_peer import Images as PeerImages
 from numpy.typing import NDArray
 from raster_contenders import Clocked, Drawing, Measured, Seen, captured, digits, measure_in_turn, random_adjoints
@@ -63,7 +61,7 @@ BEFORE_STOP = 0.999
 PEER_NOTES = (
     "gsplat's depth is that of splats' centres, ours that of their tangent planes: they differ by splats' sizes.",
     "gsplat draws neither median depth nor the last Gaussian; ours include both.",
-    "gsplat reads a count back, which waits for the device: it cannot be captured, and its times include the wait.",
+    "gsplat reads a count back, which waits for the device: it cannot be captured; its wall times include the wait.",
 )
 
 
@@ -163,9 +161,13 @@ def contenders_for(
     if peer is None:
         facts["gsplat"] = f"absent: {absent}"
         return found, facts
-    facts["gsplat"], facts["gsplat_pairs"] = GSPLAT_VERSION, peer.pair_count()
+    facts["gsplat"], facts["gsplat_pairs"] = peer.version, peer.pair_count()
     adjoints = random_adjoints(scene.camera.width * scene.camera.height, values.shape[1])
-    for name, work in (("forward", peer.forward), ("training", peer.training(peer_adjoints(scene, adjoints)))):
+    theirs = {"forward": peer.forward, "training": peer.training(peer_adjoints(scene, adjoints))}
+    inference = peer.inference() if values.shape[1] == 3 else None
+    if inference is not None:
+        theirs["inference, RGB alone"] = inference
+    for name, work in theirs.items():
         work()
         found[f"gsplat, {name}"] = Clocked(work, peer.event, peer.seconds_between)
     return found, facts
@@ -190,11 +192,11 @@ def measure_peer(effort: Effort, device: Any) -> Row:
     for case, count in CASES.items():
         contenders, facts = contenders_for(scene, np.ascontiguousarray(values[:, :count]), device)
         measured = measure_in_turn(contenders, effort.repeats, device)
-        found["cases"][case] = {
-            **facts,
-            "ms": {name: entry.summary() for name, entry in measured.items()},
-            "faster_than_gsplat": ratios_to_gsplat(measured),
-        }
+        rows = {name: entry.summary() for name, entry in measured.items()}
+        if not facts["gsplat"].startswith("absent"):
+            for name, entry in contenders.items():
+                rows[name]["kernel_ms"] = digits(1e3 * kernel_seconds(entry.work, device.alias))
+        found["cases"][case] = {**facts, "ms": rows, "faster_than_gsplat": ratios_to_gsplat(measured)}
     faint = replace(scene.cloud, opacities=0.1 * scene.cloud.opacities)
     found["agreement"] = compare_with_peer(scene, device)
     found["agreement_of_faint_splats"] = compare_with_peer(scene._replace(cloud=faint), device)
@@ -521,67 +523,6 @@ def measure(
     return result
 
 
-def markdown(result: Row) -> str:
-    """Return the tables that a person reads first."""
-    lines = [f"{result['machine']['device']} ({result['machine']['processor']}), commit {result['commit']}"]
-    for name in result["failed"]:
-        lines.append(f"\n{name} failed: {result[name]['failed']}")
-    measured = {name: part for name, part in result.items() if isinstance(part, dict) and "failed" not in part}
-    tables: dict[str, Row] = {}
-    for case, part in measured.get("peer", {}).get("cases", {}).items():
-        tables[f"{case} ({part['pairs']:,} pairs, gsplat {part['gsplat']})"] = {
-            name: {**row, "faster than gsplat": part["faster_than_gsplat"].get(name)}
-            for name, row in part["ms"].items()
-        }
-    if "frames" in measured:
-        tables[f"{measured['frames']['channels']} channels and depth"] = measured["frames"]["ms"]
-    for name in ("figure", "cube"):
-        if "variants" in measured:
-            tables[f"{name}, variants"] = measured["variants"][name]["variants"]
-    for title, rows in tables.items():
-        lines += ["", *_time_table(title, rows)]
-    for case, part in measured.get("stages", {}).items():
-        if isinstance(part, dict) and "forward" in part:
-            lines += ["", f"| {case}: stage | ms | share |", "|---|---|---|"]
-            for way in ("forward", "backward"):
-                lines += [
-                    f"| {stage} | {value:g} | {100 * part[way]['share'][stage]:.0f} % |"
-                    for stage, value in part[way]["ms"].items()
-                ]
-                graph = part[way].get("graph")
-                beside = "" if graph is None else f", {graph['device_ms']['median']:g} as a graph"
-                lines.append(f"| **{way}** | {part[way]['total_ms']:g}{beside} | |")
-    for series in ("gaussians", "pixels"):
-        rows = measured.get("growth", {}).get(series, [])
-        for row in rows:
-            label = f"{row['splats']:,} at {row['width']} x {row['height']}"
-            lines += ["", *_time_table(f"{label}, {row['pairs']:,} pairs", row["ms"])]
-    for name in ("peer", "accuracy"):
-        shown = {
-            key: part for key, part in measured.get(name, {}).items() if key.startswith(("agree", "figure", "cube"))
-        }
-        if shown:
-            lines += ["", f"{name}:", "", "```json", json.dumps(shown, indent=1), "```"]
-    return "\n".join(lines) + "\n"
-
-
-def _time_table(title: str, rows: Mapping[str, Row]) -> list[str]:
-    """Return one line a contender: medians and ranges of all clocks, and ratios."""
-    clocks = [key for key in next(iter(rows.values())) if key.endswith("_ms")]
-    extra = ("thread_gain", "faster than gsplat", "times_as_long_as_plane")
-    extra = [key for key in extra if any(row.get(key) is not None for row in rows.values())]
-    heads = [key.removesuffix("_ms").replace("_", " ") + " [ms]" for key in clocks] + extra
-    lines = [f"| {title} | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
-    for name, row in rows.items():
-        cells = []
-        for key in clocks:
-            value = row.get(key)
-            cells.append("" if value is None else f"{value['median']:g} ({value['lowest']:g}–{value['highest']:g})")
-        cells += ["" if row.get(key) is None else f"{row[key]:.3g}" for key in extra]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return lines
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
@@ -597,7 +538,6 @@ def main() -> int:
         parser.error(f"--only must name sections of {', '.join(sections(effort, device, say))}, got {unknown}")
     keep = partial(record.write_result, arguments, device)
     result = measure(effort, device, say, only=arguments.only, keep=keep)
-    print(markdown(result), end="")
     return 1 if result["failed"] else 0
 
 

@@ -1,11 +1,11 @@
 """The rasteriser's gradients against float64, entry by entry, with every decision held still.
 
-    python benchmarks/raster_gradients.py [--device cuda:0] [--out results.json]
+    python benchmarks/raster_gradients.py [--device cuda:0] --out JSON
 
 For random scenes and every hazard of ``tests/support/raster_hazards.py``: relative L2 errors of the gradients to each
 array, of a loss with random derivatives to every image, against complex steps of the float64 rasteriser of
 ``tests/reference``; beside them what one rounding of the inputs to single precision changes, which no program that
-reads single precision can be better than. Prints Markdown and writes JSON.
+reads single precision can be better than. Writes JSON.
 """
 
 from __future__ import annotations
@@ -34,8 +34,6 @@ from support.raster_hazards import HAZARDS, in_view, make
 
 ARRAYS = {"positions": wp.vec3, "orientations": wp.quat, "scales": wp.vec3, "opacities": float, "values": float}
 MODES = ("plane", "exact")
-UNSTABLE = 1e3
-"""Relative effect of a rounding from which on a derivative is 0 but for rounding."""
 ROUNDINGS = 5
 """Roundings of the inputs, of which the largest effect counts."""
 
@@ -101,28 +99,14 @@ def report(device: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as a table: error, and in brackets what one rounding of the inputs changes.
-
-    A dash stands where that is all of it: for derivatives that are 0 but for rounding.
-    """
-    lines = ["| scene | depth | " + " | ".join(ARRAYS) + " |", "|---" * (2 + len(ARRAYS)) + "|"]
-    for row in rows:
-        pairs = [(row["error"][key], row["one_rounding"][key]) for key in ARRAYS]
-        cells = [f"{error:.1e} ({least:.1e})" if least < UNSTABLE else "–" for error, least in pairs]
-        lines.append(f"| {row['scene']} | {row['depth']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
 def main() -> None:
-    """Measure, print and write."""
+    """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=None)
     record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     rows = report(device)
-    print(markdown(rows))
     record.write_result(arguments, device, {"rows": rows})
 
 

@@ -1,22 +1,12 @@
-"""The raster benchmark as two pictures: how time grows with Gaussians and pixels, and which stages take it.
-
-    python benchmarks/raster_plot.py [RESULT.json ...] [--out docs/images]
-
-Without files, draws what lies in ``results/raster_*.json``. Writes ``raster_growth.png`` and ``raster_stages.png``.
-"""
+"""The raster benchmark as two pictures: how time grows with Gaussians and pixels, and which stages take it."""
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from raster_stages import BACKWARD, FORWARD, REST
-
-HERE = Path(__file__).parent
 
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
 """Timed parts in growth rows, and their titles."""
@@ -67,7 +57,7 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
             _log_axes(axes)
     panels[0, 0].legend()
     figure.suptitle(
-        "11 channels, depth, median depth and alpha of a figure; lines are the fastest repeats, areas their ranges"
+        "11 channels, depth, median depth and alpha of a figure; lines are medians, areas ranges of repeats"
     )
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -128,17 +118,17 @@ def _measured(result: Mapping[str, Any], section: str) -> bool:
 
 
 def _draw_line(axes: Any, rows: Sequence[Mapping[str, Any]], series: str, part: str, way: Way, device: str) -> None:
-    """Draw the fastest repeats as a line and ranges as an area; nothing where nothing was measured."""
+    """Draw medians as a line and ranges as an area; nothing where nothing was measured."""
     points = []
     for row in rows:
         entry = row["ms"].get(f"{way.name}, {part}", {}).get(way.clock)
         if entry is not None:
             across = row["splats"] if series == "gaussians" else row["width"] * row["height"]
-            points.append((across, entry["lowest"], entry["highest"]))
+            points.append((across, entry["median"], entry["lowest"], entry["highest"]))
     if not points:
         return
-    x, low, high = zip(*sorted(points), strict=True)
-    axes.plot(x, low, way.style, color=way.color, marker="o", markersize=5, label=f"{device}, {way.label}")
+    x, middle, low, high = zip(*sorted(points), strict=True)
+    axes.plot(x, middle, way.style, color=way.color, marker="o", markersize=5, label=f"{device}, {way.label}")
     axes.fill_between(x, low, high, color=way.color, alpha=0.12, linewidth=0)
 
 
@@ -185,24 +175,3 @@ def _pyplot() -> Any:
     from matplotlib import pyplot
 
     return pyplot
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, nargs="*", default=sorted((HERE / "results").glob("raster_*.json")))
-    parser.add_argument("--out", type=Path, default=HERE.parent / "docs" / "images")
-    arguments = parser.parse_args()
-    results = [json.loads(path.read_text(encoding="utf-8")) for path in arguments.results]
-    results.sort(key=lambda result: result["machine"]["device"] == "cpu")  # GPUs first
-    if not results:
-        parser.error(
-            "there must be a result to draw, got none; run raster.py --out benchmarks/results/raster_NAME.json"
-        )
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    draw_growth(results, arguments.out / "raster_growth.png")
-    draw_stages(results, arguments.out / "raster_stages.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -121,24 +121,27 @@ def filled(page: Path, text: str) -> str:
         return match[1] + "\n" + "\n".join(lines) + "\n\n" + match[3]
 
     def write_number(match: re.Match[str]) -> str:
-        text, spread = value_at(match["file"], match["key"])
-        files = NUMBERS[match["key"][1:]][0] if match["key"].startswith("=") else (match["file"],)
-        title = "; ".join(source(file) for file in files) + spread
-        return f'[{text}]({match["path"]}#{match["key"]} "{title}")'
+        path, _, spec = match["key"].partition("~")
+        files, value = found_at(match["file"], path)
+        said, spread = written(value, spec)
+        title = "; ".join(map(source, files)) + spread
+        return f'[{said}]({match["path"]}#{match["key"]} "{title}")'
 
     return NUMBER.sub(write_number, TABLE.sub(write_table, text))
 
 
-def value_at(file: str, key: str) -> tuple[str, str]:
-    """Return the value that a fragment leads to as text, and the range of its repeats in words."""
-    path, _, spec = key.partition("~")
-    factor, form = re.fullmatch(r"(?:\*([\d.e+-]+):?)?(.*)", spec).groups()  # pyright: ignore[reportOptionalMemberAccess]
-    scale, form = float(factor or 1.0), form or ".3g"
+def found_at(file: str, path: str) -> tuple[tuple[str, ...], Any]:
+    """Return the results that a number is of, and its value."""
     if path.startswith("="):
         files, function = NUMBERS[path[1:]]
-        value = function(*map(result, files))
-    else:
-        value = functools.reduce(step, path.split("/"), result(file))
+        return files, function(*map(result, files))
+    return (file,), functools.reduce(step, path.split("/"), result(file))
+
+
+def written(value: Any, spec: str) -> tuple[str, str]:
+    """Return a value as text by what stands after ``~``, and in words the range of its repeats."""
+    factor, form = re.fullmatch(r"(?:\*([\d.e+-]+):?)?(.*)", spec).groups()  # pyright: ignore[reportOptionalMemberAccess]
+    scale, form = float(factor or 1.0), form or ".3g"
     if is_spread(value):
         low, high = (cell(value[end], form, factor=scale) for end in ("lowest", "highest"))
         return cell(value["median"], form, factor=scale), f"; median of repeats, which range from {low} to {high}"

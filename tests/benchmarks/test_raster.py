@@ -159,7 +159,7 @@ def test_everything_is_measured(device, tmp_path):
     states = []
     result = benchmark.measure(TINY, target, lambda text: None, keep=lambda state: states.append(json.dumps(state)))
     assert result["failed"] == []
-    result = {"commit": "none", **json.loads(states[-1])}
+    result = json.loads(states[-1])
     assert len(states) == len(benchmark.sections(TINY, target, lambda text: None))
     for rows in (result["variants"]["figure"]["variants"], result["variants"]["cube"]["variants"]):
         for name, row in rows.items():
@@ -169,7 +169,6 @@ def test_everything_is_measured(device, tmp_path):
         assert result["accuracy"][scene]["two_runs_bit_equal"] == {"images": True, "gradients": True}
     assert [row["splats"] for row in result["growth"]["gaussians"]] == [100, 300]
     assert [row["width"] for row in result["growth"]["pixels"]] == [16, 24]
-    assert "14 channels and depth" in benchmark.markdown(result)
     for draw_one in (draw_growth, draw_stages):
         draw_one([result], tmp_path / "plot.png")
         assert (tmp_path / "plot.png").stat().st_size > 10_000
@@ -182,7 +181,6 @@ def test_a_section_that_fails_says_so_and_the_others_are_kept(monkeypatch):
     assert result["failed"] == ["frames"]
     assert "ZeroDivisionError" in result["frames"]["failed"]
     assert result["growth"]["gaussians"] == []
-    assert "ZeroDivisionError" in benchmark.markdown({"commit": "none", **result})
 
 
 def test_pictures_are_written_small(device, tmp_path):
