@@ -222,6 +222,21 @@ def test_indirect_light_is_what_bounces_add(corner):
     assert whole.layers["indirect"].mean() > 0.02 * whole.rgb.mean()
 
 
+def test_channels_do_not_mix(corner, device, rng):
+    """Where red, green and blue of materials and lights change places they do so in the image, bounces included."""
+    colors, lamp = rng.random((len(corner.cloud), 3)), corner.lights[0]
+    images = []
+    for order in ([0, 1, 2], [1, 2, 0]):
+        cloud = corner.cloud.with_arrays(base_color=colors[:, order])
+        light = replace(lamp, intensity=tuple(np.array([3.0, 2.0, 1.0])[order]))
+        shot = replace(corner, cloud=cloud, environment=WHITE, lights=(light,))
+        images.append(render(shot, device, samples=4, bounces=2))
+    one, two = images
+    # the same paths: only sums over channels are rounded otherwise
+    np.testing.assert_allclose(two.rgb, one.rgb[..., [1, 2, 0]], rtol=1e-4)
+    np.testing.assert_allclose(two.layers["indirect"], one.layers["indirect"][..., [1, 2, 0]], rtol=1e-4, atol=1e-6)
+
+
 def test_the_same_seed_gives_the_same_bits(corner, monkeypatch):
     first = render(corner, samples=20)
     monkeypatch.setenv("BEAM_WARP_THREADS", "1")
@@ -266,8 +281,14 @@ def test_checkpoints_of_something_else_are_not_taken_up(corner, tmp_path):
     progress.advance()
     progress.save(path)
     assert PathRenderer(options, device="cpu").start(corner).resume(path)
-    brighter = replace(corner, environment=corner.environment.scaled(2.0))
-    assert not PathRenderer(options, device="cpu").start(brighter).resume(path)
+    for changed in (
+        {"environment": corner.environment.scaled(2.0)},
+        {"environment_rotation": 10.0},
+        {"lights": ()},
+        {"lights": (replace(corner.lights[0], intensity=(1.0, 2.0, 3.0)),)},
+        {"mesh": plate()},
+    ):
+        assert not PathRenderer(options, device="cpu").start(replace(corner, **changed)).resume(path)
     assert not PathRenderer(PathOptions(samples=4 * PASS_SAMPLES), device="cpu").start(corner).resume(path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(AssetFormatError, match="Delete it"):
