@@ -78,7 +78,9 @@ def figure():
 
 
 def figure_camera(cloud, size=(20, 30), azimuth=30.0):
-    return Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
+    """A view whose pixels are not square."""
+    camera = Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
+    return replace(camera, focal_x=0.9 * camera.focal_y)
 
 
 # ---- lights on a plane: closed forms --------------------------------------------------------------------------------
