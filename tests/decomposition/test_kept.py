@@ -43,23 +43,28 @@ def source_of(folder, sequence, shown=None):
     return Source(sequence=sequence, images=shown, options=options, digests=digests, device="cpu", log=log)
 
 
-def test_exposure(tmp_path, monkeypatch):
-    """By turns, since one result is kept: everything as it was, then one thing another."""
+@pytest.mark.parametrize(
+    "change",
+    [{"light": LIGHT.scaled(2.0)}, {"described": "other options"}, {"greys": (0.4,)}, {"shown": images("digest")}],
+    ids=lambda change: next(iter(change)),
+)
+def test_exposure(tmp_path, monkeypatch, change):
     searches = count()
     monkeypatch.setattr("beam_warp.decomposition.capture_light._exposure_stops", lambda *_: float(next(searches)))
 
     def stops(greys=(0.3,), light=LIGHT, described="options", shown=None):
         return prepare_light(light, source_of(tmp_path, balls(*greys), shown), described, tmp_path).stops
 
-    assert [stops(), stops()] == [0.0, 0.0]
-    assert stops(light=LIGHT.scaled(2.0)) == 1.0
-    assert stops(described="other options") == 2.0
-    assert stops(greys=(0.4,)) == 3.0
-    assert [stops(shown=images("one")), stops(shown=images("one")), stops(shown=images("other"))] == [4.0, 4.0, 5.0]
+    assert [stops(), stops(), stops(**change), stops(**change)] == [0.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("persistent", [True, False])
-def test_roughness(tmp_path, monkeypatch, persistent):
+@pytest.mark.parametrize(
+    "change",
+    [{"key": "another light"}, {"greys": (0.4, 0.3)}, {"greys": (0.3, 0.4)}, {"shown": images("digest")}],
+    ids=["light", "first frame", "second frame", "images"],
+)
+def test_roughness(tmp_path, monkeypatch, persistent, change):
     """Of persistent Gaussians every frame decides it, else the one that is asked for."""
     searches = count()
     monkeypatch.setattr(RoughnessFinder, "_profile", lambda *_: next(searches))
@@ -69,13 +74,9 @@ def test_roughness(tmp_path, monkeypatch, persistent):
     )
 
     def found(greys=(0.3, 0.3), key="light and options", shown=None):
-        source = source_of(tmp_path, balls(*greys), shown)
-        archive = FrameArchive(tmp_path, None)
+        source, archive = source_of(tmp_path, balls(*greys), shown), FrameArchive(tmp_path, None)
         plan = JobPlan(source=source, light=None, persistent=persistent, key=key, archive=archive)
         return RoughnessFinder(plan).arrays(source.first)["roughness"][0]
 
-    assert [found(), found()] == [0.0, 0.0]
-    assert found(key="another light") == 1.0
-    assert found(greys=(0.4, 0.3)) == 2.0
-    assert found(greys=(0.4, 0.4)) == (3.0 if persistent else 2.0)
-    assert found(shown=images("one")) > 2.0
+    other = 0.0 if change == {"greys": (0.3, 0.4)} and not persistent else 1.0
+    assert [found(), found(), found(**change), found(**change)] == [0.0, 0.0, other, other]
