@@ -32,12 +32,12 @@ def run(*words):
     return main(["mesh", *map(str, words)])
 
 
-def write_capture(folder, frames):
+def write_capture(folder, frames, distance=3.0):
     """Cameras around the ball, without images: none are needed."""
     folder.mkdir()
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     seen = {"width": 64, "height": 64, "vertical_fov": 30.0}
-    cameras = [Camera.orbit((0, 0, 0), 3.0, 45.0 * i, 40.0 * (-1) ** i, **seen) for i in range(9)]
+    cameras = [Camera.orbit((0, 0, 0), distance, 45.0 * i, 40.0 * (-1) ** i, **seen) for i in range(9)]
     records = [
         {"file_path": f"images/{i}/{frame:04d}.exr", "camera": f"cam{i}", "frame": frame,
          "split": "train" if i < 8 else "test", "transform_matrix": (camera.camera_to_world @ flip).tolist()}
@@ -111,6 +111,10 @@ def test_cameras_of_a_capture(sequence, tmp_path, capsys):
     assert frame["mesh"]["nonmanifold_edges"] == 0
     mesh = read_mesh(tmp_path / "out" / "mesh000000.glb")
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.5).max() < 0.05
+    write_capture(tmp_path / "nearer", [0], distance=2.9)
+    elsewhere = ("--capture", tmp_path / "nearer", *words[2:])
+    assert run(sequence, "--out", tmp_path / "out", *elsewhere, "--frames", "0", "--json") == 0
+    assert not json.loads(capsys.readouterr().out)["frames"][0]["kept"]
     assert run(sequence, "--out", tmp_path / "out", *words) == 2
     assert "split must name records of frame 1 of the capture, got 'train'" in capsys.readouterr().err
 

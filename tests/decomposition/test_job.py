@@ -136,6 +136,8 @@ def test_stopped_job_continues_to_identical_bytes(tmp_path, light, whole):
 def test_other_input_options_or_code_start_over(tmp_path, light):
     out, given = tmp_path / "out", {"sequence": frames(0.0), "light": light, "options": FAST}
     job(out=out, **given)
+    with pytest.raises(InvalidOptionError, match="environment must shed light"):  # what is kept is of another light
+        job(out=out, **given | {"light": light.scaled(0.0)})
     for changed in (
         {"sequence": frames(0.5)},
         {"light": light.scaled(2.0)},
@@ -323,7 +325,10 @@ class TestWithACapture:
         assert all(np.array_equal(a.color, b.color) for a, b in zip(views, expected, strict=True))
 
     def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, capture, tmp_path):
-        """8-bit images carry no scale: the same light twice as bright gives the same base colour."""
+        """8-bit images carry no scale: the same light four times as bright gives the same base colour.
+
+        In one folder: the exposure that was found for the one light is not that of the other.
+        """
         assert not CaptureImages(capture, discs).is_display_referred(0)
         records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in capture.records)
         display = replace(capture, records=records)
@@ -331,7 +336,7 @@ class TestWithACapture:
         assert images.ceiling(0, images.views(0)) == 1.0
         one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
         plain, brighter = (
-            job(one, studio.scaled(scale), tmp_path / str(scale), AUTO, capture=display) for scale in (1.0, 4.0)
+            job(one, studio.scaled(scale), tmp_path / "out", AUTO, capture=display) for scale in (1.0, 4.0)
         )
         # candidates are a sixteenth of a stop apart
         difference = plain.report["exposure_stops"] - brighter.report["exposure_stops"]

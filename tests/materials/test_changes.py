@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 from support.color_evidence import color_evidence
 
 from beam_warp.materials.base_color import BaseColor
@@ -53,6 +54,22 @@ def test_changes_are_found_and_followed(rng):
     assert np.sqrt((off**2).mean()) < 1.1 * 0.03
     assert 0.8 < np.sqrt((off**2).mean()) / error[:200].mean() < 1.25
     np.testing.assert_allclose(color[found.changing == 0], found.mean[found.changing == 0])
+
+
+@pytest.mark.parametrize(("chance", "found"), [(0.8, 200), (1.2, 0)])
+def test_chances_are_judged_by_their_rank(chance, found):
+    """Of 4,000 Gaussians 200 differ from frame to frame, all by as much, and the others not at all.
+
+    Benjamini and Hochberg's limit of the 200th smallest chance is the level times 200 / 4,000. A single chance would
+    pass below the level, and by Bonferroni's limit none would.
+    """
+    error, channels = 0.05, 3
+    # Two frames at mean +- d have Q = 2 (d / error)^2 by channel, of one degree of freedom each.
+    q = stats.chi2.isf(chance * FALSE_DISCOVERIES * 200 / COUNT, channels)
+    apart = np.where(np.arange(COUNT) < 200, error * np.sqrt(q / channels / 2.0), 0.0)[:, None] * np.ones(channels)
+    changing = outcome([evidence(0.5 + apart, error), evidence(0.5 - apart, error)]).changing
+    assert changing[:200].sum() == found
+    assert not changing[200:].any()
 
 
 def test_frames_that_do_not_see_a_gaussian_do_not_count(rng):

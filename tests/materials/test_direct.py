@@ -115,10 +115,13 @@ class TestOccluded:
         return cloud_of(*parts), normals
 
     def test_one_bounce_takes_light_off_the_corner(self, device):
-        """Radiosity of the corner, solved on the Gaussians themselves, is what a camera would have captured."""
+        """Radiosity of the corner, solved on the Gaussians themselves, is what a camera would have captured.
+
+        By channel: what bounces is red here, so that light is taken off by as much as each has of it.
+        """
         cloud, normals = self.corner()
         count = len(cloud)
-        truth = np.full((count, 3), 0.6)
+        truth = np.array([0.8, 0.5, 0.2])
         offset = cloud.positions[None] - cloud.positions[:, None]
         distance = np.linalg.norm(offset, axis=2) + np.eye(count)
         cos_here = np.maximum(np.einsum("ijk,ik->ij", offset, normals) / distance, 0.0)
@@ -126,20 +129,20 @@ class TestOccluded:
         form = cos_here * cos_there / (np.pi * distance**2) * 0.06**2
         # neighbours at the edge: at most 1/2
         form *= np.minimum(1.0, 0.5 / np.maximum(form.sum(1, keepdims=True), 1e-9))
-        kept = 0.6 * (1.0 - SPECULAR_ALBEDO)
         sky_part = 1.0 - form.sum(1)
-        radiosity = np.linalg.solve(np.eye(count) - kept * form, kept * sky_part)
-        arriving = sky_part + form @ radiosity
-        captured = np.repeat(((kept + SPECULAR_ALBEDO) * arriving)[:, None], 3, axis=1)
-        cloud = colored(cloud, captured)
+        captured = []
+        for kept in truth * (1.0 - SPECULAR_ALBEDO):
+            radiosity = np.linalg.solve(np.eye(count) - kept * form, kept * sky_part)
+            captured.append((kept + SPECULAR_ALBEDO) * (sky_part + form @ radiosity))
+        cloud = colored(cloud, np.stack(captured, axis=1))
         x, y, z = cloud.positions.T
         edge = (np.abs(x + z - 0.15) < 0.1) & (np.abs(y) < 0.6)
         bounced, _ = decompose(cloud, normals, EVEN, device)
         direct, _ = decompose(cloud, normals, EVEN, device, MaterialOptions(bounce=False))
-        with_bounce = np.abs(bounced.base_color - truth)[edge].mean()
-        without = np.abs(direct.base_color - truth)[edge].mean()
-        assert with_bounce < 0.05
-        assert with_bounce < 0.5 * without
+        with_bounce = np.abs(bounced.base_color - truth)[edge].mean(axis=0)
+        without = np.abs(direct.base_color - truth)[edge].mean(axis=0)
+        assert (with_bounce < 0.05).all()
+        assert (with_bounce < 0.5 * without).all()
 
     def test_buried_gaussians_are_filled_from_neighbours_and_flagged(self, device):
         points, spacing = sphere_points(1500)
@@ -229,7 +232,7 @@ class TestFailures:
 
 
 class TestExposure:
-    @pytest.mark.parametrize("stops", [-2.0, 0.0, 3.0])
+    @pytest.mark.parametrize("stops", [-2.0, 0.0, 6.0])
     def test_unknown_scale_of_the_light_is_found(self, rng, stops):
         """Whites of 0.8 and blacks of 0.05, captured at some exposure: the light comes back to a quarter stop."""
         points, spacing = sphere_points(1500)

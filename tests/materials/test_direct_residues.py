@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
+from reference.harmonics import sh_color
 from support.estimates import LARGEST_Z
 from support.flat_scenes import brdf_twin
 from support.shapes import cloud_of, disc_points, sphere_points, tiles
@@ -21,12 +22,14 @@ from beam_warp.kernels.materials.residues import (
     ShadedPoints,
     launch_fit_color,
     launch_gather_light,
+    launch_sample_radiance,
     launch_trace_bounce,
     launch_view_residues,
 )
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.direct import view_set
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
@@ -205,7 +208,8 @@ class TestResidues:
     @pytest.mark.parametrize("roughness", [0.3, 0.7])
     def test_open_points_show_the_blurred_sky_times_the_albedo(self, device, rng, sky, roughness):
         normals = unit(rng.normal(size=(33, 3)))
-        points = Points(normals, *even_rays(normals, 64), device, roughness=roughness, bounce=0.25)
+        bounce = np.array([0.25, 0.5, 0.1])
+        points = Points(normals, *even_rays(normals, 64), device, roughness=roughness, bounce=bounce)
         points.gather(True, np.ones((33, 3)))
         views = views_of(normals, self.COSINES, rng)
         specular, share = points.residues(sky(device), views)
@@ -223,7 +227,7 @@ class TestResidues:
             weight = ggx_distribution(half @ d, roughness**2) * cosine[up]
             masked = weight / (1.0 + smith_lambda(cosine[up], roughness**2))
             blurred = [(w[:, None] * light[up]).sum(0) / w.sum() for w in (weight, masked)]
-            expected = (np.array(blurred) + 0.25) * albedo[v]
+            expected = (np.array(blurred) + bounce) * albedo[v]
             spread = np.abs(expected[0] - expected[1])
             # tree blur 2 %, linear in log roughness between levels 2 %, and what masking makes of the lobe
             assert (np.abs(specular[v, p] - expected.mean(0)) < spread + 0.04 * expected.max() + TABLE_ERROR).all()
@@ -290,6 +294,23 @@ class TestResidues:
             assert (share == 0.0).all()
 
 
+def test_sampled_radiance_is_what_viewers_around_the_normal_see(device, rng):
+    """Harmonics of degree 2 along the way from each viewer, weighted by the projected area."""
+    radiance, gaussians, views = rng.normal(0.0, 0.2, (9, 9, 3)), np.array([3, 8, 0, 3]), view_set()
+    normals = unit(rng.normal(size=(4, 3)))
+    rows = [wp.array(gaussians, dtype=int, device=device), 0, wp.array(normals, dtype=wp.vec3, device=device)]
+    colors, directions = (wp.empty((len(views), 4), dtype=kind, device=device) for kind in (wp.vec4, wp.vec3))
+    coefficients = wp.array(np.float32(radiance), dtype=wp.vec3, device=device)
+    launch_sample_radiance(
+        4, coefficients, *rows, wp.array(views, dtype=wp.vec3, device=device), colors, directions, device
+    )
+    for view, found, toward in zip(views, colors.numpy(), directions.numpy(), strict=True):
+        np.testing.assert_allclose((toward * normals).sum(axis=1), view[2], atol=4 * EPS)
+        np.testing.assert_allclose(found[:, 3], view[2])
+        # nine terms of order 1
+        np.testing.assert_allclose(found[:, :3], sh_color(radiance[gaussians], -toward), atol=20 * EPS)
+
+
 def scene_of_views(rng, count, views):
     """Observations as a model makes them: light, shares, speculars, weights; and normals that views see at angles."""
     normals = unit(rng.normal(size=(count, 3)))
@@ -316,7 +337,7 @@ class TestFit:
     @pytest.mark.parametrize("views", [1, 33])
     def test_plain_least_squares_is_lstsq(self, device, rng, views):
         normals, toward, arriving, share, specular, weight = scene_of_views(rng, 70, views)
-        bounce = 0.25
+        bounce = np.array([0.25, 0.5, 0.1])
         diffuse = (arriving + bounce) * share[..., None]
         colors = rng.uniform(0.2, 0.8, (70, 3)) * diffuse + specular + rng.normal(0.0, 0.02, (views, 70, 3))
         fit = fitted(colors, weight, toward, share, specular, normals, arriving, device, bounce=bounce)
@@ -353,13 +374,25 @@ class TestFit:
         assert (robust["views"] < 15.5).all()  # what hardly counts is not counted
         assert (robust["views"] > 14.5).all()
 
-    def test_colours_that_no_base_colour_explains_do_not_break_the_weights(self, device, rng):
-        normals, toward, arriving, share, specular, weight = scene_of_views(rng, 40, 8)
-        for factor in (-0.5, 3.0):  # darker than the highlight alone, brighter than white
-            colors = factor * arriving * share[..., None] + specular
-            fit = fitted(colors, weight, toward, share, specular, normals, arriving, device, robust=True)
-            raw = fit["numerator"] / fit["denominator"]
-            np.testing.assert_allclose(raw, factor, atol=0.05)  # sums are those of the data: cutting is the solver's
+    @pytest.mark.parametrize(("targets", "bound"), [([-0.1, -0.5, -2.0], 0.0), ([1.2, 1.4, 3.0], 1.0)])
+    def test_views_are_weighed_by_what_a_base_colour_explains(self, device, rng, targets, bound):
+        """All show less than the highlight alone, or more than white: they are off from black, or from white.
+
+        The sums themselves are those of the data: cutting their quotient is the solver's.
+        """
+        normals, toward, arriving, share, specular, _ = scene_of_views(rng, 5, 3)
+        arriving[:], share[:] = 1.0, 1.0
+        target = np.array(targets)[:, None, None]
+        fit = fitted(
+            target + specular, np.ones((3, 5)), toward, share, specular, normals, arriving, device, robust=True
+        )
+        spread = max(0.1 * bound, 0.01)
+        weight = spread**2 / (spread**2 + 3.0 * (target[:, 0, 0] - bound) ** 2)
+        # residues of 0.1 are differences of numbers of about 1; their squares decide the weights
+        np.testing.assert_allclose(
+            fit["numerator"] / fit["denominator"], weight @ targets / weight.sum(), rtol=50 * EPS
+        )
+        np.testing.assert_allclose(fit["views"], weight.sum() ** 2 / (weight**2).sum(), rtol=50 * EPS)
 
     def test_grazing_views_count_less_and_are_told(self, device, rng):
         normals = unit(rng.normal(size=(10, 3)))

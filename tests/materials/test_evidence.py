@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
+from reference.harmonics import sh_color
+from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles, unit
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError
@@ -50,7 +51,8 @@ def shown_colors(*arguments, device):
 
 class TestSurface:
     def test_points_and_normals_of_a_sphere(self, ball, device):
-        found = view_evidence(ball, around(), device=device)
+        cameras = [replace(camera, focal_x=0.9 * camera.focal_y) for camera in around()]  # pixels need not be square
+        found = view_evidence(ball, cameras, device=device)
         seen = found.seen
         assert seen.mean() > 0.95
         radius = np.linalg.norm(found.positions.numpy()[seen], axis=1)
@@ -103,6 +105,15 @@ class TestColors:
         colors, shown = shown_colors(ball, cameras, views, device=device)
         truth = np.broadcast_to(0.5 + more + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
         np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=tolerance)
+
+    def test_colours_are_those_that_each_camera_sees(self, ball, device, rng):
+        """Of harmonics of degree 3 along the way from the camera, which the other side does not show."""
+        cameras = around(4)
+        glossy = ball.with_arrays(radiance=rng.normal(0.0, 0.1, (3000, 16, 3)))
+        colors, shown = shown_colors(glossy, cameras, captured(glossy, cameras, device=device), device=device)
+        for camera, found, rows in zip(cameras, colors, shown, strict=True):
+            away = unit(glossy.positions[rows] - camera.position)
+            np.testing.assert_allclose(found[rows, :3], sh_color(glossy.radiance[rows], away), atol=2e-5)
 
     def test_display_colour_is_decoded(self, ball, device):
         cameras = around(4)

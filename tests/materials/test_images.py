@@ -203,6 +203,20 @@ class TestBehaviour:
             np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
         assert not np.array_equal(first.base_color, other.base_color)
 
+    def test_every_view_of_every_frame_has_noise_of_its_own(self, made, monkeypatch):
+        """The same view twice in each of two frames: what is to be baked differs four times, occlusion included."""
+        found, usual = [], image_path.bake
+
+        def bake(gaussians, targets, **options):
+            found.extend(np.where(t.weights.numpy() > 0.0, t.targets.numpy(), 0.0) for t in targets)
+            return usual(gaussians, targets, **options)
+
+        monkeypatch.setattr(image_path, "bake", bake)
+        for frame in (0, 1):
+            made.decompose(2 * made.views, frame=frame, denoiser="none")
+        for columns in (np.s_[..., :3], np.s_[..., 3:]):
+            assert len({values[columns].tobytes() for values in found}) == 4
+
     def test_a_temporal_term_takes_flicker_off(self, device):
         made = ball(device, views=2)
         first = made.decompose(frame=0).base_color

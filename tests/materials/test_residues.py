@@ -1,5 +1,7 @@
 """What light does at pixels' surface points: closed forms, a quadrature of the same integrals, noise as stated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -35,7 +37,8 @@ def ball(count=1500):
 
 
 def looking_at(azimuth=20.0, elevation=30.0, size=24, distance=4.0, fov=30.0, at=(0, 0, 0)):
-    return Camera.orbit(at, distance, azimuth, elevation, width=size, height=size, vertical_fov=fov)
+    camera = Camera.orbit(at, distance, azimuth, elevation, width=size, height=size, vertical_fov=fov)
+    return replace(camera, focal_x=0.9 * camera.focal_y)  # pixels are not square
 
 
 class TestSurfaces:

@@ -78,7 +78,9 @@ def figure():
 
 
 def figure_camera(cloud, size=(20, 30), azimuth=30.0):
-    return Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
+    """A view whose pixels are not square."""
+    camera = Camera.frame_cloud(cloud.positions, azimuth=azimuth, width=size[0], height=size[1])
+    return replace(camera, focal_x=0.9 * camera.focal_y)
 
 
 # ---- lights on a plane: closed forms --------------------------------------------------------------------------------
@@ -112,14 +114,21 @@ def test_a_point_light_falls_with_the_square(device):
         assert middle(render(shot, device))[1] == pytest.approx(2.0 * cosine / squared * scattered, rel=1e-3)
 
 
-def test_a_spot_lights_its_cone_only(device):
-    light = SpotLight(position=(0, 0, 2), direction=(0, 0, -1), intensity=(1, 1, 1), inner_angle=10.0, outer_angle=20.0)
-    found = []
-    for x in (0.0, 0.2, 0.5, 0.9):  # 0, 6, 14 and 24 degrees from the axis
-        shot = Shot(cloud=floor(), camera=camera((x, 0, 4.0), (x, 0, 0)), lights=(light,))
-        found.append(middle(render(shot, device))[0])
-    assert found[0] > found[1] > found[2] > 0.0
-    assert found[3] == 0.0
+def test_a_spot_fades_from_its_inner_to_its_outer_angle(device):
+    """By 3 x^2 - 2 x^3, x the place of the cosine between those of both angles; white and rough, seen from above."""
+    light = SpotLight(position=(0, 0, 2), direction=(0, 0, -1), intensity=(2, 2, 2), inner_angle=10.0, outer_angle=20.0)
+    outer, inner = np.cos(np.radians([20.0, 10.0]))
+    scattered = (1.0 - specular_albedo(1.0, 1.0)) / np.pi
+    for angle in (8.0, 12.0, 15.0, 18.0, 24.0):
+        at = 2.0 * np.tan(np.radians(angle))
+        shot = Shot(cloud=floor(), camera=camera((at, 0, 4.0), (at, 0, 0), fov=0.1), lights=(light,))
+        away = np.array([-at, 0.0, 2.0])
+        cosine = 2.0 / np.linalg.norm(away)
+        x = np.clip((cosine - outer) / (inner - outer), 0.0, 1.0)
+        shed = 2.0 * cosine / (away @ away) * (3.0 * x**2 - 2.0 * x**3)
+        found = middle(render(shot, device))[1]
+        # a float32 cosine over the cone's width of cosines, 0.045
+        assert found == pytest.approx(shed * (scattered + brdf_twin(UP, UP, away, 1.0)), rel=1e-3, abs=1e-7)
 
 
 @pytest.mark.parametrize(("roughness", "diameter", "most"), [(1.0, 20.0, 0.02), (0.5, 10.0, 0.03), (0.25, 0.53, 0.02)])
@@ -250,6 +259,38 @@ def test_bounces_in_a_closed_room(device):
         reflects = color * (1.0 - share) + share
         expected = np.pi * openness * sum(((1 - openness) * reflects) ** k for k in range(bounces + 1))
         np.testing.assert_allclose(arriving, expected, rtol=2e-3)
+
+
+def test_bounces_are_those_of_form_factors(device, rng):
+    """Gaussians at random, so few that each is a cluster, against float64: sizes, opacities, colours, two bounces."""
+    count = 60
+    places, normals = rng.uniform(-1.0, 1.0, (count, 3)), rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    color, roughness, openness = rng.random((count, 3)), rng.random(count), rng.random(count)
+    material = {"color": color, "roughness": roughness, "openness": openness}
+    sides = rng.uniform(0.05, 0.8, (count, 2))
+    cloud = discs(places, normals, 1.0, **material, opacity=0.5)
+    cloud = cloud.with_arrays(
+        scales=np.column_stack([sides, 0.1 * sides.min(axis=1)]), opacities=rng.uniform(0.2, 1.0, count)
+    )
+    shot = Shot(cloud=cloud, camera=figure_camera(cloud), environment=FURNACE)
+    renderer = DeferredRenderer(replace(PLAIN, bounces=2), device=device, prepared=[prepared(FURNACE, device)])
+    found = renderer.frame(shot).gaussians.values.numpy()[:, 8:11]
+
+    share = specular_albedo(np.full(count, 2.0 / 3.0), roughness)[:, None]
+    reflects = color * (1.0 - share) + share
+    area = 2.0 * np.pi * cloud.opacities * sides.prod(axis=1)
+    away = places[None] - places[:, None]
+    squared = (away**2).sum(axis=-1) + np.eye(count)  # none of which sees itself
+    here = np.maximum(np.einsum("ijk,ik->ij", away, normals), 0.0)
+    there = np.maximum(-np.einsum("ijk,jk->ij", away, normals), 0.0)
+    form = area * here * there / squared / (squared + area / np.pi)
+    form /= np.maximum(form.sum(axis=1, keepdims=True), 1e-12)
+    straight = np.pi * openness[:, None] * [1.0, 0.5, 2.0]
+    hidden = (1.0 - openness)[:, None]
+    once = straight + hidden * (form @ (reflects * straight))
+    # sums of 60 float32 terms, and an albedo from its table
+    np.testing.assert_allclose(found, straight + hidden * (form @ (reflects * once)), rtol=2e-3)
 
 
 # ---- triangles ------------------------------------------------------------------------------------------------------

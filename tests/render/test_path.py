@@ -134,6 +134,29 @@ def test_a_half_opaque_disc_takes_half_of_the_light(device):
     assert np.isclose(shaded.rgb[1:3, 1:3].mean() / free.rgb[1:3, 1:3].mean(), 0.5, atol=0.02)
 
 
+@pytest.mark.parametrize("diameter", [0.0, 60.0])
+def test_a_light_that_casts_no_shadows_passes_what_is_in_its_way(device, diameter):
+    """Found by chance too, which half of the samples of a smooth plane do."""
+    sun = replace(SUN, angular_diameter=diameter, casts_shadows=False)
+    ground = Shot(cloud=disc(roughness=0.3), camera=look((0.0, -1.0, 0.4)), lights=(sun,))
+    roof = disc(height=0.8, size=0.5)
+    images = [
+        render(replace(ground, cloud=cloud), device, samples=16, bounces=0)
+        for cloud in (ground.cloud, together(ground.cloud, roof))
+    ]
+    np.testing.assert_allclose(images[1].rgb, images[0].rgb, rtol=1e-3)
+
+
+def test_pixels_need_not_be_square_and_depth_is_along_the_axis(device):
+    """A wide view of a level square from 2 m above: as many pixels as its sides have focal lengths, all 2 m deep."""
+    view = replace(look((0.0, -1e-3, 2.0), size=32, fov=60.0), focal_x=40.0, focal_y=24.0)
+    image = render(
+        Shot(cloud=nothing(), camera=view, lights=(SUN,), mesh=plate(half=0.6)), device, samples=64, bounces=0
+    )
+    assert image.alpha.sum() == pytest.approx(0.6 * 40.0 * 0.6 * 24.0, rel=0.01)
+    np.testing.assert_allclose(image.layers["depth"][image.alpha == 1.0], 2.0, rtol=1e-3)
+
+
 def test_penumbras_are_as_wide_as_the_light_says(device):
     """A straight edge at half the height of a sphere light: light rises from 0 to 1 over the disc's area."""
     radius, height = 0.2, 2.0
@@ -222,6 +245,21 @@ def test_indirect_light_is_what_bounces_add(corner):
     assert whole.layers["indirect"].mean() > 0.02 * whole.rgb.mean()
 
 
+def test_channels_do_not_mix(corner, device, rng):
+    """Where red, green and blue of materials and lights change places they do so in the image, bounces included."""
+    colors, lamp = rng.random((len(corner.cloud), 3)), corner.lights[0]
+    images = []
+    for order in ([0, 1, 2], [1, 2, 0]):
+        cloud = corner.cloud.with_arrays(base_color=colors[:, order])
+        light = replace(lamp, intensity=tuple(np.array([3.0, 2.0, 1.0])[order]))
+        shot = replace(corner, cloud=cloud, environment=WHITE, lights=(light,))
+        images.append(render(shot, device, samples=4, bounces=2))
+    one, two = images
+    # the same paths: only sums over channels are rounded otherwise
+    np.testing.assert_allclose(two.rgb, one.rgb[..., [1, 2, 0]], rtol=1e-4)
+    np.testing.assert_allclose(two.layers["indirect"], one.layers["indirect"][..., [1, 2, 0]], rtol=1e-4, atol=1e-6)
+
+
 def test_the_same_seed_gives_the_same_bits(corner, monkeypatch):
     first = render(corner, samples=20)
     monkeypatch.setenv("BEAM_WARP_THREADS", "1")
@@ -266,8 +304,14 @@ def test_checkpoints_of_something_else_are_not_taken_up(corner, tmp_path):
     progress.advance()
     progress.save(path)
     assert PathRenderer(options, device="cpu").start(corner).resume(path)
-    brighter = replace(corner, environment=corner.environment.scaled(2.0))
-    assert not PathRenderer(options, device="cpu").start(brighter).resume(path)
+    for changed in (
+        {"environment": corner.environment.scaled(2.0)},
+        {"environment_rotation": 10.0},
+        {"lights": ()},
+        {"lights": (replace(corner.lights[0], intensity=(1.0, 2.0, 3.0)),)},
+        {"mesh": plate()},
+    ):
+        assert not PathRenderer(options, device="cpu").start(replace(corner, **changed)).resume(path)
     assert not PathRenderer(PathOptions(samples=4 * PASS_SAMPLES), device="cpu").start(corner).resume(path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(AssetFormatError, match="Delete it"):

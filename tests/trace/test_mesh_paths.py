@@ -1,5 +1,7 @@
 """The path tracer that makes the demo's truth: furnace, closed forms of visibility, light from the right side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -66,6 +68,17 @@ def test_furnace_never_gains_energy_inside_concavities(device):
     inside = image.alpha > 0.999
     assert inside.any()
     assert image.rgb[inside].mean() == pytest.approx(1.0, abs=0.02)
+
+
+def test_channels_do_not_mix(device, rng):
+    """Where red, green and blue of a bowl change places they do so in its image, bounces included."""
+    white = bowl(rings=12)
+    colors, images = rng.random((len(white.vertices), 3)), []
+    for order in ([0, 1, 2], [1, 2, 0]):
+        traced = TracedMesh.from_mesh(replace(white, base_color=colors[:, order]), device=device)
+        images.append(trace_radiance(traced, camera(8), UNIFORM, sample_count=4, bounce_count=3).rgb)
+    # the same paths: only sums over channels are rounded otherwise
+    np.testing.assert_allclose(images[1], images[0][..., [1, 2, 0]], rtol=1e-4)
 
 
 def test_bowl_sees_half_of_the_sky(device):

@@ -1,4 +1,4 @@
-"""Directions drawn from environments and GGX lobes: map, inverse and density of each."""
+"""Directions drawn from environments, lights of a size and GGX lobes: map, inverse and density."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,11 @@ from beam_warp.kernels.light.environment_sampling import (
     square_to_environment_pdf,
 )
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
+from beam_warp.kernels.light.lights import Lights, disc_pdf, light_disc, sample_disc
 from beam_warp.light.sampled import environment_distribution
+from beam_warp.light.uploaded import upload_lights
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.lights import DirectionalLight, PointLight
 
 
 @wp.kernel
@@ -48,6 +51,25 @@ def reflection_kernel(
 def reflection_pdf_kernel(view: wp.vec3, alpha: float, lights: wp.array[wp.vec3], out: wp.array[float]):
     i = wp.tid()
     out[i] = square_to_visible_reflection_pdf(view, lights[i], alpha)
+
+
+@wp.kernel
+def disc_kernel(
+    lights: Lights,
+    point: wp.vec3,
+    squares: wp.array[wp.vec2],
+    out_direction: wp.array[wp.vec3],
+    out_radiance: wp.array[wp.vec3],
+    out_reach: wp.array[float],
+    out_pdf: wp.array[wp.vec2],
+):
+    i = wp.tid()
+    disc = light_disc(lights, 0, point)
+    sample = sample_disc(disc, squares[i][0], squares[i][1])
+    out_direction[i] = sample.direction
+    out_radiance[i] = sample.radiance
+    out_reach[i] = sample.reach
+    out_pdf[i] = wp.vec2(sample.pdf, disc_pdf(disc, sample.direction))
 
 
 def sky(height=32):
@@ -100,6 +122,39 @@ class TestEnvironment:
         directions, _, _ = self.draw(device, black, rng.random((20_000, 2)).astype(np.float32))
         counts = np.histogram(directions[:, 2], bins=16, range=(-1, 1))[0]
         assert stats.chisquare(counts).pvalue > SIGNIFICANCE
+
+
+class TestDiscs:
+    def draw(self, light, point, device, side=64):
+        """Samples at the middles of a grid over the square: sums of what is linear over it are exact."""
+        places = (np.arange(side, dtype=np.float32) + 0.5) / side
+        squares = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+        inputs = [upload_lights([light], device), wp.vec3(*point), (squares, wp.vec2)]
+        return run_kernel(disc_kernel, len(squares), inputs, (wp.vec3, wp.vec3, float, wp.vec2), device)
+
+    def test_a_sphere(self, device):
+        """Every direction ends on it; together they shed intensity over the squared distance on what faces it."""
+        point, position, radius = np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.3, 0.7]), 0.6
+        light = PointLight(position=tuple(position), intensity=(3.0, 2.0, 1.0), radius=radius)
+        direction, radiance, reach, pdf = self.draw(light, point, device)
+        distance = np.linalg.norm(position - point)
+        assert (reach < distance).all()  # on the side that faces the point
+        # a root of the distance from the sphere's edge: 1e-7 becomes its root there
+        ends = np.linalg.norm(point + reach[:, None] * direction - position, axis=1)
+        np.testing.assert_allclose(ends, radius, atol=3e-4)
+        middle = np.sqrt(1.0 - (radius / distance) ** 2)
+        np.testing.assert_allclose(pdf, 1.0 / (2.0 * np.pi * (1.0 - middle)), rtol=1e-5)
+        shed = (radiance * (direction @ (position - point) / distance / pdf[:, 0])[:, None]).mean(axis=0)
+        np.testing.assert_allclose(shed, np.array([3.0, 2.0, 1.0]) / distance**2, rtol=1e-5)
+
+    @pytest.mark.parametrize("diameter", [0.53, 40.0])
+    def test_a_disc_in_the_sky(self, device, diameter):
+        """Its angle is that across all of it; together its directions shed its irradiance."""
+        light = DirectionalLight(direction=(0.6, 0.0, -0.8), irradiance=(3.0, 2.0, 1.0), angular_diameter=diameter)
+        direction, radiance, _, pdf = self.draw(light, (1.0, 2.0, 3.0), device)
+        np.testing.assert_allclose(pdf, 1.0 / (4.0 * np.pi * np.sin(np.radians(diameter) / 4.0) ** 2), rtol=1e-5)
+        shed = (radiance * (direction @ [-0.6, 0.0, 0.8] / pdf[:, 0])[:, None]).mean(axis=0)
+        np.testing.assert_allclose(shed, [3.0, 2.0, 1.0], rtol=1e-5)
 
 
 class TestVisibleNormals:
