@@ -239,7 +239,12 @@ def judged(mutant: Mutant, tree: Tree, reach: Reach, budget: float, passed: list
             if code not in (0, 5):
                 invalid = any(words in said for words in INVALID)
                 how = "failed" if code > 0 else "took too long" if code == -signal.SIGALRM else f"signal {-code}"
-                result |= {"verdict": "invalid" if invalid else "killed", "test": doing.read_text(), "how": how}
+                result |= {
+                    "verdict": "invalid" if invalid else "killed",
+                    "test": doing.read_text(),
+                    "how": how,
+                    "passed": [],
+                }
                 break
     finally:
         path.write_bytes(source)
@@ -329,7 +334,7 @@ def main() -> None:
             chosen[record["area"]].append(Mutant(**{name: record[name] for name in Mutant.__dataclass_fields__}))
             passed[key(record)] = record["passed"]
     else:
-        chosen = {area: mutants for area, mutants in drawn(ROOT, args.seed).items() if area in args.areas}
+        chosen = drawn(ROOT, args.seed, args.areas)
     args.out.mkdir(parents=True, exist_ok=True)
     queue = Queue(chosen, args.per_area, args.out / "results.jsonl")
     if args.dry_run:

@@ -1,6 +1,6 @@
 """Pytest plugin of `mutants`: which functions does a test reach, and which tests come first where a mutant is?
 
-With ``MUTANTS_RECORD`` it writes, for every test, its seconds and the functions that it entered, as ``file:first line``.
+With ``MUTANTS_RECORD`` it writes, for every test, its seconds and the functions that it entered, as ``file:line``.
 Functions of Warp never run as Python: they count as entered when a kernel is launched that can call them. With
 ``MUTANTS_PLAN`` it puts tests into an order and kills the process when a test takes too long.
 """
