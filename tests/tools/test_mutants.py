@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+
 from tools.mutants import Reach
 from tools.mutations import AREAS, Mutant, compiles, drawn, mutants_of
 
