@@ -39,6 +39,9 @@ ROOT = Path(__file__).parents[2]
 MAPPED = ("kernels", "schema", "converters")
 """Folders that are installed inside of ``beam_warp``."""
 
+READ = ("beam_warp", *MAPPED, "tests", "benchmarks", "docs")
+"""Folders that tests read."""
+
 COMPARES_TEXT = ("test_architecture.py", "test_docs.py", "test_english.py", "test_layers.py", "test_packaging.py")
 COMPARES_TEXT += ("stability/test_page.py", "kernels/test_cuda_compile.py", "tools/test_mutants.py")
 """Test files that look at sources and pages, or build: what they say of a mutant is no merit of the tests."""
@@ -48,8 +51,8 @@ READS_KERNELS = "tests/kernels/common/test_launching.py::test_kernels_with_atomi
 INVALID = ("Error while parsing function", "WarpCodegen", "Failed to load CPU module", "build failed")
 """What Warp says of a kernel that it cannot compile."""
 
-SLACK, TIMES = 60.0, 8.0
-"""A test may take this long [s], and this many times as long as without the mutant: kernels are compiled again."""
+TIMES, SLACK, COMPILING = 8.0, 60.0, 240.0
+"""A test may take so many times as long as without the mutant, and some seconds more: a lot if kernels are compiled."""
 
 
 @dataclass
@@ -63,12 +66,14 @@ class Tree:
     @classmethod
     def of_checkout(cls, folder: Path, kernels: Path) -> Tree:
         shutil.rmtree(folder, ignore_errors=True)
-        left = shutil.ignore_patterns(".*", "__pycache__", "build", "demo", "out", "chart", "*.egg-info")
-        shutil.copytree(ROOT, folder, ignore=left)
+        for name in READ:
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".*"))
+        for path in filter(Path.is_file, ROOT.iterdir()):
+            shutil.copy2(path, folder)
         for name in MAPPED:
             (folder / name).rename(folder / "beam_warp" / name)
             (folder / name).symlink_to(Path("beam_warp") / name)
-        compileall.compile_dir(folder, quiet=2)
+        compileall.compile_dir(folder, quiet=2, workers=0)
         kernels.mkdir(parents=True, exist_ok=True)
         return cls(folder, kernels)
 
@@ -185,8 +190,10 @@ def healthy(tree: Tree, names: list[str], work: Path, workers: int, stop: float)
     for path in sorted(tree.folder.rglob("*.py")):
         digest.update(path.read_bytes())
     known = work / "healthy.json"
-    if known.exists() and (found := json.loads(known.read_text()))["digest"] == digest.hexdigest():
-        return found["tests"]
+    if known.exists() and any(tree.kernels.iterdir()):
+        found = json.loads(known.read_text())
+        if found["digest"] == digest.hexdigest():
+            return found["tests"]
 
     def run(name: str) -> tuple[int, str]:
         scratch = work / "healthy" / name.replace("/", "_")
@@ -200,8 +207,8 @@ def healthy(tree: Tree, names: list[str], work: Path, workers: int, stop: float)
         print(*failed.values(), sep="\n", file=sys.stderr)
         sys.exit(f"tests must pass in time without mutants, got {', '.join(failed)}. Mend them, or try --without them.")
     tests: dict[str, Any] = {}
-    for path in (work / "healthy").glob("*.json"):
-        tests |= json.loads(path.read_text())
+    for name in names:
+        tests |= json.loads((work / "healthy" / name.replace("/", "_")).with_suffix(".json").read_text())
     known.write_text(json.dumps({"digest": digest.hexdigest(), "tests": tests}))
     return tests
 
@@ -218,16 +225,17 @@ def judged(mutant: Mutant, tree: Tree, reach: Reach, budget: float, passed: list
     result = {**asdict(mutant), "verdict": "survived", "test": None, "passed": passed + files, "left_out": left_out}
     path.write_bytes(mutant.applied(source))
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns + 10**12))  # compiled Python of equal size is not taken
+    slack = COMPILING if mutant.area == "kernels" else SLACK
     scratch = tree.folder.parent / "scratch"
     try:
         for group in filter(None, (files[:4], files[4:])):
             plan, doing = tree.folder.parent / "plan.json", tree.folder.parent / "doing"
-            limits = {test: SLACK + TIMES * found["seconds"] for test, found in reach.tests.items()}
+            limits = {test: slack + TIMES * found["seconds"] for test, found in reach.tests.items()}
             words = {
                 "files": group,
                 "first": sorted(first),
                 "limits": limits,
-                "longest": 5 * SLACK,
+                "longest": 2 * slack,
                 "doing": str(doing),
             }
             plan.write_text(json.dumps(words))
