@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tools.mutants import Reach
 from tools.mutations import AREAS, Mutant, compiles, drawn, mutants_of
+from tools.reach import Reach
 
 ROOT = Path(__file__).parents[2]
 
