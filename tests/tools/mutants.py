@@ -161,6 +161,8 @@ def main() -> None:
             print(f"{mutant.file}:{mutant.line}  {mutant.kind}  {mutant.before} -> {mutant.after}")
         return
 
+    git = ["git", "rev-parse", "HEAD"]
+    commit = args.commit or subprocess.run(git, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     base = Tree.of_checkout(args.work / "base", args.work / "kernels")
     paths = sorted((base.folder / "tests").rglob("test_*.py"), key=lambda path: -path.stat().st_size)
     names = [path.relative_to(base.folder / "tests").as_posix() for path in paths]
@@ -179,8 +181,6 @@ def main() -> None:
 
     with ThreadPoolExecutor(args.workers) as pool:
         list(pool.map(work, range(args.workers)))
-    git = ["git", "rev-parse", "HEAD"]
-    commit = args.commit or subprocess.run(git, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     found = summary(list(queue.known.values()), args.seed, commit.strip())
     (args.out / "mutants.json").write_text(json.dumps(found, indent=1))
     survivors = [record for record in found["mutants"] if record["verdict"] == "survived"]
