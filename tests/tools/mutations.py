@@ -107,11 +107,10 @@ class _Finder(ast.NodeVisitor):
                 self.replace(kind, place, place + len(token), other)
 
     def equal_kind(self, one: ast.expr, other: ast.expr) -> bool:
-        """Whether two arguments may be swapped: Warp says so itself, Python does not, so annotations must agree."""
-        if self.area == "kernels":
-            return isinstance(one, (ast.Name, ast.Attribute, ast.Subscript))
-        kind = self.kinds.get(self.text(one))
-        return kind is not None and kind == self.kinds.get(self.text(other))
+        """Whether two arguments may be swapped: of kinds that are not known, Warp refuses unequal ones itself."""
+        kinds = {self.kinds.get(self.text(argument)) for argument in (one, other)}
+        warp = self.area == "kernels" and isinstance(one, (ast.Name, ast.Attribute, ast.Subscript))
+        return warp if None in kinds else len(kinds) == 1
 
     # What is left as it is.
 
