@@ -189,7 +189,7 @@ class _Finder(ast.NodeVisitor):
         if is_number(node) and not isinstance(node.value, complex):
             value: int | float = node.value  # pyright: ignore[reportAssignmentType]
             step = 2 * value if isinstance(value, float) else value + 1
-            after = {0: 1, 1: 0}.get(value, step)
+            after = 1 - value if value in (0, 1) else step
             self.replace("constant", self.start(node), self.end(node), repr(type(value)(after)))
 
     def visit_Subscript(self, node: ast.Subscript) -> None:
