@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Name = TypeVar("Name", bound=Hashable)
 
@@ -63,10 +63,15 @@ class Times:
         return float(self.one_thread.min() / self.two_threads.min())
 
 
+def spread(values: ArrayLike) -> dict[str, float]:
+    """Return median and range over repeats."""
+    found = np.asarray(values, np.float64)
+    return {"median": float(np.median(found)), "lowest": float(found.min()), "highest": float(found.max())}
+
+
 def rates(seconds: NDArray[np.float64], count: int) -> dict[str, float]:
     """Return median and range over repeats of millions of items per second."""
-    found = count / seconds / 1e6
-    return {"median": float(np.median(found)), "lowest": float(found.min()), "highest": float(found.max())}
+    return spread(count / seconds / 1e6)
 
 
 @contextmanager
