@@ -114,7 +114,7 @@ def timed(way: Method, subject: Subject, repeats: int, warm: Subject) -> Row:
         rows = [way(subject) for _ in range(repeats)]
     rows.sort(key=lambda row: sum(row.seconds.values()))
     return {
-        "seconds": spread([sum(row.seconds.values()) for row in rows]),
+        "seconds": spread(np.array([sum(row.seconds.values()) for row in rows])),
         "stages": rows[len(rows) // 2].seconds,
         "views": len(subject.frames[0].views),
         **memory,

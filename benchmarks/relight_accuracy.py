@@ -264,7 +264,7 @@ def measure_light(bench: Bench, subject: RelitSubject, light: str, kept: dict[st
             {
                 "method": way.method,
                 "setting": way.setting,
-                "ms": spread(way.milliseconds),
+                "ms": spread(np.array(way.milliseconds)),
                 **scores(way.images, subject.truth[light]),
                 "against_path": scores(way.images, best.images) if way is not best else None,
             }

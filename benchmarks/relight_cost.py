@@ -185,4 +185,4 @@ def path_start_times(bench: Bench, shot: Shot) -> Row:
         following = replace(shot, cloud=cloud)
         times.append(1e3 * seconds_of(lambda s=following: renderer.start(s), bench.device))
     wp.synchronize_device(bench.device)
-    return spread(times)
+    return spread(np.array(times))

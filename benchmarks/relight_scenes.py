@@ -286,4 +286,8 @@ def frame_times(work: Callable[[], Any], effort: Effort, device: Any) -> Row:
 
     rows = np.array([1e3 * seconds_of(in_a_row, device) / effort.frames for _ in range(effort.repeats)])
     alone = [1e3 * seconds_of(work, device) for _ in range(effort.repeats if effort.frames > 1 else 0)]
-    return {"ms": spread(rows), "fps": spread(1e3 / rows), "latency_ms": spread(alone if alone else rows)}
+    return {
+        "ms": spread(rows),
+        "fps": spread(1e3 / rows),
+        "latency_ms": spread(np.array(alone)) if alone else spread(rows),
+    }
