@@ -15,7 +15,9 @@ from beam_warp.image.color import linear_to_srgb
 Row = Mapping[str, Any]
 
 COLORS = {"deferred": "C0", "path traced": "C1"}
-MARKERS = ("o", "s", "^", "D", "v", "P")
+MARKERS = ("o", "s", "^", "D", "v")
+LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (1, 4)))
+"""How each light is drawn."""
 
 SHOWN_LIGHT = "sunrise"
 """Light of the compared pictures, if it is there; else the last light is shown."""
@@ -40,7 +42,7 @@ def draw_speed(subjects: Mapping[str, Row], path: Path) -> None:
     )
     handles: dict[str, Any] = {}
     names = dict.fromkeys(light for subject in subjects.values() for light in subject["lights"])
-    lines_of = dict(zip(names, ("-", "--", ":", "-.", (0, (1, 4))), strict=False))
+    looks = dict(zip(names, zip(MARKERS, LINES, strict=True), strict=False))
     for axis, (name, subject) in zip(axes.flat, subjects.items(), strict=False):
         for number, (light, found) in enumerate(subject["lights"].items()):
             for method, color in COLORS.items():
@@ -48,10 +50,10 @@ def draw_speed(subjects: Mapping[str, Row], path: Path) -> None:
                 (handles[f"{method}, {light}"],) = axis.plot(
                     [row["ms"]["median"] for row in rows],
                     [row["psnr"] for row in rows],
-                    marker=MARKERS[number % len(MARKERS)],
+                    marker=looks[light][0],
                     markersize=4,
                     color=color,
-                    linestyle=lines_of[light],
+                    linestyle=looks[light][1],
                     label=f"{method}, {light}",
                 )
                 for row in rows if number == 0 else ():

@@ -24,11 +24,16 @@ def rate(times: Row) -> str:
     return f"{cell(times['ms'], '.2f')} ms, {cell(times['fps']['median'], '.0f')} FPS"
 
 
+def percent(share: float) -> str:
+    """Return a share in per cent."""
+    return f"{100.0 * share:.0f} %"
+
+
 def described(part: Row) -> str:
     """Return what was drawn, in words."""
     covered = next(iter(part["cases"].values()))["covered"]
     width, height = part["size"]
-    return f"{part['gaussians']:,} Gaussians, {width} × {height}, {covered:.0%} covered"
+    return f"{part['gaussians']:,} Gaussians, {width} × {height}, {percent(covered)} covered"
 
 
 @table("relight_deferred", SPEED)
@@ -58,7 +63,7 @@ def path(result: Row) -> Rows:
     ]
     for name, row in part["cases"].items():
         rates = [cell(row[key], factor=1e-6) for key in ("covered_samples_per_second", "samples_per_second")]
-        rows.append((name, *rates, f"{row['covered']:.0%}"))
+        rows.append((name, *rates, percent(row["covered"])))
     return rows
 
 
@@ -170,16 +175,7 @@ def results_speed(result: Row) -> Rows:
 def results_accuracy(true: Row, evaluated: Row) -> Rows:
     """How near relit images come: PSNR [dB] with true materials, and of decomposed captures."""
     paths = evaluated["evaluation"]["paths"]
-    rows: list[Sequence[Any]] = [
-        (
-            "PSNR [dB]",
-            "light",
-            "true materials: deferred",
-            "path traced, most samples",
-            "decomposed: deferred",
-            f"path traced, {paths} samples",
-        )
-    ]
+    rows: list[Sequence[Any]] = []
     for name, capture in evaluated["evaluation"]["captures"].items():
         direct = capture["ways"]["direct"]["mean"]["relit"]
         lights: Mapping[str, Row] = true["accuracy"]["subjects"][name]["lights"]
@@ -187,7 +183,11 @@ def results_accuracy(true: Row, evaluated: Row) -> Rows:
             usual, most = shown(found["rows"])[-2:]
             scores = [usual["psnr"], most["psnr"], *(direct[way][light]["psnr"] for way in ("deferred", "path"))]
             rows.append((name, light, *(f"{score:.1f}" for score in scores)))
-    return rows
+    true_ways = (f"true materials: {way['method']}, {way['setting']}" for way in (usual, most))
+    return [
+        ("PSNR [dB]", "light", *true_ways, f"decomposed: deferred, {USUAL}", f"path traced, {paths} samples"),
+        *rows,
+    ]
 
 
 @figure("relight_speed_accuracy.png", ACCURACY)
