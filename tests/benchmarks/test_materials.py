@@ -16,8 +16,10 @@ from materials_cost import Scale, drawn_views
 from materials_evaluation import WAYS, best_constant, frames_of, score_of, statistics, true_roughness
 from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference
 from parts import measure
+from scipy.spatial import cKDTree
 
 from beam_warp.capture.matching import match_frames
+from beam_warp.demo.figure import build_figure
 from beam_warp.device.arrays import resolve_device
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions
@@ -162,8 +164,11 @@ class TestRoughness:
         records = tiny_capture.select(split="test", frames=[0])
         truth, known = true_roughness(perfect.cloud, records, SHARP, "cpu")
         assert 0.1 < known.mean() < 1.0
-        # colours solved from the same views: another way to the same values
-        assert np.median(np.abs(truth - perfect.true_roughness("cpu"))[known]) < 0.03
+        figure = build_figure(0.02).at(0.0)
+        exact = figure.roughness[cKDTree(figure.vertices).query(perfect.cloud.positions)[1]]
+        # Gaussians some pixels wide blur parts into each other; a constant would be off by the spread of the parts
+        spread = np.abs(exact - np.median(exact))[known].mean()
+        assert np.abs(truth - exact)[known].mean() < 0.5 * spread
 
     def test_best_constant_beats_the_others(self, perfect, tiny_capture):
         records = tiny_capture.select(split="test", frames=[0])
