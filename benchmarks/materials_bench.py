@@ -49,7 +49,7 @@ class Effort:
     samples: int = 2
     frames: int = 6
     evaluated_frames: int = 2
-    paths: int = 128
+    paths: int = 256
     high: int = 512
     scale: Scale = field(default_factory=Scale)
     fitting: Any = None

@@ -45,7 +45,7 @@ class Scale:
     views: int = 81
     size: tuple[int, int] = (3840, 2160)
     repeats: int = 3
-    few_views: int = 3
+    few_views: int = 2
 
 
 def figure(capture: Capture, count: int, device: Any) -> GaussianCloud:

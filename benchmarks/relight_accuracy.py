@@ -121,7 +121,7 @@ def warm_up(bench: Bench) -> None:
     device = str(bench.device)
     PathRenderer(PathOptions(samples=1), device=device).draw(shot)
     for count in sorted({min(bench.effort.scored_shadows), max(bench.effort.scored_shadows)}):
-        deferred_renderer(bench, count, SHARP).frame(shot).launch()
+        DeferredRenderer(bench.deferred_options(count, side=bench.effort.side), device=device).frame(shot).launch()
 
 
 def subjects(bench: Bench) -> Iterator[RelitSubject]:
@@ -248,8 +248,9 @@ def materials_at(mesh: MaterialMesh, points: NDArray[np.float32]) -> tuple[NDArr
 def measure_light(bench: Bench, subject: RelitSubject, light: str, kept: dict[str, NDArray[Any]]) -> Row:
     """Return a row of every way under one light; images of the first camera go to ``kept``."""
     reference, rendered = path_traced(bench, subject, light)
+    prepared = PreparedEnvironment(subject.lights[light], bench.device)
     for count in bench.effort.scored_shadows:
-        rendered.append(deferred(bench, subject, light, count))
+        rendered.append(deferred(bench, subject, light, count, prepared))
     best = max((r for r in rendered if r.method == "path traced"), key=lambda r: int(r.setting.split()[0]))
     usual = DeferredOptions().environment_shadows
     shown = min((r for r in rendered if r.method == "deferred"), key=lambda r: abs(int(r.setting.split()[-1]) - usual))
@@ -304,15 +305,10 @@ def known_of(progress: PathProgress) -> Known:
     return Known(image.rgb, image.alpha)
 
 
-def deferred_renderer(bench: Bench, count: int, raster: RasterOptions) -> DeferredRenderer:
-    """Return a renderer with so many shadow maps of the environment."""
-    options = bench.deferred_options(count, side=bench.effort.side)
-    return DeferredRenderer(options, raster=raster, device=str(bench.device))
-
-
-def deferred(bench: Bench, subject: RelitSubject, light: str, count: int) -> Rendered:
+def deferred(bench: Bench, subject: RelitSubject, light: str, count: int, prepared: PreparedEnvironment) -> Rendered:
     """Return deferred images, each timed with all shadow maps drawn again."""
-    renderer = deferred_renderer(bench, count, subject.raster)
+    options = bench.deferred_options(count, side=bench.effort.side)
+    renderer = DeferredRenderer(options, raster=subject.raster, device=str(bench.device), prepared=[prepared])
     images, spent = [], []
     for camera in subject.cameras:
         frame = renderer.frame(shot_of(subject, light, camera))

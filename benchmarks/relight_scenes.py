@@ -85,7 +85,7 @@ class Effort:
         (32, 2),
         (64, 2),
     )
-    levels: tuple[int, ...] = (16, 64, 256, 1024)
+    levels: tuple[int, ...] = (4, 16, 64, 256)
     level_seconds: float = 5.0
     demo_size: tuple[int, int] = (240, 360)
     demo_spacing: float = 0.011
