@@ -54,8 +54,6 @@ WAYS: Mapping[str, Mapping[str, Any]] = {
 }
 """What decomposes, as `beam decompose` does without options and with ``--preset paper``, whose roughness is 0.5."""
 
-SHOWN_VIEWS = 2
-
 CONSTANTS = np.arange(0.3, 0.901, 0.05)
 """Roughnesses of which the best is what knowing nothing but one number would give."""
 
@@ -141,7 +139,7 @@ def evaluate(bench: Bench, name: str, sequence: GaussianSequence, way: str, opti
     shown: list[ScoredView] = []
 
     def observe(view: ScoredView) -> None:
-        if len(shown) < SHOWN_VIEWS:
+        if not shown:
             shown.append(view)
 
     relighters: dict[str, Relighter] = {

@@ -10,6 +10,9 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
+SHEET_WIDTH = 1900
+"""Width of pictures of materials [pixel]."""
+
 GROUPS = {"ladder": "C0", "one idea taken away": "C2", "image path": "C1"}
 
 
@@ -104,11 +107,13 @@ def draw_cost(part: Row, path: Path) -> None:
 
 
 def draw_sheet(sheet: Path, path: Path) -> None:
-    """Write a sheet that the evaluation drew, with a palette: it lies in the repository."""
+    """Write a sheet that the evaluation drew, smaller and with a palette: it lies in the repository."""
     from PIL import Image
 
     with Image.open(sheet) as picture:
-        picture.convert("RGB").quantize(256).save(path, optimize=True)
+        small = picture.convert("RGB")
+        small.thumbnail((SHEET_WIDTH, small.height))
+        small.quantize(128).save(path, optimize=True)
 
 
 def _bars(axes: Any, labels: Sequence[str], values: Sequence[float], colors: Sequence[str]) -> None:
