@@ -10,9 +10,10 @@ occlusion, base colour with and without the bounce; ``cost`` times both paths on
 3840 x 2160 that lie in memory decoded, and how that grows: it is the only part whose seconds count, and must run alone.
 ``--quick`` is the demo's capture, small: does all of it run?
 
-Reconstructions are given with ``--assets NAME=PATH``, or made here (``--gaussians``). ``--keep DIR`` keeps what the
-direct path makes as DIR/NAME/asset.usda, for relight.py to relight; ``--pictures DIR`` gets a sheet of it. Writes the
-JSON after every row, so that a kill loses little. A part that fails says so in its place; the program returns 1 then.
+Reconstructions are given with ``--assets DIR``, as reconstruction.py ``--keep`` writes them, or made here
+(``--gaussians``). ``--keep DIR`` keeps what the direct path makes as DIR/NAME/asset.usda, for relight.py to relight;
+``--pictures DIR`` gets a sheet of it. Writes the JSON after every row, so that a kill loses little. A part that fails
+says so in its place; the program returns 1 then.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def main() -> int:
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], help="names there")
-    parser.add_argument("--assets", nargs="*", default=[], metavar="NAME=PATH", help="reconstructions of captures")
+    parser.add_argument("--assets", type=Path, metavar="DIR", help="reconstructions, NAME/gaussians.usda")
     parser.add_argument("--gaussians", type=int, default=140_000, help="of reconstructions that are made here")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="the direct path's assets, DIR/NAME/asset.usda")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="evaluated assets as materials_NAME.png")
@@ -133,7 +134,7 @@ def main() -> int:
             bench = Bench(
                 captures={name: Capture.read(arguments.data / "captures" / name) for name in arguments.captures},
                 lights=read_lights(arguments.data),
-                assets={name: Path(path) for name, path in (word.split("=", 1) for word in arguments.assets)},
+                assets=arguments.assets,
                 effort=replace(FULL, gaussians=arguments.gaussians),
                 device=device,
                 folder=Path(folder),

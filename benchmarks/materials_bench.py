@@ -82,7 +82,7 @@ class Bench:
     Attributes:
         captures: With truth, by name.
         lights: Environments by name.
-        assets: Reconstructions by the name of their capture; what is missing is made.
+        assets: Folder of reconstructions, NAME/gaussians.usda; what is missing there is made.
         effort: How much is measured.
         device: Where.
         folder: For what is made on the way.
@@ -93,7 +93,7 @@ class Bench:
 
     captures: Mapping[str, Capture]
     lights: Mapping[str, EnvironmentMap]
-    assets: Mapping[str, Path]
+    assets: Path | None
     effort: Effort
     device: Any
     folder: Path
@@ -131,4 +131,4 @@ def bench_of_capture(capture: Capture, folder: Path, device: Any, say: Callable[
     """Return a quick bench of one capture."""
     assert capture.environment_path is not None
     lights = {"its own": EnvironmentMap.read(capture.environment_path)}
-    return Bench({"demo": capture}, lights, {}, QUICK, device, folder, say)
+    return Bench({"demo": capture}, lights, None, QUICK, device, folder, say)

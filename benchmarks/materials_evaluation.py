@@ -63,9 +63,8 @@ LEAST_PIXELS = 0.1
 
 def reconstruction(bench: Bench, name: str) -> GaussianSequence:
     """Return a reconstruction that was given, or make one; a second time it is read."""
-    if name in bench.assets:
-        path = bench.assets[name]
-        return converters.read(path / "gaussians.usda" if (path / "gaussians.usda").exists() else path)
+    if bench.assets is not None and (bench.assets / name / "gaussians.usda").exists():
+        return converters.read(bench.assets / name / "gaussians.usda")
     effort, capture = bench.effort, bench.captures[name]
     fitting = FitOptions.of_preset("fast", gaussian_count=effort.gaussians, **(effort.fitting or {}))
     steps = FitAndTrack(fitting=fitting, device=str(bench.device))
