@@ -102,7 +102,7 @@ def _three(row: Row) -> str | None:
 
 @table("materials_ladder", ABLATION)
 def ladder(result: Row) -> Rows:
-    """From the paper's recipe to ours, one idea after the other."""
+    """The way from the paper's recipe to ours, one idea after the other."""
     return compared(result, ["ladder"])
 
 
