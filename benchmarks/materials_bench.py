@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from materials_cost import Scale
-from materials_truth import Materials, TruthViews
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
+from beam_warp.demo.lights import sunset
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.world.environment import EnvironmentMap
-
-TARGETS = {
-    "perfect": {
-        "ambient_occlusion_psnr": 40.0,
-        "irradiance_relative_rmse": 0.035,
-        "base_color_psnr_with_bounce": 35.0,
-        "base_color_psnr_direct_only": [31.0, 33.0],
-    },
-    "reconstructed": {
-        "ambient_occlusion": [30.0, 0.95],
-        "base_color": [26.0, 0.93],
-        "scale": [0.97, 1.03],
-        "relit": [30.0, 0.94],
-    },
-}
 
 LIGHTS = ("studio", "sunrise", "apartment", "night", "workshop")
 
@@ -39,6 +23,7 @@ class Effort:
     """Effort of the benchmark.
 
     Attributes:
+        gaussians: Of reconstructions that are made here.
         perfect_gaussians: On the true surface.
         light_points: Points at which light is compared.
         light_rays: Rays that are judged.
@@ -46,13 +31,15 @@ class Effort:
         perfect_rays: Rays a Gaussian of the perfect geometry's materials.
         perfect_samples: Side of the square of samples of its drawn pixels.
         samples: The same of reconstructions.
-        frames: Most frames of an ablation.
+        frames: Most frames of a reconstruction.
+        evaluated_frames: Frames that are evaluated, those with truth first.
+        paths: Of a pixel of relit images that are path traced.
         high: Rays a pixel of the image path where there are many.
-        adam_steps: Of the image path's other solver.
         scale: Of the cost.
         fitting: Changes of the reconstruction's defaults.
     """
 
+    gaussians: int = 140_000
     perfect_gaussians: int = 140_000
     light_points: int = 4096
     light_rays: int = 64
@@ -61,8 +48,9 @@ class Effort:
     perfect_samples: int = 4
     samples: int = 2
     frames: int = 6
+    evaluated_frames: int = 2
+    paths: int = 256
     high: int = 512
-    adam_steps: int = 5000
     scale: Scale = field(default_factory=Scale)
     fitting: Any = None
 
@@ -70,6 +58,7 @@ class Effort:
 FULL = Effort()
 
 QUICK = Effort(
+    gaussians=600,
     perfect_gaussians=1500,
     light_points=32,
     light_rays=16,
@@ -78,18 +67,10 @@ QUICK = Effort(
     perfect_samples=2,
     samples=1,
     frames=2,
+    evaluated_frames=1,
+    paths=4,
     high=16,
-    adam_steps=8,
-    scale=Scale(
-        gaussians=400,
-        views=3,
-        size=(48, 32),
-        repeats=1,
-        counts=(200, 400),
-        view_counts=(1, 2),
-        ray_counts=(8, 16),
-        series_views=2,
-    ),
+    scale=Scale(gaussians=400, views=3, size=(48, 32), repeats=1, few_views=1),
     fitting={"color_iterations": 30, "normal_iterations": 30},
 )
 
@@ -101,36 +82,29 @@ class Bench:
     Attributes:
         captures: With truth, by name.
         lights: Environments by name.
-        assets: Reconstructions by the name of their capture; what is missing is made.
-        gaussians: Of those that are made.
+        assets: Folder of reconstructions, NAME/gaussians.usda; what is missing there is made.
         effort: How much is measured.
         device: Where.
-        pictures: Folder of pictures; None for none.
+        folder: For what is made on the way.
         say: Hears what is being done.
+        keep: Folder for the assets of the direct path; None for those that nobody needs afterwards.
+        pictures: Folder for the pictures of them; None for none.
     """
 
     captures: Mapping[str, Capture]
     lights: Mapping[str, EnvironmentMap]
-    assets: Mapping[str, Path]
-    gaussians: int
+    assets: Path | None
     effort: Effort
     device: Any
-    pictures: Path | None
+    folder: Path
     say: Callable[[str], None]
+    keep: Path | None = None
+    pictures: Path | None = None
 
     def light_of(self, capture: Capture) -> PreparedEnvironment:
         """Return the light of a capture, prepared."""
         assert capture.environment_path is not None
         return PreparedEnvironment(EnvironmentMap.read(capture.environment_path), self.device)
-
-    def picture(self, truth: TruthViews, cloud: Any, found: Materials | None, *words: str) -> str | None:
-        """Write a row's picture; returns its file's name."""
-        if self.pictures is None:
-            return None
-        self.pictures.mkdir(parents=True, exist_ok=True)
-        name = re.sub(r"[^a-z0-9]+", "_", " ".join(words).lower()).strip("_") + ".png"
-        truth.picture(cloud, found, self.pictures / name)
-        return name
 
 
 def read_lights(data: Path) -> dict[str, EnvironmentMap]:
@@ -141,13 +115,20 @@ def read_lights(data: Path) -> dict[str, EnvironmentMap]:
 def quick_bench(folder: Path, device: Any, say: Callable[[str], None]) -> Bench:
     """Return a bench that runs in no time, on the demo's capture and its own light."""
     capture = write_demo_capture(
-        folder / "demo", camera_count=6, test_camera_count=1, size=64, samples=4, frame_count=2, device=str(device)
+        folder / "demo",
+        camera_count=6,
+        test_camera_count=1,
+        size=64,
+        samples=4,
+        frame_count=2,
+        relit={"sunset": sunset()},
+        device=str(device),
     )
-    return bench_of_capture(capture, device, say)
+    return bench_of_capture(capture, folder, device, say)
 
 
-def bench_of_capture(capture: Capture, device: Any, say: Callable[[str], None]) -> Bench:
+def bench_of_capture(capture: Capture, folder: Path, device: Any, say: Callable[[str], None]) -> Bench:
     """Return a quick bench of one capture."""
     assert capture.environment_path is not None
     lights = {"its own": EnvironmentMap.read(capture.environment_path)}
-    return Bench({"demo": capture}, lights, {}, 600, QUICK, device, None, say)
+    return Bench({"demo": capture}, lights, None, QUICK, device, folder, say)

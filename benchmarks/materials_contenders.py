@@ -23,6 +23,7 @@ from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_m
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.materials.normals import SurfacePoints
+from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
 from beam_warp.raster.records import RasterOptions
 from beam_warp.study.materials import without_color
 from beam_warp.trace.scene import Scene
@@ -101,16 +102,18 @@ class Choices:
         offset: Lift of ray origins.
         observed: Fitted radiance plus the image's difference spread back, or images spread back as they are.
         joint: Whether all frames are fitted at once.
+        roughness: Whether roughness is found, in the first frame; else it is the subject's.
     """
 
     materials: MaterialOptions = field(default_factory=MaterialOptions)
     offset: float | Literal["auto"] = "auto"
     observed: Literal["difference", "images"] = "difference"
     joint: bool = True
+    roughness: bool = False
 
     def but(self, **changes: Any) -> Choices:
         """Return other choices; those of `MaterialOptions` by their names as well."""
-        own = {name: changes.pop(name) for name in ("offset", "observed", "joint") if name in changes}
+        own = {name: changes.pop(name) for name in ("offset", "observed", "joint", "roughness") if name in changes}
         return replace(self, materials=replace(self.materials, **changes), **own)
 
 
@@ -135,6 +138,7 @@ def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
         raise Unavailable("a joint fit needs two frames of the same Gaussians")
     joint: ColorEvidence | None = None
     first: Any = None
+    rough = subject.rough(frames[0].cloud)
     for frame in frames:
         cloud = frame.cloud
         with stages("upload and build"):
@@ -145,16 +149,15 @@ def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
             seen = view_evidence(shown, cameras, frame.views, options=subject.raster, device=device)
         with stages("surface"):
             points = SurfacePoints.seen_by(cloud, seen, scene, choices.offset)
+        if choices.roughness and first is None:
+            with stages("roughness"):
+                profile = measure_roughness_profile(
+                    cloud, scene, points, subject.light, seen, options=choices.materials, frame=frame.number
+                )
+                rough = solve_roughness(cloud.positions, profile).roughness
         with stages("materials"):
             measured = measure_materials(
-                cloud,
-                scene,
-                points,
-                subject.rough(cloud),
-                subject.light,
-                options=choices.materials,
-                views=seen,
-                frame=frame.number,
+                cloud, scene, points, rough, subject.light, options=choices.materials, views=seen, frame=frame.number
             )
         joint = measured.evidence if joint is None else joint + measured.evidence
         if first is None:
@@ -171,7 +174,7 @@ def direct(subject: Subject, choices: Choices = OURS) -> Decomposed:
             measured.ambient_occlusion_error[:, None],
             ~points.seen,
         )
-    materials = Materials(solved.base_color, openness[:, 0].astype(np.float32), subject.rough(cloud), up)
+    materials = Materials(solved.base_color, openness[:, 0].astype(np.float32), rough, up)
     return Decomposed(materials, stages.seconds, len(frames))
 
 
@@ -192,8 +195,9 @@ def seen_normals(subject: Subject) -> NDArray[np.float32]:
     return normals_of(frame.cloud, SurfacePoints.seen_by(frame.cloud, seen, scene, 0.0))
 
 
-def by_images(subject: Subject, **options: Any) -> Decomposed:
-    """Decompose by the image path; without options, the paper's preset."""
+def by_images(subject: Subject, **changes: Any) -> Decomposed:
+    """Decompose by the image path; without changes, the paper's preset with the bilateral filter."""
+    options = {"denoiser": "bilateral", **changes}
     frame = subject.frames[0]
     stages = StageTimer(subject.device)
     with stages("upload and build"):
@@ -222,15 +226,14 @@ class AblationRow:
     warm: Method
 
 
-def ablation_rows(high: int = 512, low: int = 8, steps: int = 5000) -> list[AblationRow]:
+def ablation_rows(high: int = 512, low: int = 8) -> list[AblationRow]:
     """Return all rows.
 
     Args:
         high: Rays a pixel for occlusion, half of those for light, where the image path has many.
         low: The same where it has few.
-        steps: Of Adam.
     """
-    paper = _image("ladder", "paper: image path, .02 m, 50 + 100 iid rays", {})
+    paper = _image("ladder", "paper: image path, 2 cm, 50 + 100 iid rays", {})
     choices = DIRECT_AS_PAPER
     rows = [paper, _direct("ladder", "baked directly, iid rays by the cosine, images spread back", choices)]
     for name, changes in (
@@ -249,8 +252,8 @@ def ablation_rows(high: int = 512, low: int = 8, steps: int = 5000) -> list[Abla
     for name, changes in (
         ("ours, one frame", {}),
         ("offset 0", {"offset": 0.0}),
-        ("offset .02 m", {"offset": 0.02}),
-        ("offset .1 m", {"offset": 0.1}),
+        ("offset 2 cm", {"offset": 0.02}),
+        ("offset 10 cm", {"offset": 0.1}),
         ("iid for Owen", {"sampler": "iid"}),
         ("cosine for product and ratio", {"density": "cosine", "ratio": False}),
         ("product without ratio", {"ratio": False}),
@@ -264,10 +267,9 @@ def ablation_rows(high: int = 512, low: int = 8, steps: int = 5000) -> list[Abla
         rows.append(_direct("one idea taken away", name, alone.but(**changes)))
     for name, options in (
         ("offset 0", {"offset": 0.0}),
-        ("offset .02 m", {}),
-        ("offset .1 m", {"offset": 0.1}),
+        ("offset 2 cm", {}),
+        ("offset 10 cm", {"offset": 0.1}),
         ("points at the median depth", {"surface_depth": "median"}),
-        (f"baked by {steps} steps of Adam", {"solver": "adam", "steps": steps}),
         ("albedo scaling", {"diffuse_weight": "albedo_scaling"}),
         (f"{low} + {2 * low} rays", {"occlusion_samples": low, "light_samples": 2 * low, "denoiser": "none"}),
         (f"{low} + {2 * low} rays, denoised", {"occlusion_samples": low, "light_samples": 2 * low}),
@@ -287,7 +289,7 @@ def _direct(group: str, name: str, choices: Choices) -> AblationRow:
 
 
 def _image(group: str, name: str, options: dict[str, Any]) -> AblationRow:
-    less = {"occlusion_samples": 4, "light_samples": 8, **({"steps": 4} if "steps" in options else {})}
+    less = {"occlusion_samples": 4, "light_samples": 8}
     return AblationRow(
         group,
         name,

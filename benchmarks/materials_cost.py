@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
-from materials_contenders import OURS, Decomposed, Method, Subject, SubjectFrame, by_images, direct
-from materials_truth import SHARP, Row
+from materials_contenders import OURS, Method, Subject, SubjectFrame, by_images, direct
+from materials_truth import SHARP
+from parts import Row
+from timing import spread
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.demo.capture import dome_cameras
-from beam_warp.jobs.progress import StageTimer
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.images import crop_to_subject
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.reconstruction.scores import read_truth_mesh
@@ -27,10 +27,6 @@ from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
 from beam_warp.trace.denoise import chosen_denoiser
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
-
-PAPER = {"gaussians": 140_000, "views": 81, "width": 3840, "height": 2160, "seconds": 240.0, "device": "RTX 3090"}
-
-TARGETS = {"direct": 2.0, "image path": 20.0, "peak_bytes": 16 * 2**30}
 
 
 @dataclass(frozen=True)
@@ -41,21 +37,15 @@ class Scale:
         gaussians: Of the figure.
         views: Cameras around it.
         size: Width and height of their images.
-        repeats: Timed runs of the direct path on the whole; the fastest counts.
-        counts: Gaussians of the series over them.
-        view_counts: Views of the series over them, of the same images.
-        ray_counts: Rays a Gaussian, or a pixel's occlusion, of the series over them.
-        series_views: Views of the series that do not vary them.
+        repeats: Timed runs of every way.
+        few_views: Of those on which Open Image Denoise is compared, which denoises on the CPU.
     """
 
     gaussians: int = 140_000
     views: int = 81
     size: tuple[int, int] = (3840, 2160)
     repeats: int = 3
-    counts: tuple[int, ...] = (35_000, 70_000, 140_000, 280_000)
-    view_counts: tuple[int, ...] = (5, 10, 20, 40)
-    ray_counts: tuple[int, ...] = (16, 32, 64, 128, 256)
-    series_views: int = 10
+    few_views: int = 2
 
 
 def figure(capture: Capture, count: int, device: Any) -> GaussianCloud:
@@ -91,9 +81,8 @@ def drawn_views(cloud: GaussianCloud, cameras: Sequence[Camera], device: Any) ->
 def measure_cost(
     capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any, say: Callable[[str], None]
 ) -> Iterable[tuple[str, Row]]:
-    """Yield the whole's rows and three series, each as soon as it is measured."""
-    clouds = {count: figure(capture, count, device) for count in sorted({scale.gaussians, *scale.counts})}
-    cloud = clouds[scale.gaussians]
+    """Yield the scene and what each way costs on it, each as soon as it is measured."""
+    cloud = figure(capture, scale.gaussians, device)
     width, height = scale.size
     mesh = read_truth_mesh(capture, capture.frames[0])
     dome = dome_cameras([np.asarray(mesh.vertices)], scale.views, 0, width, height)
@@ -101,67 +90,33 @@ def measure_cost(
     views = drawn_views(cloud, [entry.camera for entry in dome], device)
     share = float(np.mean([(view.alpha > 0.0).mean() for view in views if view.alpha is not None]))
     whole = Subject("paper's scale", [SubjectFrame(0, cloud, views)], SHARP, light, device)
-    yield "scene", {"gaussians": scale.gaussians, "views": len(views), "size": [width, height], "covered": share}
-    small = whole.small()
-    ways: dict[str, Method] = {"direct": lambda s: direct(s, OURS.but(joint=False)), "image path": by_images}
-    others: dict[str, Method] = {"direct, views cut to the subject": cut_first}
+    few = replace(whole, frames=[SubjectFrame(0, cloud, views[: scale.few_views])])
+    yield "scene", {"gaussians": len(cloud), "views": len(views), "size": [width, height], "covered": share}
+    small, alone = whole.small(), OURS.but(joint=False)
+    ways: list[tuple[str, Subject, Method]] = [
+        ("direct, roughness given", whole, lambda s: direct(s, alone)),
+        ("direct, with roughness", whole, lambda s: direct(s, alone.but(roughness=True))),
+        ("paper, bilateral", whole, by_images),
+        ("paper, bilateral, few views", few, by_images),
+    ]
     if chosen_denoiser("auto") == "oidn":
-        others["image path, bilateral"] = lambda s: by_images(s, denoiser="bilateral")
-    others["image path, not denoised"] = lambda s: by_images(s, denoiser="none")
-    for name, way in (ways | others).items():
-        row = timed(way, whole, scale.repeats if name.startswith("direct") else 1, small)
-        target = TARGETS["direct" if name.startswith("direct") else "image path"]
-        row["target_seconds"] = target
-        row["reached"] = bool(row["seconds"] <= target)
-        if "peak_device_bytes" in row:
-            row["memory_reached"] = bool(row["peak_device_bytes"] <= TARGETS["peak_bytes"])
+        ways.append(("paper, OIDN, few views", few, lambda s: by_images(s, denoiser="oidn")))
+    for name, subject, way in ways:
+        row = timed(way, subject, scale.repeats, small)
         say(f"{name}: {described(row)}")
         yield name, row
-    few = replace(whole, frames=[SubjectFrame(0, cloud, views[: scale.series_views])])
-    series: dict[str, list[Row]] = {"gaussians": [], "views": [], "rays": []}
-    for name, way in ways.items():
-        for count in scale.counts:
-            subject = replace(few, frames=[SubjectFrame(0, clouds[count], few.frames[0].views)])
-            series["gaussians"].append({"way": name, "gaussians": count, **timed(way, subject, 1)})
-        for count in scale.view_counts:
-            subject = replace(whole, frames=[SubjectFrame(0, cloud, views[:count])])
-            series["views"].append({"way": name, "views": count, **timed(way, subject, 1)})
-        for count in scale.ray_counts:
-            series["rays"].append({"way": name, "rays": count, **timed(with_rays(name, count), few, 1)})
-        say(f"{name}: series over Gaussians, views and rays done")
-        yield "series", series
 
 
-def cut_first(subject: Subject) -> Decomposed:
-    """Cut views to the subject, then decompose by the direct path."""
-    stages = StageTimer(subject.device)
-    with stages("cut views"):
-        frames = [replace(frame, views=[crop_to_subject(view) for view in frame.views]) for frame in subject.frames]
-    found = direct(replace(subject, frames=frames), OURS.but(joint=False))
-    return replace(found, seconds={**stages.seconds, **found.seconds})
-
-
-def with_rays(way: str, count: int) -> Method:
-    """Return a way with another number of rays; the image path takes twice as many for light, as the paper does."""
-    if way == "direct":
-        return lambda subject: direct(subject, OURS.but(joint=False, sample_count=count))
-    return lambda subject: by_images(subject, occlusion_samples=count, light_samples=2 * count)
-
-
-def timed(way: Method, subject: Subject, repeats: int, warm: Subject | None = None) -> Row:
-    """Return seconds by stage of the fastest repeat, and the most memory of any; compiles on ``warm`` first."""
-    if warm is not None:
-        way(warm)
+def timed(way: Method, subject: Subject, repeats: int, warm: Subject) -> Row:
+    """Return seconds, those of the stages in the median repeat, and the most memory; compiles on ``warm`` first."""
+    way(warm)
     with peak_memory(subject.device) as memory:
         rows = [way(subject) for _ in range(repeats)]
-    totals = [sum(row.seconds.values()) for row in rows]
-    best = rows[int(np.argmin(totals))]
+    rows.sort(key=lambda row: sum(row.seconds.values()))
     return {
-        "seconds": min(totals),
-        "all_seconds": totals,
-        "stages": best.seconds,
+        "seconds": spread(np.array([sum(row.seconds.values()) for row in rows])),
+        "stages": rows[len(rows) // 2].seconds,
         "views": len(subject.frames[0].views),
-        "notes": list(best.notes),
         **memory,
     }
 
@@ -170,4 +125,4 @@ def described(row: Row) -> str:
     """Return a row in words."""
     stages = ", ".join(f"{stage} {seconds:.3f}" for stage, seconds in row["stages"].items())
     peak = f", {row['peak_device_bytes'] / 2**30:.2f} GiB" if "peak_device_bytes" in row else ""
-    return f"{row['seconds']:.3f} s ({stages}){peak}"
+    return f"{row['seconds']['median']:.3f} s ({stages}){peak}"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from materials_bench import TARGETS, Bench
-from materials_truth import SHARP, Materials, PerfectFrame, Row, TruthViews, light_errors, light_reference, row_of
+from materials_bench import Bench
+from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference, row_of
+from parts import Row
 
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
@@ -19,7 +19,7 @@ from beam_warp.reconstruction.scores import truth_frames
 
 def measure_perfect(bench: Bench) -> Iterator[Row]:
     """Yield what is known so far of materials on the true surface."""
-    result: Row = {"targets": TARGETS["perfect"], "captures": {}}
+    result: Row = {"captures": {}}
     for name, capture in bench.captures.items():
         frame = truth_frames(capture)[0]
         started = time.perf_counter()
@@ -32,13 +32,10 @@ def measure_perfect(bench: Bench) -> Iterator[Row]:
         row["irradiance"] = perfect_light(bench, perfect)
         yield result
         truth = TruthViews(capture, frame, SHARP, bench.effort.perfect_samples, str(bench.device))
-        row["truth_picture"] = bench.picture(truth, perfect.cloud, None, "perfect", name, "truth")
-        for entry in perfect_materials(bench, perfect, truth, name):
+        for entry in perfect_materials(bench, perfect, truth):
             row["rows"].append(entry)
             bench.say(f"{name}, {entry['name']}: {row_of(entry)}")
             yield result
-        row["reached"] = perfect_reached(row)
-        yield result
 
 
 def perfect_light(bench: Bench, perfect: PerfectFrame) -> Row:
@@ -76,14 +73,13 @@ def perfect_light(bench: Bench, perfect: PerfectFrame) -> Row:
     return found
 
 
-def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, name: str) -> Iterator[Row]:
+def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews) -> Iterator[Row]:
     """Yield scores with and without the bounce, at the true points and at those that views show."""
     light = bench.light_of(perfect.capture)
     rough = {"0.5": np.full(len(perfect.cloud), 0.5, np.float32), "true": perfect.true_roughness(bench.device)}
     spread = perfect.images_spread_back()
     for row in perfect_rows(bench.effort.perfect_rays):
-        points = perfect.points(row.offset, exact=row.exact)
-        started = time.perf_counter()
+        points = perfect.points(exact=row.exact)
         measured = measure_materials(
             perfect.cloud,
             perfect.scene,
@@ -96,7 +92,6 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, na
         solved = solve_base_color(
             perfect.cloud.with_arrays(normal_confidence=points.confidence), measured.evidence, light.mean_irradiance
         )
-        seconds = time.perf_counter() - started
         openness, _ = fill_from_neighbors(
             perfect.cloud.positions,
             measured.ambient_occlusion[:, None],
@@ -108,9 +103,7 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews, na
             "name": row.name,
             "points": "true" if row.exact else "seen",
             **{key: value for key, value in vars(row).items() if key != "exact"},
-            "seconds": seconds,
             **truth.score(perfect.cloud, found),
-            "picture": bench.picture(truth, perfect.cloud, found, "perfect", name, row.name),
         }
 
 
@@ -122,7 +115,6 @@ class PerfectRow:
     roughness: str = "true"
     rays: int = 64
     bounce: bool = True
-    offset: Any = "auto"
     observed: str = "difference"
 
     @property
@@ -130,8 +122,6 @@ class PerfectRow:
         """Name in tables."""
         words = [f"{'true' if self.exact else 'seen'} points", f"roughness {self.roughness}", f"{self.rays} rays"]
         words.append("with the bounce" if self.bounce else "direct only")
-        if self.offset != "auto":
-            words.append(f"offset {1000.0 * self.offset:g} mm")
         if self.observed != "difference":
             words.append("images spread back")
         return ", ".join(words)
@@ -144,34 +134,5 @@ def perfect_rows(rays: Sequence[int]) -> list[PerfectRow]:
         *(replace(row, bounce=bounce) for row in (default, replace(default, exact=False)) for bounce in (True, False)),
         replace(default, roughness="0.5"),
         replace(default, observed="images"),
-        *(replace(default, offset=offset) for offset in (0.001, 0.002, 0.02)),
         *(replace(default, rays=count) for count in rays[1:]),
     ]
-
-
-def perfect_reached(row: Row) -> Row:
-    """Return which targets are met: with the truth's coverage, since silhouettes are the Gaussians'."""
-
-    def first(bounce: bool) -> Row:
-        return next(r for r in row["rows"] if r["bounce"] is bounce and r["points"] == "true")
-
-    wanted = TARGETS["perfect"]
-    direct_only = first(False)["base_color"]["true_coverage_psnr"]
-    low, high = wanted["base_color_psnr_direct_only"]
-    # Phrased so that NaN fails.
-    return {
-        "ambient_occlusion": bool(
-            first(True)["ambient_occlusion"]["true_coverage_psnr"] >= wanted["ambient_occlusion_psnr"]
-        ),
-        **{
-            f"irradiance, {measure}": {
-                name: bool(light["ways"]["product, ratio, Owen"][measure] <= wanted["irradiance_relative_rmse"])
-                for name, light in row["irradiance"].items()
-            }
-            for measure in ("relative_rmse", "rmse_over_mean")
-        },
-        "base_color_with_bounce": bool(
-            first(True)["base_color"]["true_coverage_psnr"] >= wanted["base_color_psnr_with_bounce"]
-        ),
-        "direct_only_lands_where_expected": bool(low <= direct_only <= high),
-    }

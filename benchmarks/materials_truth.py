@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from parts import Row
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.views import CapturedView
 from beam_warp.evaluate.relighters import Relighter
-from beam_warp.image.color import linear_to_srgb
-from beam_warp.image.files import read_image, write_png
-from beam_warp.image.metrics import SOLID_ALPHA, Score, block_means, bounding_box, compare, mean_scores
+from beam_warp.image.files import read_image
+from beam_warp.image.metrics import SOLID_ALPHA, Score, block_means, compare, mean_scores
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfacePoints
@@ -31,8 +30,6 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.shot import Shot
-
-Row = dict[str, Any]
 
 SHARP = RasterOptions(antialiased=True, low_pass=0.1)
 """Drawing of Gaussians on the true surface: truth is filtered by a box, which samples of a pixel do."""
@@ -129,24 +126,6 @@ class TruthViews:
         if result:
             result["mean"] = {key: float(np.mean([row[key] for row in result.values()])) for key in ("psnr", "ssim")}
         return result
-
-    def picture(self, cloud: GaussianCloud, found: Materials | None, path: Path) -> None:
-        """Write ambient occlusion and base colour of the first view side by side; the truth's if nothing was found."""
-        truth = self._truths[0]
-        true_alpha = truth.channels["A"]
-        color, openness = truth.stack("base_color.R", "base_color.G", "base_color.B"), truth.stack("ambient_occlusion")
-        alpha = true_alpha
-        if found is not None:
-            camera = self.records[0].camera.supersampled(self.samples)
-            columns = np.concatenate([found.base_color, found.ambient_occlusion[:, None]], axis=1, dtype=np.float32)
-            drawn = rasterize_values(cloud, camera, columns, options=self.raster, device=self.device)
-            alpha = block_means(drawn.alpha, self.samples)
-            means = block_means(drawn.values, self.samples) / np.maximum(alpha, 1e-6)[..., None]
-            color, openness = means[..., :3], means[..., 3:]
-        box = bounding_box(true_alpha)
-        panels = [np.repeat(openness, 3, axis=-1), linear_to_srgb(np.clip(color, 0.0, 1.0))]
-        strip = np.concatenate([(panel * alpha[..., None])[box] for panel in panels], axis=1)
-        write_png(path, np.round(255.0 * np.clip(strip, 0.0, 1.0)).astype(np.uint8))
 
 
 def relightable(cloud: GaussianCloud, found: Materials) -> GaussianCloud:

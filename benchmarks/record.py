@@ -27,6 +27,8 @@ from beam_warp.jobs.report import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
+PICTURES = ROOT / "benchmarks" / "pictures"
+"""Images that a GPU run brought along (``--pictures``), of which figures are drawn; not kept."""
 
 MAPPED = ("kernels", "schema", "converters")
 """Packages that lie beside ``beam_warp`` in a checkout, and inside it where it is installed."""

@@ -1,7 +1,8 @@
 """How near relit images come to path-traced truth, and what each costs: deferred and path traced.
 
-Geometry is perfect, Gaussians on the true surface with the truth's materials, or that of a decomposed reconstruction.
-The demo figure's materials are known at every point, so that nothing but the renderer is in the way of its truth.
+Geometry is perfect: Gaussians on the true surface with the truth's materials. The demo figure's materials are known at
+every point, so that nothing but the renderer is in the way of its truth. Decomposed reconstructions are relit with more
+and fewer shadow maps and bounces; with the usual ones `materials_evaluation` relights them, in both ways.
 """
 
 from __future__ import annotations
@@ -9,22 +10,24 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from materials_truth import SHARP, true_cloud
 from numpy.typing import NDArray
-from relight_scenes import Bench, Row, seconds_of
+from parts import Row
+from relight_scenes import Bench, seconds_of
 from scipy.spatial import cKDTree
+from timing import spread
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.matching import match_frames
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
-from beam_warp.image.metrics import bounding_box, compare
+from beam_warp.image.metrics import as_compared, bounding_box, compare, psnr
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
@@ -38,10 +41,7 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.mesh import MaterialMesh
-from beam_warp.world.shot import Shot
-
-TARGET_PSNR = 36.0
-"""PSNR wanted of path traced images of perfect geometry against the truth [dB]."""
+from beam_warp.world.shot import RenderedImage, Shot
 
 DANCE_PHASE = 0.15
 """The moment of the demo figure's dance that is rendered."""
@@ -83,7 +83,7 @@ class RelitSubject:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One way's images of all cameras under a light, and what each took [ms]."""
+    """One way's images of all cameras under a light, and what one takes [ms], over cameras and repeats."""
 
     method: str
     setting: str
@@ -93,7 +93,8 @@ class Rendered:
 
 def measure_accuracy(bench: Bench) -> Iterator[Row]:
     """Yield scores so far of every subject under every light."""
-    result: Row = {"target_psnr": TARGET_PSNR, "side": bench.effort.side, "subjects": {}}
+    result: Row = {"side": bench.effort.side, "subjects": {}}
+    pictures: dict[str, NDArray[Any]] = {}
     warm_up(bench)
     for subject in subjects(bench):
         row: Row = {
@@ -103,14 +104,14 @@ def measure_accuracy(bench: Bench) -> Iterator[Row]:
             "lights": {},
         }
         result["subjects"][subject.name] = row
-        kept: dict[str, NDArray[Any]] = {}
         for light in subject.lights:
-            row["lights"][light] = found = measure_light(bench, subject, light, kept)
+            row["lights"][light] = found = measure_light(bench, subject, light, pictures)
             for entry in found["rows"]:
                 bench.say(f"{subject.name}, {light}, {described(entry)}")
             yield result
-        row["picture"] = keep_images(bench, subject.name, kept)
-        yield result
+        if bench.pictures is not None:
+            bench.pictures.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(bench.pictures / "relight.npz", **pictures)  # pyright: ignore[reportArgumentType]
 
 
 def warm_up(bench: Bench) -> None:
@@ -120,11 +121,11 @@ def warm_up(bench: Bench) -> None:
     device = str(bench.device)
     PathRenderer(PathOptions(samples=1), device=device).draw(shot)
     for count in sorted({min(bench.effort.scored_shadows), max(bench.effort.scored_shadows)}):
-        deferred_renderer(bench, count, SHARP).frame(shot).launch()
+        DeferredRenderer(bench.deferred_options(count, side=bench.effort.side), device=device).frame(shot).launch()
 
 
 def subjects(bench: Bench) -> Iterator[RelitSubject]:
-    """Yield the captures' perfect geometry, the demo figure, and the reconstructions that were given."""
+    """Yield the captures' perfect geometry, and the demo figure."""
     for name, capture in bench.captures.items():
         frame = truth_frames(capture)[0]
         started = time.perf_counter()
@@ -132,23 +133,50 @@ def subjects(bench: Bench) -> Iterator[RelitSubject]:
         bench.say(f"{name}: true materials of {len(cloud):,} Gaussians in {time.perf_counter() - started:.1f} s")
         yield captured_subject(name, capture, frame, cloud, SHARP, bench.effort.views)
     yield demo_subject(bench)
+
+
+def measure_shadows(bench: Bench) -> Iterator[Row]:
+    """Yield how near decomposed reconstructions come to the truth so far, by shadow maps and bounces; none is timed."""
+    if not bench.assets:
+        raise FileNotFoundError("assets must be given to be relit, got none. Make them with materials.py --keep.")
+    result: Row = {"side": bench.effort.side, "subjects": {}}
     for name, path in bench.assets.items():
-        if name in bench.captures:
-            capture = bench.captures[name]
-            sequence = converters.read(path)
-            matched = match_frames(sequence)
-            frame = next(frame for frame in truth_frames(capture) if frame in matched)
-            cloud = change_axes(sequence[matched[frame]], "rfu")
-            raster = RasterOptions.from_metadata(sequence.metadata)
-            yield captured_subject(f"{name}, decomposed", capture, frame, cloud, raster, bench.effort.views)
+        capture, sequence = bench.captures[name], converters.read(path)
+        matched = match_frames(sequence)
+        frame = next(frame for frame in truth_frames(capture) if frame in matched)
+        cloud = change_axes(sequence[matched[frame]], "rfu")
+        raster = RasterOptions.from_metadata(sequence.metadata)
+        subject = captured_subject(name, capture, frame, cloud, raster, views=None)
+        row: Row = {"gaussians": len(cloud), "views": len(subject.cameras), "lights": {}}
+        result["subjects"][name] = row
+        for light, truth in subject.truth.items():
+            prepared = [PreparedEnvironment(subject.lights[light], bench.device)]
+            row["lights"][light] = rows = []
+            for shadows, bounces in bench.effort.settings:
+                options = replace(bench.deferred_options(shadows, side=bench.effort.side), bounces=bounces)
+                renderer = DeferredRenderer(options, raster=raster, device=str(bench.device), prepared=prepared)
+                images = [renderer.draw(shot_of(subject, light, camera)) for camera in subject.cameras]
+                score = float(np.mean([box_psnr(*pair) for pair in zip(images, truth, strict=True)]))
+                rows.append({"shadows": shadows, "bounces": bounces, "psnr": score})
+            bench.say(f"{name}, {light}: {', '.join(format(entry['psnr'], '.2f') for entry in rows)}")
+            yield result
+
+
+def box_psnr(image: RenderedImage, known: Known) -> float:
+    """Return PSNR in the subject's box."""
+    pair = as_compared(
+        image.rgb, known.rgb, alpha=image.alpha, truth_alpha=known.alpha, is_color=True, premultiplied=True
+    )
+    return psnr(pair.image, pair.truth)
 
 
 def captured_subject(
-    name: str, capture: Capture, frame: int, cloud: GaussianCloud, raster: RasterOptions, views: int
+    name: str, capture: Capture, frame: int, cloud: GaussianCloud, raster: RasterOptions, views: int | None
 ) -> RelitSubject:
-    """Return Gaussians with a capture's truth under the lights that it has, of views far from each other."""
+    """Return Gaussians with a capture's truth under its lights: of so many views far from each other, or of all."""
     records = [r for r in capture.select(split="test", frames=[frame]) if r.truth_path is not None and r.relit_paths]
-    records = records[:: max(1, len(records) // views)][:views]
+    if views is not None:
+        records = records[:: max(1, len(records) // views)][:views]
     names = sorted(records[0].relit_paths)
     return RelitSubject(
         name,
@@ -220,15 +248,16 @@ def materials_at(mesh: MaterialMesh, points: NDArray[np.float32]) -> tuple[NDArr
 def measure_light(bench: Bench, subject: RelitSubject, light: str, kept: dict[str, NDArray[Any]]) -> Row:
     """Return a row of every way under one light; images of the first camera go to ``kept``."""
     reference, rendered = path_traced(bench, subject, light)
+    prepared = PreparedEnvironment(subject.lights[light], bench.device)
     for count in bench.effort.scored_shadows:
-        rendered.append(deferred(bench, subject, light, count))
+        rendered.append(deferred(bench, subject, light, count, prepared))
     best = max((r for r in rendered if r.method == "path traced"), key=lambda r: int(r.setting.split()[0]))
     usual = DeferredOptions().environment_shadows
     shown = min((r for r in rendered if r.method == "deferred"), key=lambda r: abs(int(r.setting.split()[-1]) - usual))
     known = subject.truth[light][0]
     box = bounding_box(known.alpha)
     for name, image in (("deferred", shown.images[0]), ("path", best.images[0]), ("truth", known)):
-        kept[f"{light}_{name}"] = image.rgb[box].astype(np.float16)
+        kept[f"{subject.name} {light} {name}"] = image.rgb[box].astype(np.float16)
     return {
         **reference,
         "shown": {"deferred": shown.setting, "path": best.setting},
@@ -236,7 +265,7 @@ def measure_light(bench: Bench, subject: RelitSubject, light: str, kept: dict[st
             {
                 "method": way.method,
                 "setting": way.setting,
-                "ms": float(np.mean(way.milliseconds)),
+                "ms": spread(np.array(way.milliseconds)),
                 **scores(way.images, subject.truth[light]),
                 "against_path": scores(way.images, best.images) if way is not best else None,
             }
@@ -276,22 +305,17 @@ def known_of(progress: PathProgress) -> Known:
     return Known(image.rgb, image.alpha)
 
 
-def deferred_renderer(bench: Bench, count: int, raster: RasterOptions) -> DeferredRenderer:
-    """Return a renderer with so many shadow maps of the environment."""
-    options = bench.deferred_options(count, side=bench.effort.side)
-    return DeferredRenderer(options, raster=raster, device=str(bench.device))
-
-
-def deferred(bench: Bench, subject: RelitSubject, light: str, count: int) -> Rendered:
+def deferred(bench: Bench, subject: RelitSubject, light: str, count: int, prepared: PreparedEnvironment) -> Rendered:
     """Return deferred images, each timed with all shadow maps drawn again."""
-    renderer = deferred_renderer(bench, count, subject.raster)
+    options = bench.deferred_options(count, side=bench.effort.side)
+    renderer = DeferredRenderer(options, raster=subject.raster, device=str(bench.device), prepared=[prepared])
     images, spent = [], []
     for camera in subject.cameras:
         frame = renderer.frame(shot_of(subject, light, camera))
         image = frame.image()
         images.append(Known(image.rgb, image.alpha))
         frame.launch()
-        spent.append(1e3 * min(seconds_of(frame.launch, bench.device) for _ in range(bench.effort.repeats)))
+        spent += [1e3 * seconds_of(frame.launch, bench.device) for _ in range(bench.effort.repeats)]
     return Rendered("deferred", f"N = {count}", images, spent)
 
 
@@ -320,19 +344,9 @@ def scores(images: Sequence[Known], truth: Sequence[Known]) -> Row:
     }
 
 
-def keep_images(bench: Bench, name: str, kept: Mapping[str, NDArray[Any]]) -> str | None:
-    """Write a subject's images, scene-linear half floats cut to the subject; returns the file's name."""
-    if bench.pictures is None:
-        return None
-    bench.pictures.mkdir(parents=True, exist_ok=True)
-    path = Path("relight_" + name.replace(", ", "_").replace(" ", "_") + ".npz")
-    np.savez_compressed(bench.pictures / path, **kept)
-    return str(path)
-
-
 def described(row: Row) -> str:
     """Return a row in words."""
     return (
         f"{row['method']}, {row['setting']}: {row['psnr']:.2f} dB / {row['ssim']:.4f}, solid {row['solid_psnr']:.2f}, "
-        f"true coverage {row['true_coverage_psnr']:.2f}, {row['ms']:.2f} ms"
+        f"true coverage {row['true_coverage_psnr']:.2f}, {row['ms']['median']:.2f} ms"
     )

@@ -1,4 +1,8 @@
-"""Whether renderers keep the light: white things in a white furnace, and few samples against many."""
+"""Whether renderers keep the light: white things in a white furnace, and few samples against many.
+
+The second compares the path tracer with itself: a bias that all numbers of samples share stays unseen. What does not
+depend on it is the furnace, a closed form, and the tracer of meshes that `relight_accuracy` takes as the truth.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,8 @@ import raster_scenes
 import scipy.stats
 import trimesh
 from numpy.typing import NDArray
-from relight_scenes import LAMPS, Bench, Row, ground
+from parts import Row
+from relight_scenes import LAMPS, Bench, ground
 
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
@@ -22,7 +27,6 @@ from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import Renderer, Shot
 
 ROUGHNESS = (0.03, 0.1, 0.3, 0.6, 1.0)
-TARGET_ERROR = 0.01
 
 WHITE = EnvironmentMap.constant((1.0, 1.0, 1.0))
 
@@ -50,7 +54,7 @@ def measure_furnace(bench: Bench) -> Iterator[Row]:
         "deferred, no shadow maps": DeferredRenderer(bench.deferred_options(0), device=device),
         f"deferred, N = {usual}": DeferredRenderer(bench.deferred_options(usual), device=device),
     }
-    result: Row = {"target": TARGET_ERROR, "samples": effort.furnace_samples, "rows": []}
+    result: Row = {"samples": effort.furnace_samples, "rows": []}
     for shape, shot in (("plane", white_plane(effort.furnace_size)), ("ball", white_ball(bench))):
         for name, renderer in renderers.items():
             for roughness in ROUGHNESS:
@@ -67,7 +71,6 @@ def measure_furnace(bench: Bench) -> Iterator[Row]:
                     "standard_error": float(sent.std() / np.sqrt(max(len(sent), 1))),
                     "largest_error": float(np.abs(sent - 1.0).max()),
                 }
-                row["reached"] = bool(abs(row["mean_error"]) <= TARGET_ERROR)
                 result["rows"].append(row)
             errors = [f"{100.0 * row['mean_error']:+.2f} %" for row in result["rows"][-len(ROUGHNESS) :]]
             bench.say(f"{shape}, {name}: {', '.join(errors)}")
@@ -108,7 +111,7 @@ def white(cloud: GaussianCloud) -> GaussianCloud:
     )
 
 
-def measure_unbiased(bench: Bench) -> Iterator[Row]:
+def measure_consistent(bench: Bench) -> Iterator[Row]:
     """Yield z-scores of pixels: the mean of many images of few samples less that of images of sixteen times as many."""
     effort, device = bench.effort, str(bench.device)
     scene = raster_scenes.figure(effort.bias_gaussians, *effort.bias_size)

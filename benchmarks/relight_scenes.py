@@ -12,6 +12,8 @@ import numpy as np
 import raster_scenes
 import warp as wp
 from numpy.typing import NDArray
+from parts import Row
+from timing import spread
 
 from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import upload
@@ -23,8 +25,6 @@ from beam_warp.world.lights import DirectionalLight, Light, PointLight
 from beam_warp.world.mesh import MaterialMesh
 from beam_warp.world.quaternions import product
 from beam_warp.world.shot import Shot, ShotMesh
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ class Effort:
         perfect_gaussians: Gaussians on true surfaces.
         views: Test views a capture at most.
         side: Side of the square of samples of a pixel, deferred, where it is scored.
-        scored_shadows: The same as ``shadows``, where it is scored.
+        scored_shadows: The same as ``shadows``, where it is scored and timed, with the usual bounces.
+        settings: Shadow maps of the environment and bounces that decomposed assets are relit with.
         levels: Samples of a pixel at which path tracing is scored, ascending.
         level_seconds: A level that would take longer, for one image, is left out.
         demo_size: Width and height of the demo figure's images.
@@ -62,7 +63,7 @@ class Effort:
     size: tuple[int, int] = (1920, 1080)
     shadows: tuple[int, ...] = (4, 16)
     maps: tuple[int, int] = (DeferredOptions().light_map_size, DeferredOptions().environment_map_size)
-    frames: int = 60
+    frames: int = 30
     repeats: int = 5
     poses: int = 16
     path_samples: int = 16
@@ -71,17 +72,30 @@ class Effort:
     views: int = 2
     side: int = 2
     scored_shadows: tuple[int, ...] = (0, 4, 16, 32)
-    levels: tuple[int, ...] = (16, 64, 256, 1024)
+    settings: tuple[tuple[int, int], ...] = (
+        (0, 0),
+        (0, 2),
+        (1, 2),
+        (4, 2),
+        (8, 2),
+        (16, 0),
+        (16, 1),
+        (16, 2),
+        (16, 3),
+        (32, 2),
+        (64, 2),
+    )
+    levels: tuple[int, ...] = (4, 16, 64, 256)
     level_seconds: float = 5.0
     demo_size: tuple[int, int] = (240, 360)
     demo_spacing: float = 0.011
-    truth_samples: int = 2048
+    truth_samples: int = 1024
     furnace_gaussians: int = 20_000
     furnace_size: int = 64
     furnace_samples: int = 256
     bias_gaussians: int = 20_000
     bias_size: tuple[int, int] = (64, 36)
-    bias_seeds: tuple[int, int] = (128, 24)
+    bias_seeds: tuple[int, int] = (64, 12)
 
 
 FULL = Effort()
@@ -121,6 +135,7 @@ QUICK = Effort(
     views=1,
     side=1,
     scored_shadows=(0, 4),
+    settings=((0, 0), (4, 2)),
     levels=(2, 4),
     level_seconds=60.0,
     demo_size=(32, 48),
@@ -145,7 +160,7 @@ class Bench:
         sky: What the figure stands under.
         effort: How much is measured.
         device: Where.
-        pictures: Folder of images that ``relight_plot.py`` draws; None for none.
+        pictures: Folder of images that ``tables.py`` draws; None for none.
         say: Hears what is being done.
     """
 
@@ -269,11 +284,10 @@ def frame_times(work: Callable[[], Any], effort: Effort, device: Any) -> Row:
         for _ in range(effort.frames):
             work()
 
-    rows = [1e3 * seconds_of(in_a_row, device) / effort.frames for _ in range(effort.repeats)]
-    alone = [1e3 * seconds_of(work, device) for _ in range(effort.repeats if effort.frames > 1 else 0)] or rows
+    rows = np.array([1e3 * seconds_of(in_a_row, device) / effort.frames for _ in range(effort.repeats)])
+    alone = [1e3 * seconds_of(work, device) for _ in range(effort.repeats if effort.frames > 1 else 0)]
     return {
-        "ms": float(np.median(rows)),
-        "fps": 1e3 / float(np.median(rows)),
-        "all_ms": rows,
-        "latency_ms": float(np.median(alone)),
+        "ms": spread(rows),
+        "fps": spread(1e3 / rows),
+        "latency_ms": spread(np.array(alone)) if alone else spread(rows),
     }

@@ -60,6 +60,7 @@ def stability(args: Stability) -> int:
         for part, run in parts.items():
             if args.only in (None, part):
                 result = result.joined(run(args, report))
+    result = result.measured_now()
     if args.out is not None:
         write_page(
             args.out,

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from beam_warp._version import __version__
 from beam_warp.capture.images import EXPOSURE_STOPS as INSPECTED_STOPS
+from beam_warp.digests import code_digest
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.files import replacing
 from beam_warp.jobs.markdown import markdown_table
@@ -147,6 +149,7 @@ class StabilityResult:
         captures: One for each capture on which reconstructions fail.
         materials: One for each subject or light on which the measurement of materials fails.
         relighting: One for each subject or light on which relighting fails, and each renderer.
+        measured: By device, what measured: version, digest of the code, date.
     """
 
     cases: tuple[TracingOutcome, ...] = ()
@@ -154,22 +157,32 @@ class StabilityResult:
     captures: tuple[CaptureOutcome, ...] = ()
     materials: tuple[MaterialOutcome, ...] = ()
     relighting: tuple[RelightingOutcome, ...] = ()
+    measured: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
         """Whether every verdict is good."""
-        return all(outcome.passed for part in fields(self) for outcome in getattr(self, part.name))
+        return all(outcome.passed for outcome in self.outcomes)
+
+    @property
+    def outcomes(self) -> list[Any]:
+        """All outcomes of all parts."""
+        return [outcome for name in KINDS for outcome in getattr(self, name)]
 
     def joined(self, other: StabilityResult) -> StabilityResult:
         """Return both results as one, this one's first."""
-        return StabilityResult(
-            **{part.name: getattr(self, part.name) + getattr(other, part.name) for part in fields(self)}
-        )
+        parts: dict[str, Any] = {name: getattr(self, name) + getattr(other, name) for name in KINDS}
+        return StabilityResult(**parts, measured={**other.measured, **self.measured})
+
+    def measured_now(self) -> StabilityResult:
+        """Return the same, stating that the package as it is measured it today."""
+        stated = f"beam-warp {__version__}, code {code_digest()[:12]}, {datetime.now(UTC).date()}"
+        return replace(self, measured=dict.fromkeys(devices_of(self.outcomes), stated))
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record."""
-        parts = {part.name: [outcome.as_dict() for outcome in getattr(self, part.name)] for part in fields(self)}
-        return {"version": __version__, "passed": self.passed, **parts}
+        parts = {name: [outcome.as_dict() for outcome in getattr(self, name)] for name in KINDS}
+        return {"version": __version__, "passed": self.passed, "measured": dict(self.measured), **parts}
 
 
 KINDS: dict[str, type[OutcomeRecord]] = {
@@ -192,7 +205,7 @@ def read_result(path: Path) -> StabilityResult:
     try:
         record = {"captures": [], "materials": [], "relighting": [], **json.loads(path.read_text(encoding="utf-8"))}
         parts: dict[str, Any] = {name: tuple(map(kind.from_dict, record[name])) for name, kind in KINDS.items()}
-        return StabilityResult(**parts)
+        return StabilityResult(**parts, measured=record.get("measured", {}))
     except OSError as error:
         raise MissingFileError(f"beside must be a file, got {path} ({error.strerror}). Check the path.") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -204,6 +217,12 @@ def read_result(path: Path) -> StabilityResult:
 def devices_of(outcomes: Sequence[CaseOutcome | OcclusionOutcome]) -> list[str]:
     """Return the devices that occur, in order."""
     return list(dict.fromkeys(outcome.device for outcome in outcomes))
+
+
+def measured_by(outcomes: Sequence[CaseOutcome | OcclusionOutcome], measured: Mapping[str, str]) -> str:
+    """Return a line of what measured some outcomes, device by device."""
+    stated = (f"on {device}: {measured.get(device, 'not recorded')}" for device in devices_of(outcomes))
+    return f"*Measured {'; '.join(stated)}.*" if outcomes else ""
 
 
 def verdict_of(outcomes: Sequence[TracingOutcome]) -> str:
@@ -229,7 +248,7 @@ def markdown(result: StabilityResult, command: str, before: str = "") -> str:
     parts = [_tracing(result, command) if result.cases or not before else tracing]
     for name, section in SECTIONS.items():
         kept = [part for part in others if part.startswith(section.title)]
-        parts.append(section.markdown(getattr(result, name)) or "".join(kept[-1:]))
+        parts.append(section.markdown(getattr(result, name), result.measured) or "".join(kept[-1:]))
     return "\n".join(part.rstrip() + "\n" for part in parts if part)
 
 
@@ -255,9 +274,9 @@ class Section:
     facts: Callable[[Any], str]
     common: Callable[[Any], Hashable] = attrgetter("device")
 
-    def markdown(self, outcomes: Sequence[CaseOutcome]) -> str:
+    def markdown(self, outcomes: Sequence[CaseOutcome], measured: Mapping[str, str]) -> str:
         """Return this part of the page; empty if there are no outcomes."""
-        lines = [self.title, "", self.text]
+        lines = [self.title, "", self.text, measured_by(outcomes, measured), ""]
         for common in dict.fromkeys(map(self.common, outcomes)):
             same = [outcome for outcome in outcomes if self.common(outcome) == common]
             table = case_table(self.titles, self.cases, same, lambda outcome, same=same: self.cells(outcome, same))
@@ -342,7 +361,8 @@ def case_table(
 
 def _tracing(result: StabilityResult, command: str) -> str:
     """Return the part about ray tracing."""
-    parts = ["# Stability", HOW_TO_READ.format(command=command), "## Stress cases", _tracing_table(result.cases)]
+    parts = ["# Stability", HOW_TO_READ.format(command=command), measured_by(result.cases, result.measured)]
+    parts += ["## Stress cases", _tracing_table(result.cases)]
     parts += ["## Ambient occlusion of known shapes", OCCLUSION_TEXT, _occlusion_table(result.occlusion)]
     return "\n".join(part.rstrip() + "\n" for part in parts)
 

@@ -1,25 +1,32 @@
-"""The materials benchmark: its scores are right where the answer is known, and all of it runs."""
+"""The materials benchmark: its scores are right where the answer is known, and all of it runs into tables."""
 
 import json
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import materials as benchmark
 import numpy as np
 import pytest
+import tables_materials
 from device_memory import peak_memory
 from materials_bench import QUICK, bench_of_capture
 from materials_contenders import DIRECT_AS_PAPER, OURS, Subject, SubjectFrame, Unavailable, ablation_rows, direct
 from materials_cost import Scale, drawn_views
-from materials_plot import draw_all
+from materials_evaluation import WAYS, best_constant, frames_of, score_of, statistics, true_roughness
 from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference
+from parts import measure
+from scipy.spatial import cKDTree
 
+from beam_warp.capture.matching import match_frames
+from beam_warp.demo.figure import build_figure
 from beam_warp.device.arrays import resolve_device
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianSequence
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 
@@ -28,17 +35,8 @@ TINY = replace(
     perfect_gaussians=600,
     light_points=8,
     reference_rays=64,
-    frames=2,
-    scale=Scale(
-        gaussians=200,
-        views=2,
-        size=(32, 24),
-        repeats=1,
-        counts=(100, 200),
-        view_counts=(1, 2),
-        ray_counts=(4, 8),
-        series_views=1,
-    ),
+    paths=2,
+    scale=Scale(gaussians=200, views=2, size=(32, 24), repeats=2, few_views=1),
 )
 
 
@@ -161,63 +159,122 @@ class TestCost:
             assert found["peak_device_bytes"] >= found["device_bytes_before"] + (4 << 20)
 
 
-def test_all_of_it_runs(device, tiny_capture, tmp_path):
+class TestRoughness:
+    def test_truth_is_spread_back_from_the_test_views(self, perfect, tiny_capture):
+        records = tiny_capture.select(split="test", frames=[0])
+        truth, known = true_roughness(perfect.cloud, records, SHARP, "cpu")
+        assert 0.1 < known.mean() < 1.0
+        figure = build_figure(0.02).at(0.0)
+        exact = figure.roughness[cKDTree(figure.vertices).query(perfect.cloud.positions)[1]]
+        # Gaussians some pixels wide blur parts into each other; a constant would be off by the spread of the parts
+        spread = np.abs(exact - np.median(exact))[known].mean()
+        assert np.abs(truth - exact)[known].mean() < 0.5 * spread
+
+    def test_best_constant_beats_the_others(self, perfect, tiny_capture):
+        records = tiny_capture.select(split="test", frames=[0])
+        best, score = best_constant(perfect.cloud, records, SHARP, "cpu")
+        cloud = perfect.cloud.with_arrays(roughness=np.full(len(perfect.cloud), best, np.float32))
+        assert score_of(cloud, records, SHARP, "cpu").psnr == pytest.approx(score.psnr, abs=1e-3)
+        worse = [score_of(cloud, records, SHARP, "cpu", constant).psnr for constant in (best - 0.05, best + 0.05)]
+        assert max(worse) <= score.psnr
+
+    def test_stated_errors_that_are_right_have_the_shares_of_a_normal_distribution(self, rng):
+        truth, error = rng.uniform(0.2, 0.8, 20_000), rng.uniform(0.05, 0.2, 20_000)
+        estimate = SimpleNamespace(roughness=truth + error * rng.normal(size=len(truth)), standard_error=error)
+        found = statistics(estimate, truth, truth > 0.3)
+        # four standard errors of a share of some 17,000
+        assert found["within_1"] == pytest.approx(0.6827, abs=0.015)
+        assert found["within_2"] == pytest.approx(0.9545, abs=0.007)
+        assert found["median_z"] == pytest.approx(0.6745, abs=0.03)
+
+
+def test_chosen_frames_are_those_of_the_capture(perfect):
+    clouds = [perfect.cloud.with_arrays(opacities=np.full(len(perfect.cloud), 0.1 * n, np.float32)) for n in (1, 2, 3)]
+    sequence = GaussianSequence.from_clouds(clouds, metadata={"capture_frames": "4 6 9"})
+    chosen = frames_of(sequence, [4, 9])
+    assert [cloud.opacities[0] for cloud in chosen] == pytest.approx([0.1, 0.3])
+    assert match_frames(chosen) == {4: 0, 9: 1}
+
+
+@pytest.fixture
+def bench(device, tiny_capture, tmp_path):
+    made = bench_of_capture(tiny_capture, tmp_path, resolve_device(device), lambda text: None)
+    return replace(made, effort=TINY)
+
+
+def test_true_surface_and_cost_run_into_tables(bench, tmp_path):
     pytest.importorskip("matplotlib")
-    target = resolve_device(device)
-    pictures = tmp_path / "pictures"
-    bench = bench_of_capture(tiny_capture, target, lambda text: None)
-    bench = replace(bench, effort=TINY, pictures=pictures)
     states = []
-    result = benchmark.measure(bench, only=("perfect", "cost"), keep=lambda state: states.append(json.dumps(state)))
+    result = measure(
+        benchmark.PARTS, bench, only=("perfect", "cost"), keep=lambda state: states.append(json.dumps(state))
+    )
     assert result["failed"] == []
     assert len(states) > 10  # a kill loses one row
     rows = result["perfect"]["captures"]["demo"]["rows"]
     assert {(row["points"], row["bounce"]) for row in rows} == {(p, b) for p in ("true", "seen") for b in (True, False)}
-    assert all((pictures / row["picture"]).stat().st_size > 100 for row in rows)
-    parts = json.loads(states[-1])["cost"]["parts"]
-    assert parts["scene"]["views"] == 2
-    assert [row["views"] for row in parts["series"]["views"]] == [1, 2, 1, 2]
-    for name in ("direct", "image path"):
-        assert parts[name]["seconds"] == pytest.approx(sum(parts[name]["stages"].values()))
-    text = benchmark.markdown(result)
-    assert "with the bounce" in text
-    assert "- image path: " in text
-    written = draw_all([{**json.loads(states[-1])}], tmp_path / "plots", pictures)
-    assert {path.name for path in written} == {
-        "materials_perfect.png",
-        "materials_cost.png",
-        "materials_rows_perfect_demo.png",
-    }
+    cost = json.loads(states[-1])["cost"]
+    assert cost["scene"]["views"] == 2
+    for name, views in (("direct, roughness given", 2), ("paper, bilateral", 2), ("paper, bilateral, few views", 1)):
+        seconds = cost[name]["seconds"]
+        assert cost[name]["views"] == views
+        assert seconds["lowest"] < seconds["median"] < seconds["highest"]
+    assert "roughness" in cost["direct, with roughness"]["stages"]
+    assert len(tables_materials.perfect(result)) == 1 + len(rows)
+    assert [row[0] for row in tables_materials.light(result)] == ["light", "its own"]
+    assert tables_materials.cost(result)[1][:2] == ("direct, roughness given", "2")
+    tables_materials.draw_perfect(result, tmp_path / "perfect.png")
+    tables_materials.draw_cost(result, tmp_path / "cost.png")
+    assert all((tmp_path / name).stat().st_size > 1000 for name in ("perfect.png", "cost.png"))
 
 
-def test_ablation_runs_on_what_was_reconstructed(subject, tiny_capture, tmp_path, monkeypatch):
+def test_evaluation_is_of_what_the_package_makes(bench, perfect, tmp_path, monkeypatch):
+    """Two ways are decomposed, scored and relit; the direct path's asset and its picture are kept."""
+    given = GaussianSequence.from_clouds([perfect.cloud], metadata={"capture_frames": "0", **SHARP.as_metadata()})
+    monkeypatch.setattr("materials_evaluation.reconstruction", lambda bench, name: given)
+    monkeypatch.setattr("materials_evaluation.WAYS", {name: WAYS[name] for name in ("direct", "paper, bilateral")})
+    bench = replace(bench, keep=tmp_path / "keep", pictures=tmp_path / "pictures")
+    result = measure(benchmark.PARTS, bench, only=("evaluation", "roughness"))
+    assert result["failed"] == []
+    found = result["evaluation"]["captures"]["demo"]["ways"]
+    assert list(found) == ["direct", "paper, bilateral"]
+    assert (tmp_path / "keep" / "demo" / "asset.usda").exists()
+    assert (tmp_path / "pictures" / "materials_demo.png").stat().st_size > 1000
+    assert [row[0] for row in tables_materials.quality(result)] == ["", "demo, direct", "demo, paper, bilateral"]
+    # no estimate is asked for in the paper's preset: its roughness is a constant
+    assert found["paper, bilateral"]["decompose"]["roughness"] == {}
+    (row,) = result["roughness"]["captures"]["demo"]["rows"]
+    assert row["frames"] == 1
+    assert len(tables_materials.roughness(result)) == 2
+
+
+def test_ablation_runs_on_what_was_reconstructed(bench, subject, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
-    device = resolve_device("cpu")
-    monkeypatch.setattr(benchmark, "reconstruction", lambda bench, name, capture: (subject, {"asset": "made up"}))
-    kept = ("paper: image path, .02 m, 50 + 100 iid rays", "+ offset auto", "+ all frames", "offset .1 m")
-    rows = [row for row in ablation_rows(high=4, low=4, steps=2) if row.name in kept]
+    monkeypatch.setattr(benchmark, "subject_of", lambda bench, name: subject)
+    kept = ("paper: image path, 2 cm, 50 + 100 iid rays", "+ offset auto", "+ all frames", "offset 10 cm")
+    rows = [row for row in ablation_rows(high=4, low=4) if row.name in kept]
     monkeypatch.setattr(benchmark, "ablation_rows", lambda **options: rows)
-    bench = bench_of_capture(tiny_capture, device, lambda text: None)
-    result = benchmark.measure(replace(bench, effort=TINY, pictures=tmp_path), only=("ablation",))
+    result = measure(benchmark.PARTS, bench, only=("ablation",))
     assert result["failed"] == []
     found = {(row["group"], row["name"]): row for row in result["ablation"]["captures"]["demo"]["rows"]}
     assert "two frames" in found["ladder", "+ all frames"]["unavailable"]
     assert "psnr" in found["ladder", "+ offset auto"]["base_color"]
-    assert len(benchmark.markdown(result).splitlines()) > len(found)
-    names = {path.name for path in draw_all([result], tmp_path / "plots", tmp_path)}
-    assert names == {"materials_ablation.png", "materials_rows_ablation_demo.png"}
+    ladder = tables_materials.ladder(result)
+    assert [row[0] for row in ladder[1:]] == [name for group, name in found if group == "ladder"]
+    assert ladder[-1][1] is None
+    tables_materials.draw_ablation(result, tmp_path / "ablation.png")
+    assert (tmp_path / "ablation.png").stat().st_size > 1000
 
 
-def test_a_part_that_fails_says_so_and_the_others_are_kept(tiny_capture, monkeypatch):
+def test_a_part_that_fails_says_so_and_the_others_are_kept(bench):
     def fail(bench):
         yield {"so far": 1}
         raise ZeroDivisionError
 
-    monkeypatch.setitem(benchmark.PARTS, "perfect", fail)
-    monkeypatch.setitem(benchmark.PARTS, "cost", lambda bench: iter([{"parts": {}}]))
-    bench = bench_of_capture(tiny_capture, resolve_device("cpu"), lambda text: None)
-    result = benchmark.measure(bench, only=("perfect", "cost"))
-    assert result["failed"] == ["perfect"]
-    assert result["perfect"]["so far"] == 1
-    assert "ZeroDivisionError" in benchmark.markdown(result)
-    assert result["cost"]["parts"] == {}
+    kept = []
+    parts = {"first": fail, "second": lambda bench: iter([{"found": 2}]), "third": fail}
+    result = measure(parts, bench, only=("first", "second"), keep=lambda state: kept.append(json.dumps(state)))
+    assert result["failed"] == ["first"]
+    assert result["first"]["so far"] == 1
+    assert "ZeroDivisionError" in result["first"]["failed"]
+    assert result["second"]["found"] == 2
+    assert json.loads(kept[0]) == {"failed": [], "first": {"so far": 1}}

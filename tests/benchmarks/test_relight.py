@@ -1,4 +1,4 @@
-"""The relighting benchmark: its scores and z-scores are right where the answer is known, and all of it runs."""
+"""The relighting benchmark: scores and z-scores are right where the answer is known, and all of it runs into tables."""
 
 import json
 from dataclasses import replace
@@ -6,16 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import relight as benchmark
+import tables_relight
 from materials_truth import SHARP, true_cloud
-from relight_accuracy import Known, RelitSubject, materials_at, measure_light, scores
+from parts import measure
+from relight_accuracy import Known, RelitSubject, box_psnr, materials_at, measure_light, scores
 from relight_energy import z_scores
-from relight_plot import LARGEST_FILE, draw_all
+from relight_plot import LARGEST_FILE
 from relight_scenes import MovingFigure, posed
 
+from beam_warp import converters
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianSequence
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 
@@ -69,6 +73,7 @@ class TestScores:
         inside = -20.0 * np.log10(difference) - 10.0 * np.log10(alpha.sum() / area)
         assert found["psnr"] == pytest.approx(inside, abs=1e-3)
         assert found["view_psnr"] == [found["psnr"]]
+        assert box_psnr(*images) == found["psnr"]
 
     def test_true_coverage_takes_silhouettes_away(self):
         alpha = disc_alpha()
@@ -153,20 +158,25 @@ def test_levels_that_take_too_long_are_left_out(bench, small_lights):
     assert [row["setting"] for row in found["rows"] if row["method"] == "path traced"] == ["1 samples", "2 samples"]
 
 
-def test_all_of_it_runs(device, bench, tmp_path, small_lights):
+def test_all_of_it_runs_into_tables(device, bench, tmp_path, small_lights, relit_capture, monkeypatch):
     pytest.importorskip("matplotlib")
-    pictures = tmp_path / "pictures"
-    states = []
-    result = benchmark.measure(bench(device, pictures=pictures), keep=lambda state: states.append(json.dumps(state)))
+    pictures, states = tmp_path / "pictures", []
+    cloud = true_cloud(relit_capture, 0, 300, resolve_device(device))
+    asset = GaussianSequence.from_clouds([cloud], metadata={"capture_frames": "0", **SHARP.as_metadata()})
+    converters.write(asset, tmp_path / "asset.usda")
+    ready = bench(device, pictures=pictures, assets={"demo": tmp_path / "asset.usda"})
+    result = measure(benchmark.PARTS, ready, keep=lambda state: states.append(json.dumps(state)))
     assert result["failed"] == []
     assert len(states) > 12  # a kill loses one row
+    result = json.loads(states[-1])
     cases = result["deferred"]["cases"]
     assert [row["lights"] for row in cases.values()] == [0, 2, 0]
     assert all(row["launched_is_drawn"] for row in cases.values())
     for row in cases.values():
-        assert sum(row["shares_ms"].values()) == pytest.approx(row["whole"]["ms"])
+        assert sum(row["shares_ms"].values()) == pytest.approx(row["whole"]["ms"]["median"])
     for row in result["path"]["cases"].values():
-        assert row["covered_samples_per_second"] == pytest.approx(row["covered"] * row["samples_per_second"])
+        rate, covered = row["samples_per_second"]["median"], row["covered_samples_per_second"]["median"]
+        assert covered == pytest.approx(row["covered"] * rate)
     covered = [row["covered"] for row in result["path"]["cases"].values()]
     assert covered[0] == covered[1] < covered[2] == covered[3]
     assert set(result["moving"]["trees"]) == {"refit", "fast"}
@@ -176,46 +186,34 @@ def test_all_of_it_runs(device, bench, tmp_path, small_lights):
         for found in subject["lights"].values():
             assert {row["method"] for row in found["rows"]} == {"path traced", "deferred"}
             assert [row["against_path"] is None for row in found["rows"]].count(True) == 1
-    furnace = result["furnace"]["rows"]
-    assert len(furnace) == 30
-    assert all(row["pixels"] > 0 for row in furnace)
-    assert result["unbiased"]["pixels"] > 0
-    text = benchmark.markdown(json.loads(states[-1]))
-    assert "| environment |" in text
-    assert "### White furnace" in text
-    written = draw_all([json.loads(states[-1])], tmp_path / "plots", pictures)
-    assert {path.name for path in written} == {"relight_speed_accuracy.png", "relight_comparison.png"}
-    assert all(1000 < path.stat().st_size <= LARGEST_FILE for path in written)
+    shadows = result["shadows"]["subjects"]["demo"]
+    assert shadows["views"] == 2
+    assert [row["shadows"] for row in shadows["lights"]["sunset"]] == [0, 4]
+    assert len(result["furnace"]["rows"]) == 30
+    assert all(row["pixels"] > 0 for row in result["furnace"]["rows"])
+    assert result["consistent"]["pixels"] > 0
+    assert [row[0] for row in tables_relight.deferred(result)[1:]] == list(cases)
+    assert [row[0] for row in tables_relight.path(result)[1:]] == list(result["path"]["cases"])
+    assert len(tables_relight.results_speed(result)) == 2 + len(cases)
+    assert tables_relight.samples(result)[0] == ["PSNR [dB]", "2 samples", "4 samples"]
+    assert len(tables_relight.shadows(result)) == 3
+    assert len(tables_relight.furnace(result)) == 7
+    assert len(tables_relight.consistent(result)) == 5
+    monkeypatch.setattr(tables_relight, "USUAL", "N = 4")
+    assert len(tables_relight.accuracy(result)) == 1 + 3 * (2 + 2)
+    relit = {way: {light: {"psnr": 30.0} for light in ("stage", "sunset")} for way in ("deferred", "path")}
+    evaluated = {"paths": 2, "captures": {"demo": {"ways": {"direct": {"mean": {"relit": relit}}}}}}
+    scored = tables_relight.results_accuracy(result, {"evaluation": evaluated})
+    assert [row[:2] for row in scored[1:]] == [("demo", "stage"), ("demo", "sunset")]
+    monkeypatch.setattr(tables_relight, "PICTURES", pictures)
+    for draw in (tables_relight.draw_speed, tables_relight.draw_comparison):
+        draw(result, tmp_path / "figure.png")
+        assert 1000 < (tmp_path / "figure.png").stat().st_size <= LARGEST_FILE
 
 
-def test_a_part_that_fails_says_so_and_the_others_are_kept(bench, monkeypatch):
-    def fail(bench):
-        yield {"cases": {}, "gaussians": 1, "size": [1, 1]}
-        raise ZeroDivisionError
-
-    monkeypatch.setitem(benchmark.PARTS, "deferred", fail)
-    monkeypatch.setitem(benchmark.PARTS, "furnace", lambda bench: iter([{"rows": []}]))
-    result = benchmark.measure(bench("cpu"), only=("deferred", "furnace"))
-    assert result["failed"] == ["deferred"]
-    assert result["deferred"]["cases"] == {}
-    assert "ZeroDivisionError" in benchmark.markdown(result)
-    assert result["furnace"]["rows"] == []
-
-
-def test_tables_of_cuda_results_have_milliseconds(bench):
-    """The CPU's are relative; those of a GPU are what they say."""
-    times = {"ms": 1.5, "fps": 666.7, "latency_ms": 1.75, "all_ms": [1.5]}
-    row = dict.fromkeys(("whole", "still_maps", "moving", "g_buffer"), times)
-    row["shares_ms"] = {"shadow maps and what arrives": 0.0, "G-buffer": 1.0, "shading": 0.5}
-    part = {"cases": {"environment": row}, "gaussians": 140_000, "size": [1920, 1080]}
-    part |= {"targets": {"environment_fps": 600.0}, "reached": {"environment_fps": True}}
-    moving = {"trees": {"refit": times}, "gaussians": 140_000, "size": [1920, 1080], "path_start_ms": times}
-    moving["cases"] = {"environment": dict.fromkeys(("arrays", "deferred", "refit", "fast"), times)}
-    result = {"machine": {"device": "NVIDIA H200"}, "deferred": part, "moving": moving, "failed": []}
-    text = benchmark.markdown(result)
-    assert "| environment | 1.500 | 667 | 1.750 |" in text
-    assert "environment_fps 600: reached" in text
-    assert "1.500 (667 FPS)" in text
+def test_shadow_maps_are_scored_of_assets_alone(bench):
+    result = measure(benchmark.PARTS, bench("cpu"), only=("shadows",))
+    assert "materials.py --keep" in result["shadows"]["failed"]
 
 
 def test_assets_are_found_by_the_name_of_their_capture(tmp_path):
