@@ -4,11 +4,11 @@
                                    [--only GROUP ...] [--quick]
 
 Constants are those of `constants_registry`. The set-up is small: 20,000 Gaussians are fitted to the first frame of a
-capture in a fifth of the usual steps, and from what the unchanged values give, one frame is tracked, a mesh extracted,
+capture in a tenth of the usual steps, and from what the unchanged values give, one frame is tracked, a mesh extracted,
 materials are found by the direct path, and test views relit. A constant is changed in that part alone which it belongs
 to. Other seeds of the same say how much of a change is chance.
 
-Several processes share the device. The JSON is written after each row, and another run with the same file takes up
+Several processes share the device. The JSON is written while rows come in, and another run with the same file takes up
 where the last one ended; ``--seconds`` ends it early. A row that fails says so. ``--quick`` takes the demo's capture,
 few Gaussians and a handful of constants. This is about scores only: no time is measured.
 """
@@ -37,7 +37,7 @@ import numpy as np
 import record
 import trimesh
 from constants_places import changed, is_option, load_packages, value_of, with_option
-from constants_registry import GROUPS, SIDES, Constant
+from constants_registry import GROUPS, JUDGED, SIDES, Constant
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.views import CapturedView
@@ -78,13 +78,13 @@ QUICK_PLACES = ("FitOptions.weights.normal", "joints.rigidity", "SPREAD_PART", "
 
 
 def _small_fit() -> FitOptions:
-    return FitOptions(gaussian_count=20_000, color_iterations=200, normal_iterations=400, refine_every=50)
+    return FitOptions(gaussian_count=20_000, color_iterations=100, normal_iterations=200, refine_every=25)
 
 
 def _small_tracking() -> TrackOptions:
     usual = TrackOptions()
-    joints = replace(usual.joints, iterations=tuple(count // 5 for count in usual.joints.iterations))
-    return replace(usual, joints=joints, refinement=replace(usual.refinement, normal_iterations=80))
+    joints = replace(usual.joints, iterations=tuple(count // 10 for count in usual.joints.iterations))
+    return replace(usual, joints=joints, refinement=replace(usual.refinement, normal_iterations=40))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,6 +338,9 @@ RUNS: dict[str, Callable[[Subject, Setup], Row]] = {
 }
 """What is run and scored for the constants of a group."""
 
+SECONDS_TO_KEEP = 15.0
+"""Time between two writings of the result, which digests the code each time [s]."""
+
 SEEDED = ("reconstruction", "tracking", "materials", "path tracing")
 """Groups whose scores depend on a seed; the others are run with the first alone."""
 
@@ -422,14 +425,17 @@ def _mean(values: Iterator[float]) -> float:
 
 
 def tasks_of(setup: Setup, only: list[str], quick: bool) -> list[Task]:
-    """Return all rows: seeds first, then the constants of all groups in turn."""
+    """Return all rows: seeds first, then the constants of all groups in turn, those chosen by judgement last."""
     groups = only or list(GROUPS)
     tasks = [Task(group, "", str(seed)) for group in groups for seed in range(setup.seeds if group in SEEDED else 1)]
-    for group in groups:
-        for constant in GROUPS[group]:
-            if not constant.not_varied and (not quick or any(part in constant.place for part in QUICK_PLACES)):
-                tasks += [Task(group, constant.place, side) for side in SIDES]
-    return tasks
+    varied = [
+        (group, constant)
+        for group in groups
+        for constant in GROUPS[group]
+        if not constant.not_varied and (not quick or any(part in constant.place for part in QUICK_PLACES))
+    ]
+    varied.sort(key=lambda pair: pair[1].chosen_on == JUDGED)
+    return tasks + [Task(group, constant.place, side) for group, constant in varied for side in SIDES]
 
 
 def find(result: Row, task: Task) -> tuple[Row, str]:
@@ -449,25 +455,31 @@ def measure(
         result: Is filled; what it holds already stays.
         pool: Processes that `start_worker` has begun.
         workers: How many they are.
-        keep: Called after each row.
+        keep: Called after rows, a few times a minute, and at the end.
         until: Time of `time.monotonic` after which no task is begun.
     """
     list(pool.map(make_unchanged, result["captures"]))
     waiting = [task for task in tasks if find(result, task)[1] not in find(result, task)[0]]
     running: dict[Any, Task] = {}
-    while waiting or running:
-        while waiting and len(running) < workers and time.monotonic() < until:
-            task = waiting.pop(0)
-            running[pool.submit(run_task, task)] = task
-        if not running:
-            print(f"{len(waiting)} rows are left for another run")
-            return
-        for done in wait(running, return_when=FIRST_COMPLETED).done:
-            task = running.pop(done)
-            holder, key = find(result, task)
-            holder[key] = done.result()
-            print(f"{task.group} {task.place or 'seed'} {key}: {holder[key].get('failed', 'ok')}", flush=True)
-            keep()
+    kept = time.monotonic()
+    try:
+        while waiting or running:
+            while waiting and len(running) < 2 * workers and time.monotonic() < until:
+                task = waiting.pop(0)
+                running[pool.submit(run_task, task)] = task
+            if not running:
+                print(f"{len(waiting)} rows are left for another run")
+                return
+            for done in wait(running, return_when=FIRST_COMPLETED).done:
+                task = running.pop(done)
+                holder, key = find(result, task)
+                holder[key] = done.result()
+                print(f"{task.group} {task.place or 'seed'} {key}: {holder[key].get('failed', 'ok')}", flush=True)
+            if time.monotonic() > kept + SECONDS_TO_KEEP:
+                keep()
+                kept = time.monotonic()
+    finally:
+        keep()
 
 
 def main() -> int:

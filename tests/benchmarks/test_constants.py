@@ -154,7 +154,7 @@ def test_rows_are_kept_and_not_made_twice(fake_runs):
     with ThreadPoolExecutor(1) as pool:
         benchmark.measure(tasks, result, pool, 1, lambda: kept.append(1))
         benchmark.measure(tasks, result, pool, 1, lambda: kept.append(1), until=-math.inf)
-    assert len(kept) == 2
+    assert len(kept) == 2  # at the end of each run
     assert result["seeds"]["reconstruction"]["0"] == "as it was"
     assert result["constants"][SPLIT]["less"] == {"chamfer": [1.0 + 0.5 * densify.SPLIT_OFFSET]}
     assert result["seeds"]["meshing"]["0"]["failed"].startswith("ZeroDivisionError")
