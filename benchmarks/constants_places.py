@@ -8,7 +8,6 @@ A place is a module and a path: ``beam_warp.render.arriving:CLUSTER_COUNT`` is a
 from __future__ import annotations
 
 import ast
-import functools
 import importlib
 import inspect
 import pkgutil
@@ -79,7 +78,7 @@ def scaled(value: Any, factor: float, most: float = float("inf")) -> Any:
     """Return a value times a factor, at most ``most``; whole numbers stay whole, and change by at least one."""
     if isinstance(value, int):
         step = 1 if factor > 1.0 else -1
-        return max(1, int(min(most, step * max(step * round(factor * value), step * value + 1))))
+        return max(0, int(min(most, step * max(step * round(factor * value), step * value + 1))))
     if isinstance(value, float | np.number):
         return type(value)(min(factor * value, most))
     parts = [scaled(part, factor, most) for part in value]
@@ -101,24 +100,23 @@ def load_packages() -> None:
             importlib.import_module(entry.name)
 
 
-@functools.cache
-def _holders() -> dict[tuple[str, str], list[tuple[ModuleType, str]]]:
-    """Return which modules hold what they imported from which, and under which name."""
-    load_packages()
-    found: dict[tuple[str, str], list[tuple[ModuleType, str]]] = {}
-    for name, module in list(sys.modules.items()):
-        if not name.startswith("beam_warp.") or not (module.__file__ or "").endswith(".py"):
+def _copies(module: str, name: str) -> Iterator[tuple[ModuleType, str]]:
+    """Return which modules imported a name from a module, and as what."""
+    for other in list(sys.modules.values()):
+        if not getattr(other, "__name__", "").startswith("beam_warp.") or not (other.__file__ or "").endswith(".py"):
             continue
-        for node in ast.walk(ast.parse(inspect.getsource(module))):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                for alias in node.names:
-                    found.setdefault((node.module, alias.name), []).append((module, alias.asname or alias.name))
-    return found
+        source = inspect.getsource(other)
+        for node in ast.walk(ast.parse(source)) if f"from {module} import" in source and name in source else ():
+            if isinstance(node, ast.ImportFrom) and node.module == module:
+                yield from ((other, alias.asname or name) for alias in node.names if alias.name == name)
 
 
 @contextmanager
 def changed(place: str, value: Any) -> Iterator[None]:
-    """Let a number of a module, or a default, be another one; kernels that know it are compiled anew when they run."""
+    """Let a number of a module, or a default, be another one; kernels that know it are compiled anew when they run.
+
+    Only modules that are loaded see it: call `load_packages` before.
+    """
     module, _, path = place.partition(":")
     argument = ARGUMENT.fullmatch(path)
     before = value_of(place)
@@ -131,7 +129,7 @@ def changed(place: str, value: Any) -> Iterator[None]:
         def give(new: Any) -> None:
             _set_default(function, argument["name"], new)
     else:
-        holders = [(importlib.import_module(module), path), *_holders().get((module, path), ())]
+        holders = [(importlib.import_module(module), path), *_copies(module, path)]
 
         def give(new: Any) -> None:
             for holder, name in holders:

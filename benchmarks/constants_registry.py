@@ -398,7 +398,7 @@ UNTUNED = {
         beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK
-        beam_warp.materials.agreement: CUT_PART
+        beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
         beam_warp.kernels.render.cluster_bounces: MEAN_COSINE
         beam_warp.kernels.render.gaussian_light: TAU
@@ -454,11 +454,11 @@ UNTUNED = {
     "how results are scored and shown": """
         beam_warp.reconstruction.drift: NEAR LEAST_OPACITY CARRIERS
         beam_warp.reconstruction.preview: AMPLIFICATION MOST_ROWS FEWEST_ROWS
-        beam_warp.render.channels: FLAG_COLORS MOST_GAUSSIANS TEXT_COLOR TEXT_SIZE LINE_HEIGHT MARGIN""",
+        beam_warp.render.channels: MOST_GAUSSIANS TEXT_COLOR TEXT_SIZE LINE_HEIGHT MARGIN""",
     "numbers of cases and of columns": """
         beam_warp.kernels.reconstruction.visual_hull: OUTSIDE SURFACE INSIDE
-        beam_warp.kernels.materials.residues: ALBEDO_SCALING FRESNEL_HV BOUNCE_STREAM
-        beam_warp.kernels.materials.image_residues: RESIDUE_STREAM
+        beam_warp.kernels.materials.residues: ALBEDO_SCALING FRESNEL_HV
+        beam_warp.materials.direct: DIFFUSE_WEIGHTS
         beam_warp.kernels.materials.bounded_solve: WALK FREE SHIFT
         beam_warp.kernels.render.gaussian_light: ROUGHNESS OCCLUSION NORMAL ARRIVING OPENNESS""",
 }

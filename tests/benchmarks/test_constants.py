@@ -96,7 +96,7 @@ def test_a_constant_is_there_and_can_be_varied(constant):
 
 def test_values_are_scaled_in_their_own_kind():
     """Whole numbers stay whole and differ, fractions stop at their most, and several are scaled one by one."""
-    assert [scaled(n, 0.5) for n in (64, 3, 2, 1)] == [32, 2, 1, 1]
+    assert [scaled(n, 0.5) for n in (64, 3, 2, 1)] == [32, 2, 1, 0]
     assert [scaled(n, 1.5) for n in (64, 3, 1)] == [96, 4, 2]
     assert scaled(0.8, 1.5, most=1.0) == 1.0
     assert scaled((16, 32), 0.5) == (8, 16)
