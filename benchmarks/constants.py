@@ -213,9 +213,9 @@ class Subject:
         """Return what the unchanged constants make, ``gaussians`` or ``materials``; made by the first who asks."""
         path = self.kept / f"{self.name}_{name}.pickle"
         if not path.exists():
-            partial = path.with_suffix(f".{os.getpid()}")
-            partial.write_bytes(pickle.dumps(make()))
-            partial.replace(path)
+            unfinished = path.with_suffix(f".{os.getpid()}")
+            unfinished.write_bytes(pickle.dumps(make()))
+            unfinished.replace(path)
         return pickle.loads(path.read_bytes())
 
 
