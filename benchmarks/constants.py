@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
@@ -46,6 +46,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.scores import MaterialViewScores
 from beam_warp.evaluate.views import ViewScorer
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialOptions, measure_materials
@@ -193,7 +194,7 @@ class Subject:
         return [view.camera for view in self.views[0]]
 
     @cached_property
-    def tests(self) -> list[CaptureRecord]:
+    def tests(self) -> Sequence[CaptureRecord]:
         """Views of the first frame that nothing is fitted to."""
         return self.capture.select(split="test", frames=[self.frames[0]])
 
@@ -221,7 +222,7 @@ class Subject:
 
 def reconstruct(subject: Subject, setup: Setup) -> GaussianCloud:
     """Fit the first frame."""
-    track, _ = FitAndTrack(fitting=setup.fit, device=subject.device).begin(subject.views[0], lambda *_: None)
+    track, _ = FitAndTrack(fitting=setup.fit, device=subject.device).begin(subject.views[0], no_progress)
     return track.cloud
 
 

@@ -80,7 +80,7 @@ def scaled(value: Any, factor: float, most: float = float("inf")) -> Any:
         step = 1 if factor > 1.0 else -1
         return max(0, int(min(most, step * max(step * round(factor * value), step * value + 1))))
     if isinstance(value, float | np.number):
-        return type(value)(min(factor * value, most))
+        return float(min(factor * value, most))
     parts = [scaled(part, factor, most) for part in value]
     return np.array(parts) if isinstance(value, np.ndarray) else type(value)(parts)
 
