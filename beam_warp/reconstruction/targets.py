@@ -39,6 +39,9 @@ CROP_STEP = 16
 MOST_SAMPLES = 4
 """Largest side of the square of samples of a pixel."""
 
+SAMPLES_PER_SPACING = 2.0
+"""Samples that fall on the distance of neighbouring Gaussians, unless `MOST_SAMPLES` are fewer."""
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -364,4 +367,5 @@ def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spa
     footprint = float(np.median(footprints))
     if not footprint > 0.0:
         return 1
-    return int(np.ceil(2.0 * footprint / spacing)) if MOST_SAMPLES * spacing > 2.0 * footprint else MOST_SAMPLES
+    needed = SAMPLES_PER_SPACING * footprint
+    return int(np.ceil(needed / spacing)) if MOST_SAMPLES * spacing > needed else MOST_SAMPLES
