@@ -54,19 +54,18 @@ class Times:
         return float(np.median(other.alone / self.alone))
 
     def thread_gain(self) -> float | None:
-        """Return how many times faster two threads are than one by wall-clock time; None where not measured.
+        """Return how many times faster two threads are than one, as the median ratio of wall-clock times within a turn.
 
-        Of the fastest repeats: two threads of a machine that others use are slowed down by them, not by their work.
+        None where two threads were not measured.
         """
         if self.one_thread is None or self.two_threads is None:
             return None
-        return float(self.one_thread.min() / self.two_threads.min())
+        return float(np.median(self.one_thread / self.two_threads))
 
 
-def rates(seconds: NDArray[np.float64], count: int) -> dict[str, float]:
-    """Return median and range over repeats of millions of items per second."""
-    found = count / seconds / 1e6
-    return {"median": float(np.median(found)), "lowest": float(found.min()), "highest": float(found.max())}
+def spread(values: NDArray[np.float64]) -> dict[str, float]:
+    """Return median and range over repeats."""
+    return {"median": float(np.median(values)), "lowest": float(values.min()), "highest": float(values.max())}
 
 
 @contextmanager
