@@ -1,0 +1,102 @@
+"""The one table of the README: a row for each thing that the package does, from the results of their benchmarks."""
+
+from __future__ import annotations
+
+from tables import Row, Rows, cell, table
+
+SHADOWS = "environment with 16 shadow maps, 2 bounces"
+"""The case of the deferred renderer that has its default options."""
+
+
+@table(
+    "readme",
+    "tracing_h200.json",
+    "raster_h200.json",
+    "reconstruction_h200.json",
+    "materials_evaluation_h200.json",
+    "relight_h200.json",
+)
+def readme(tracing: Row, raster: Row, reconstruction: Row, materials: Row, relight: Row) -> Rows:
+    """Return what is measured, how well it does, and what it is compared with or seen in."""
+    results = (tracing, raster, reconstruction, materials, relight)
+    devices = dict.fromkeys(result["measured"]["machine"]["device"] for result in results)
+    return [
+        ["", ", ".join(devices), "beside it"],
+        _rays(tracing),
+        _images(raster),
+        *_reconstructions(reconstruction),
+        *_materials(materials),
+        _relighting(relight),
+        _paths(relight),
+    ]
+
+
+def _rays(result: Row) -> list[str]:
+    torus = result["torus"]
+    ours = torus["contenders"]["wide product"]
+    return [
+        f"rays through {torus['gaussians']:,} Gaussians, exact visibility",
+        f"{cell(ours['mray_per_second'])} million/s, error at most {cell(ours['largest_error'])}",
+        f"{cell(ours['over_wp_bvh'])} × the fastest loop over `wp.Bvh`",
+    ]
+
+
+def _images(result: Row) -> list[str]:
+    scene, case = result["peer"]["scene"], result["peer"]["cases"]["RGB and depth"]
+    wall = {name: cell(times["wall_ms"]) for name, times in case["ms"].items()}
+    return [
+        f"{scene['splats']:,} Gaussians at {scene['width']} × {scene['height']}, {case['covered']:.0%} covered, "
+        "image and gradients",
+        f"{wall['ours redraw, training']} ms launched, {wall['ours graph, training']} ms as a CUDA graph",
+        f"gsplat {case['gsplat']}: {wall['gsplat, training']} ms",
+    ]
+
+
+def _reconstructions(result: Row) -> Rows:
+    rows = []
+    for name, part in result["captures"].items():
+        first = part["frames"][0]
+        rows.append(
+            [
+                f"reconstruction of {name}, first frame",
+                f"novel views {first['psnr']:.1f} dB, normals {first['normals_median_degrees']:.1f}°, "
+                f"mesh {first['surface']['chamfer_mm']:.1f} mm",
+                f"{cell(part['first_seconds'], '.1f')} s",
+            ]
+        )
+    return rows
+
+
+def _materials(result: Row) -> Rows:
+    captures = [name for name, part in result.items() if name != "measured" and isinstance(part, dict)]
+    return [
+        [
+            f"materials of {name}",
+            _scores(result[name]["direct"]),
+            f"the paper's recipe: {_scores(result[name]['paper'])}",
+        ]
+        for name in captures
+    ]
+
+
+def _scores(way: Row) -> str:
+    mean = way["evaluation"]["mean"]
+    return f"occlusion {mean['ambient_occlusion']['psnr']:.1f} dB, base colour {mean['base_color']['psnr']:.1f} dB"
+
+
+def _relighting(result: Row) -> list[str]:
+    part = result["deferred"]
+    case = part["cases"][SHADOWS]
+    size = " × ".join(map(str, part["size"]))
+    return [
+        f"relighting of {part['gaussians']:,} Gaussians at {size}, {case['covered']:.0%} covered, default shadows",
+        f"{cell(case['whole']['fps'])} frames/s with all redrawn",
+        f"{cell(case['still_maps']['fps'])} frames/s with the camera moved only",
+    ]
+
+
+def _paths(result: Row) -> list[str]:
+    part = result["path"]
+    case = part["cases"]["sky"]
+    rate = cell(case["covered_samples_per_second"], factor=1e-6)
+    return [f"path tracing of the same, {part['bounces']} bounces", f"{rate} million covered samples/s", ""]
