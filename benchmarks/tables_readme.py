@@ -14,7 +14,7 @@ SHADOWS = "environment with 16 shadow maps, 2 bounces"
     "raster_h200.json",
     "reconstruction_h200.json",
     "materials_evaluation_h200.json",
-    "relight_h200.json",
+    "relight_speed_h200.json",
 )
 def readme(tracing: Row, raster: Row, reconstruction: Row, materials: Row, relight: Row) -> Rows:
     """Return what is measured, how well it does, and what it is compared with or seen in."""
@@ -45,11 +45,14 @@ def _images(result: Row) -> list[str]:
     scene, case = result["peer"]["scene"], result["peer"]["cases"]["RGB and depth"]
     wall = {name: cell(times["wall_ms"]) for name, times in case["ms"].items()}
     return [
-        f"{scene['splats']:,} Gaussians at {scene['width']} × {scene['height']}, {case['covered']:.0%} covered, "
-        "image and gradients",
+        f"image and gradients of {scene['splats']:,} Gaussians at {scene['width']} × {scene['height']}, {_covered(case)}",
         f"{wall['ours redraw, training']} ms launched, {wall['ours graph, training']} ms as a CUDA graph",
         f"gsplat {case['gsplat']}: {wall['gsplat, training']} ms",
     ]
+
+
+def _covered(case: Row) -> str:
+    return f"{100.0 * case['covered']:.0f} % covered"
 
 
 def _reconstructions(result: Row) -> Rows:
@@ -68,30 +71,28 @@ def _reconstructions(result: Row) -> Rows:
 
 
 def _materials(result: Row) -> Rows:
-    captures = [name for name, part in result.items() if name != "measured" and isinstance(part, dict)]
+    captures = {name: part["ways"] for name, part in result["evaluation"]["captures"].items()}
     return [
-        [
-            f"materials of {name}",
-            _scores(result[name]["direct"]),
-            f"the paper's recipe: {_scores(result[name]['paper'])}",
-        ]
-        for name in captures
+        [f"materials of {name}", _scores(ways["direct"]), f"the paper's recipe: {_scores(ways['paper'])}"]
+        for name, ways in captures.items()
     ]
 
 
 def _scores(way: Row) -> str:
-    mean = way["evaluation"]["mean"]
+    if "mean" not in way:
+        return "not run"
+    mean = way["mean"]
     return f"occlusion {mean['ambient_occlusion']['psnr']:.1f} dB, base colour {mean['base_color']['psnr']:.1f} dB"
 
 
 def _relighting(result: Row) -> list[str]:
     part = result["deferred"]
-    case = part["cases"][SHADOWS]
-    size = " × ".join(map(str, part["size"]))
+    case, (width, height) = part["cases"][SHADOWS], part["size"]
     return [
-        f"relighting of {part['gaussians']:,} Gaussians at {size}, {case['covered']:.0%} covered, default shadows",
-        f"{cell(case['whole']['fps'])} frames/s with all redrawn",
-        f"{cell(case['still_maps']['fps'])} frames/s with the camera moved only",
+        f"relighting a ball of {part['gaussians']:,} Gaussians at {width} × {height}, one sample a pixel, "
+        f"{_covered(case)}, default shadows",
+        f"{cell(case['whole']['fps'], '.0f')} frames/s with everything redrawn",
+        f"{cell(case['still_maps']['fps'], '.0f')} frames/s with the camera moved only",
     ]
 
 

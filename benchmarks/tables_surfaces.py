@@ -17,7 +17,7 @@ def meshing(result: Row) -> Rows:
     scenes = f"sphere of 0.5 m, voxel {sphere['voxel_mm']:.1f} mm", f"demo figure, voxel {human['voxel_mm']:.1f} mm"
     found = [(scene, way, entry[way]) for scene, entry in zip(scenes, (sphere, human), strict=True) for way in WAYS]
 
-    def row(title: str, key: str, form: str = ",") -> list[str]:
+    def row(title: str, key: str, form: str = ",.0f") -> list[str]:
         return [title, *(cell(entry[key], form) for *_, entry in found)]
 
     def distance(title: str, name: str, of_sphere: str, of_figure: str, form: str = ".2g") -> list[str]:

@@ -66,7 +66,7 @@ def tracing_builds(result: Row) -> Rows:
     builds, surface = result["builds"], result["closest_surface"]
     rows: list[list[Any]] = [[f"{builds['gaussians']:,} Gaussians", device_of(result)]]
     rows += [[f"{_code(name)} [ms]", value] for name, value in builds["milliseconds"].items()]
-    covered = f"closest surface, camera rays, {surface['covered']:.0%} covered [Mray/s]"
+    covered = f"closest surface, camera rays, {100.0 * surface['covered']:.0f} % covered [Mray/s]"
     rows.append([covered, surface["mray_per_second"]])
     rows.append(["memory, everything that a scene holds [bytes a Gaussian]", builds["bytes_per_gaussian"]["wide"]])
     return rows
@@ -147,7 +147,7 @@ def results_first_light(gpu: Row, cpu: Row) -> Rows:
     return [
         [f"{runs[0]['gaussians']:,} Gaussians", gpu["measured"]["machine"]["device"], _cores(cpu)],
         ["whole job, from files to files", f"{cell(runs[0]['seconds_with_reading'])} s", ""],
-        ["of which normals, exposure, occlusion and base colour", *(f"{_share(run):.0%}" for run in runs)],
+        ["of which normals, exposure, occlusion and base colour", *(f"{100.0 * _share(run):.0f} %" for run in runs)],
         ["occlusion rays", f"{cell(rays[0]['mray_per_second'])} million a second", ""],
         ["peak memory of the process", on_device, f"{runs[1]['peak_memory_mib']:,} MiB"],
         [
