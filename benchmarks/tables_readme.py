@@ -43,9 +43,10 @@ def _rays(result: Row) -> list[str]:
 
 def _images(result: Row) -> list[str]:
     scene, case = result["peer"]["scene"], result["peer"]["cases"]["RGB and depth"]
+    size = f"{scene['width']} × {scene['height']}"
     wall = {name: cell(times["wall_ms"]) for name, times in case["ms"].items()}
     return [
-        f"image and gradients of {scene['splats']:,} Gaussians at {scene['width']} × {scene['height']}, {_covered(case)}",
+        f"image and gradients of {scene['splats']:,} Gaussians at {size}, {_covered(case)}",
         f"{wall['ours redraw, training']} ms launched, {wall['ours graph, training']} ms as a CUDA graph",
         f"gsplat {case['gsplat']}: {wall['gsplat, training']} ms",
     ]
