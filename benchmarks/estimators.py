@@ -178,7 +178,7 @@ def relative_errors(values: NDArray, truth: NDArray) -> NDArray:
 
 
 def mean_in_standard_errors(errors: NDArray) -> float:
-    """The mean of errors ``(seeds, points, channels)`` over its standard error; points are independent, the rest not."""
+    """The mean of errors ``(seeds, points, channels)`` over its standard error; only points are independent."""
     by_point = errors.astype(np.float64).mean(axis=(0, 2))
     return float(by_point.mean() / (by_point.std(ddof=1) / math.sqrt(len(by_point))))
 
