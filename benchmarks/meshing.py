@@ -183,7 +183,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--quick", action="store_true", help="small images and one repeat")
-    parser.add_argument("--side", type=int, default=384, metavar="PX", help="of the depth images")
+    parser.add_argument("--side", type=int, default=256, metavar="PX", help="of the depth images")
     parser.add_argument("--repeats", type=int, default=3)
     record.add_arguments(parser)
     args = parser.parse_args()

@@ -77,8 +77,8 @@ PLAIN_ON_CUDA = (
 STRONGEST_ON_CUDA = (PlainForm("sah", fast_math=True, sorted=True),)
 """What growth rows are compared with on CUDA, where the CPU builds every tree by surface area."""
 
-BRUTE_FORCE_PAIRS = 1e8
-"""Pairs of ray and Gaussian that the float64 truth of a growth row may cost: a second or two."""
+BRUTE_FORCE_PAIRS = 5e7
+"""Pairs of ray and Gaussian that the float64 truth of a growth row may cost: a second or so."""
 
 
 @dataclass(frozen=True)

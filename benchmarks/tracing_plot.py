@@ -6,8 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-STOP = 1e-4
-"""Transmittance below which traversal ends: the error that is there by design."""
+from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 
 
 def draw_growth(result: dict[str, Any], path: Path) -> None:
@@ -37,7 +36,7 @@ def draw_growth(result: dict[str, Any], path: Path) -> None:
     _draw(building, counts, "gaussians", "scenes", lambda row, v: v["build_ms"]["median"])
     _draw(memory, counts, "gaussians", "scenes", lambda row, v: v["bytes_per_gaussian"] * row["gaussians"] / 2**20)
     _draw(error, counts, "gaussians", "contenders", lambda row, v: v["largest_error"])
-    error.axhline(STOP, color="0.4", linestyle=":", label="the stop")
+    error.axhline(TRANSMITTANCE_STOP, color="0.4", linestyle=":", label="the stop")
     for axes, title, across, up in (
         (by_count, "overlap 1, opacity 0.9", "Gaussians", "time per ray [ns]"),
         (by_overlap, f"{of_size}, opacity 0.9", "overlap: standard deviation / spacing", "time per ray [ns]"),
@@ -50,10 +49,8 @@ def draw_growth(result: dict[str, Any], path: Path) -> None:
         axes.grid(True, which="both", alpha=0.25)
     for axes in (by_overlap, building, error):  # colours mean the same in the whole row
         axes.legend()
-    machine = result["measured"]["machine"]
-    name = machine["processor"] if machine["device"] == "cpu" else machine["device"]
-    clock = "one thread" if machine["device"] == "cpu" else "wall clock, synchronised"
-    figure.suptitle(f"Visibility of cosine rays on a torus of Gaussians: {name}, {clock}")
+    device = result["measured"]["machine"]["device"]
+    figure.suptitle(f"Visibility of cosine rays on a torus of Gaussians: {device}, median wall-clock time")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
