@@ -8,6 +8,13 @@ from typing import Any
 
 from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 
+LABELS = {
+    "wide product": "ours",
+    "wide fast product": "ours, fast build",
+    "wide": "quality build",
+    "wide fast": "fast build",
+}
+
 
 def draw_growth(result: dict[str, Any], path: Path) -> None:
     """Draw median time per ray over count, overlap and opacity, and build time, memory and error over the count.
@@ -64,7 +71,9 @@ def _draw(axes: Any, rows: list[dict[str, Any]], key: str, group: str, value: Ca
     for order, name in enumerate(rows[0][group]):
         # Later lines are thinner, so that equal ones stay visible under each other.
         heights = [value(row, row[group][name]) for row in rows]
-        axes.plot(x, heights, marker="o", linewidth=max(1.0, 3.5 - 0.6 * order), markersize=5, label=name)
+        axes.plot(
+            x, heights, marker="o", linewidth=max(1.0, 3.5 - 0.6 * order), markersize=5, label=LABELS.get(name, name)
+        )
     axes.set(xscale="log", yscale="log")
     plain = FuncFormatter(lambda number, _: f"{number:,.6g}" if number >= 1e-3 else f"{number:.0e}")
     axes.set_xticks(x, [_short(number) for number in x])
