@@ -264,7 +264,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", choices=("ball", "figure"), default="ball")
     parser.add_argument("--device", default=None)
-    parser.add_argument("--points", type=int, default=160)
+    parser.add_argument("--points", type=int, default=192)
     record.add_arguments(parser)
     arguments = parser.parse_args()
     make = make_ball if arguments.scene == "ball" else make_figure
