@@ -1,6 +1,6 @@
 """Fusion of depth images: time and error of sparse blocks beside a dense grid of the same voxels, in one run.
 
-    python benchmarks/meshing.py [--device cuda:0] [--quick] [--out result.json]
+    python benchmarks/meshing.py [--device cuda:0] [--quick] --out result.json
 
 Two scenes with truth. A sphere: depth in closed form, so that all error is the fusion's. The demo figure: Gaussians on
 its surface, drawn by the rasteriser, so that what discs that lie on a curved surface stand off it by is in the error
@@ -21,7 +21,7 @@ import record
 import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
-from timing import Task, take_turns
+from timing import Task, spread, take_turns
 from warp.geometry import IsoSurfaceMarchingCubes
 
 from beam_warp.demo.figure import build_figure
@@ -119,9 +119,9 @@ def errors(mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None) -> dict[str, An
     found["to_truth_mm"] = {
         "mean": there.mean(),
         "mean_size": np.abs(there).mean(),
-        "95 percent": np.quantile(np.abs(there), 0.95),
+        "p95": np.quantile(np.abs(there), 0.95),
     }
-    found["from_truth_mm"] = {"mean_size": np.abs(back).mean(), "95 percent": np.quantile(np.abs(back), 0.95)}
+    found["from_truth_mm"] = {"mean_size": np.abs(back).mean(), "p95": np.quantile(np.abs(back), 0.95)}
     return found
 
 
@@ -172,10 +172,10 @@ def compare(
     ways = {"sparse": lambda: fuse_depths(images, voxel=voxel), "dense": lambda: fuse_dense(images, voxel, low, high)}
     times = take_turns({name: Task(work) for name, work in ways.items()}, repeats, images.device)
     found: dict[str, Any] = {
-        name: {"seconds": float(np.median(times[name].alone)), **errors(work(), truth)} for name, work in ways.items()
+        name: {"seconds": spread(times[name].alone), **errors(work(), truth)} for name, work in ways.items()
     }
     found["voxel_mm"] = 1e3 * voxel
-    found["sparse faster than dense"] = times["sparse"].faster_than(times["dense"])
+    found["faster_than_dense"] = spread(times["dense"].alone / times["sparse"].alone)
     return found
 
 
@@ -183,7 +183,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--quick", action="store_true", help="small images and one repeat")
-    parser.add_argument("--side", type=int, default=384, metavar="PX", help="of the depth images")
+    parser.add_argument("--side", type=int, default=256, metavar="PX", help="of the depth images")
     parser.add_argument("--repeats", type=int, default=3)
     record.add_arguments(parser)
     args = parser.parse_args()
@@ -194,6 +194,7 @@ def main() -> int:
     images = sphere_images(side, device)
     reach = np.full(3, RADIUS + 0.05)
     result["sphere"] = compare(images, None, -reach, reach, 3.0 / side, repeats)
+    record.write_result(args, device, result)
 
     cloud, truth = demo_gaussians(count)
     cameras = surrounding_cameras(cloud, side=side)
@@ -210,9 +211,10 @@ def main() -> int:
         "gaussians": len(cloud),
         "cameras": len(cameras),
         "consistency": agreed.as_dict(),
-        "seconds": {name: float(np.median(times[name].alone)) for name in stages},
+        "seconds": {name: spread(times[name].alone) for name in stages},
         **compare(drawn, truth, low, high, drawn.footprint(), repeats),
     }
+    record.write_result(args, device, result)
     surface = fuse_depths(drawn, voxel=drawn.footprint())
     for _ in range(3):
         goal = 5_000 if args.quick else 20_000

@@ -1,21 +1,21 @@
 """How fast PLY is read and written, beside plyfile, and whether the values are the same.
 
-Run: ``python benchmarks/ply.py [--count 150000] [--repeats 7] [--file some.ply] [--out result.json]``.
+Run: ``python benchmarks/ply.py [--count 150000] [--repeats 7] --out result.json``.
 
 Both readers end with the same arrays in memory: positions, normalised quaternions, linear scales and opacities,
 coefficients by band. plyfile is used as its manual shows, memory-mapped, with one copy per column. Both writers start
-from those arrays and end with a closed file. Times are the least of the repeats, interleaved.
+from those arrays and end with a closed file. They take turns, timed by process CPU time.
 """
 
 import argparse
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 import record
 import warp as wp
 from plyfile import PlyData, PlyElement
+from timing import Task, spread, take_turns
 
 from beam_warp import converters
 from beam_warp.converters.activations import dc_from_color
@@ -76,54 +76,37 @@ def write_with_plyfile(cloud, path):
     PlyData([PlyElement.describe(table, "vertex")]).write(path)
 
 
-def fastest(tasks, repeats):
-    """Return the least time of each task [s]; the tasks take turns, so that both meet the same machine."""
-    best = dict.fromkeys(tasks, float("inf"))
-    for _ in range(repeats):
-        for name, task in tasks.items():
-            started = time.perf_counter()
-            task()
-            best[name] = min(best[name], time.perf_counter() - started)
-    return best
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=150_000)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--file", type=Path, help="also time the reading of this file")
     record.add_arguments(parser)
     arguments = parser.parse_args()
 
     cloud = random_cloud(arguments.count)
-    sequence = GaussianSequence.from_clouds([cloud])
+    sequence, device = GaussianSequence.from_clouds([cloud]), wp.get_device("cpu")
     with tempfile.TemporaryDirectory() as folder:
         ours, theirs = Path(folder) / "ours.ply", Path(folder) / "theirs.ply"
-        writing = fastest(
-            {"beam": lambda: converters.write(sequence, ours), "plyfile": lambda: write_with_plyfile(cloud, theirs)},
-            max(1, arguments.repeats // 2),
-        )
-        reading = fastest(
-            {"beam": lambda: converters.read(ours)[0], "plyfile": lambda: read_with_plyfile(ours)}, arguments.repeats
-        )
+        tasks = {
+            "write": Task(lambda: converters.write(sequence, ours)),
+            "plyfile write": Task(lambda: write_with_plyfile(cloud, theirs)),
+            "read": Task(lambda: converters.read(ours)[0]),
+            "plyfile read": Task(lambda: read_with_plyfile(ours)),
+        }
+        times = take_turns(tasks, arguments.repeats, device)
         mine, independent = converters.read(ours)[0], read_with_plyfile(ours)
         result = {
             "count": arguments.count,
             "megabytes": ours.stat().st_size / 1e6,
-            "read_seconds": reading,
-            "read_ratio": reading["plyfile"] / reading["beam"],
-            "write_seconds": writing,
-            "write_ratio": writing["plyfile"] / writing["beam"],
+            "seconds": {name: spread(entry.alone) for name, entry in times.items()},
+            "faster_than_plyfile": {
+                name: spread(times[f"plyfile {name}"].alone / times[name].alone) for name in ("read", "write")
+            },
             "largest_difference": {
                 name: float(np.abs(getattr(mine, name) - values).max()) for name, values in independent.items()
             },
         }
-    if arguments.file:
-        result["file"] = arguments.file.name
-        result["file_read_seconds"] = fastest({"beam": lambda: converters.read(arguments.file)}, arguments.repeats)[
-            "beam"
-        ]
-    record.write_result(arguments, wp.get_device("cpu"), result)
+    record.write_result(arguments, device, result)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
-"""The tracer's speed, and its error beside it: against a plain wp.Bvh loop and against Embree.
+"""The tracer's speed, and its error beside it: against a loop over ``wp.Bvh`` and against Embree.
 
-    python benchmarks/tracing.py [--device cuda:0] [--out DIR] [--quick]
+    python benchmarks/tracing.py --device cuda:0 --out benchmarks/results/tracing_h200.json [--quick]
 
-The scene is a torus tiled with flat Gaussians, the rays are cosine-distributed from its surface. On the CPU one thread
-is timed by process CPU time and two by wall-clock time; a GPU by wall-clock time around synchronised calls. Contenders
-take turns, and ratios are medians of ratios within a turn, so that a busy machine disturbs them least. Errors are
-against a float64 brute force on some of the same rays. Embree needs ``pip install embreex`` and gcc; without them the
-report says so. Writes ``tracing_<device>.json`` and ``.png`` into DIR, and the tables to the terminal.
+The scene is a torus tiled with flat Gaussians, the rays are cosine-distributed from its surface. The CPU is timed by
+the process CPU time of one thread, a GPU by wall-clock time around synchronised calls. Contenders take turns, and
+ratios are taken within a turn, so that a busy machine disturbs them least. Errors are against a float64 brute force on
+some of the same rays. Embree needs ``pip install embreex`` and gcc; without them the result says so.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ import numpy as np
 import record
 import warp as wp
 from numpy.typing import NDArray
-from timing import Task, Times, machine, rates, take_turns
+from timing import Task, Times, spread, take_turns
 from tracing_baselines import (
     BUILD_QUALITIES,
     EmbreeScene,
@@ -32,7 +32,7 @@ from tracing_baselines import (
     PlainBvh,
     pack_gaussians,
 )
-from tracing_scenes import Rays, brute_force_visibility, bumpy_torus, camera_rays, cosine_rays
+from tracing_scenes import Rays, brute_force_visibility, bumpy_torus, camera_rays, cosine_rays, morton_codes
 
 from beam_warp import GaussianCloud, Scene, visibility
 from beam_warp.device.arrays import resolve_device
@@ -45,12 +45,40 @@ SCENE_BUILDS: dict[str, dict[str, Any]] = {"wide": {}, "wide fast": {"build": "f
 MOVES = ("refit", "fast", "quality")
 """Ways of `Scene.move` that are timed."""
 
-FROM_HOST = "Scene.from_gaussians "
-PLAIN = "plain wp.Bvh"
 EMBREE = "Embree 4"
 
-BRUTE_FORCE_PAIRS = 2e8
-"""Pairs of ray and Gaussian that the float64 truth of a growth row may cost: a few seconds."""
+
+class PlainForm(NamedTuple):
+    """A form of the loop over ``wp.Bvh``.
+
+    ``fast_math`` is Warp's option of the kernel, which ours has and which changes CUDA code only. ``sorted`` has the
+    Gaussians along a Morton curve in memory, as the leaves of our trees nearly are.
+    """
+
+    constructor: str
+    fast_math: bool = False
+    sorted: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name of the contender."""
+        extras = ", fast math" * self.fast_math + ", Morton order" * self.sorted
+        return f"wp.Bvh {self.constructor}{extras}"
+
+
+PLAIN_ON_CPU = (PlainForm("sah"), PlainForm("sah", sorted=True))
+PLAIN_ON_CUDA = (
+    *(PlainForm(constructor) for constructor in ("sah", "lbvh", "cubql")),
+    PlainForm("sah", fast_math=True),
+    PlainForm("sah", sorted=True),
+    PlainForm("sah", fast_math=True, sorted=True),
+    PlainForm("lbvh", fast_math=True, sorted=True),
+)
+STRONGEST_ON_CUDA = (PlainForm("sah", fast_math=True, sorted=True),)
+"""What growth rows are compared with on CUDA, where the CPU builds every tree by surface area."""
+
+BRUTE_FORCE_PAIRS = 5e7
+"""Pairs of ray and Gaussian that the float64 truth of a growth row may cost: a second or so."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +90,10 @@ class Effort:
         points: Surface points of the main table's rays, 50 a point.
         repeats: Rounds of the main table.
         truth_rays: Rays compared with float64.
+        seeds: Of Bernoulli acceptance, for its mean over the rays compared with float64.
         counts: Gaussians of the growth rows.
-        overlaps: Of the growth rows, at ``sweep_count`` Gaussians.
-        opacities: Of the growth rows, at ``sweep_count`` Gaussians.
-        sweep_count: See above.
+        overlaps: Of the growth rows, at ``gaussians``.
+        opacities: Of the growth rows, at ``gaussians``.
         growth_rays: Rays of a growth row.
         growth_repeats: Rounds of a growth row.
         image: Width and height of the camera rays.
@@ -74,37 +102,42 @@ class Effort:
 
     gaussians: int = 140_000
     points: int = 4_000
-    repeats: int = 7
+    repeats: int = 5
     truth_rays: int = 1_000
-    counts: tuple[int, ...] = (10_000, 40_000, 140_000, 600_000)
-    overlaps: tuple[float, ...] = (0.5, 1.0, 2.0)
-    opacities: tuple[float, ...] = (0.9, 0.5, 0.2)
-    sweep_count: int = 140_000
+    seeds: int = 1_000
+    counts: tuple[int, ...] = (10_000, 40_000, 140_000)
+    overlaps: tuple[float, ...] = ()
+    opacities: tuple[float, ...] = ()
     growth_rays: int = 20_000
-    growth_repeats: int = 7
-    image: tuple[int, int] = (256, 256)
+    growth_repeats: int = 5
+    image: tuple[int, int] = (160, 160)
     parity_rays: int = 200_000
 
 
 ON_CPU = Effort()
 ON_CUDA = Effort(
-    points=140_000,
-    repeats=20,
-    counts=(10_000, 40_000, 140_000, 600_000, 2_000_000, 4_000_000),
-    growth_rays=4_000_000,
+    points=100_000,
+    repeats=15,
+    counts=(10_000, 40_000, 140_000, 600_000, 2_000_000),
+    overlaps=(0.5, 1.0, 2.0),
+    opacities=(0.9, 0.5, 0.2),
+    growth_rays=2_000_000,
     growth_repeats=9,
     image=(1920, 1080),
 )
 QUICK = Effort(
-    points=800,
-    repeats=5,
-    truth_rays=300,
-    counts=(10_000, 40_000, 140_000),
-    sweep_count=40_000,
-    growth_rays=8_000,
+    gaussians=20_000,
+    points=400,
+    repeats=3,
+    truth_rays=200,
+    seeds=50,
+    counts=(5_000, 20_000),
+    overlaps=(0.5, 2.0),
+    opacities=(0.9, 0.2),
+    growth_rays=4_000,
     growth_repeats=3,
-    image=(96, 96),
-    parity_rays=50_000,
+    image=(64, 64),
+    parity_rays=20_000,
 )
 
 
@@ -115,7 +148,7 @@ class Contender:
     Attributes:
         task: Traces all rays and keeps the result in ``found``.
         exact: Whether V is the product; else one Bernoulli sample of it a ray.
-        baseline: Whether it is a form of the plain ``wp.Bvh`` loop.
+        baseline: Whether it is a form of the loop over ``wp.Bvh``.
         found: The last result.
     """
 
@@ -125,9 +158,9 @@ class Contender:
     found: list[Any] = field(default_factory=list)
 
     @classmethod
-    def of(cls, trace: Callable[[], Any], *, threaded: bool = True, **flags: bool) -> Contender:
+    def of(cls, trace: Callable[[], Any], **flags: bool) -> Contender:
         """Wrap a function that returns the transmittances."""
-        contender = cls(Task(lambda: contender.found.__setitem__(slice(None), [trace()]), threaded), **flags)
+        contender = cls(Task(lambda: contender.found.__setitem__(slice(None), [trace()])), **flags)
         return contender
 
     def transmittances(self) -> NDArray[np.float64]:
@@ -137,7 +170,13 @@ class Contender:
 
 
 def contenders_for(
-    cloud: GaussianCloud, rays: Rays, device: Any, closing: ExitStack, *, acceptances: Iterable[str] = ACCEPTANCES
+    cloud: GaussianCloud,
+    rays: Rays,
+    device: Any,
+    closing: ExitStack,
+    *,
+    plain_forms: Iterable[PlainForm],
+    acceptances: Iterable[str] = ACCEPTANCES,
 ) -> tuple[dict[str, Contender], dict[str, str]]:
     """Return everything that can trace the cloud here, by name, and why others cannot."""
     origins, directions = (wp.array(array, dtype=wp.vec3, device=device) for array in rays)
@@ -151,27 +190,30 @@ def contenders_for(
                 exact=acceptance == "product",
             )
     packed = pack_gaussians(cloud)
-    for constructor in ("sah", "lbvh") if device.is_cuda else ("sah",):
-        plain = PlainBvh(packed, device, constructor)
-        found[f"{PLAIN} {constructor}"] = Contender.of(
-            lambda plain=plain: plain.visibility(origins, directions), baseline=True
-        )
+    in_order = packed.sorted_by(np.argsort(morton_codes(packed.rows[:, 0, :3]), kind="stable"))
+    for form in plain_forms:
+        plain = PlainBvh(in_order if form.sorted else packed, device, form.constructor, fast_math=form.fast_math)
+        found[form.name] = Contender.of(lambda plain=plain: plain.visibility(origins, directions), baseline=True)
     if device.is_cuda:
         return found, {EMBREE: "it runs on the CPU only"}
     try:
         embree = closing.enter_context(EmbreeScene(packed))
     except EmbreeUnavailableError as error:
         return found, {EMBREE: str(error)}
-    found[EMBREE] = Contender.of(lambda: embree.visibility(*rays), threaded=False)
+    found[EMBREE] = Contender.of(lambda: embree.visibility(*rays))
     return found, {}
 
 
-def ratios(name: str, times: dict[str, Times], contenders: dict[str, Contender]) -> dict[str, float]:
-    """Return how many times faster than the fastest form of ``wp.Bvh`` and than Embree."""
-    over_bvh = [times[name].faster_than(times[other]) for other, entry in contenders.items() if entry.baseline]
-    found = {"over_wp_bvh": min(over_bvh)}
+def strongest_bvh(times: dict[str, Times], contenders: dict[str, Contender]) -> str:
+    """Return the fastest form of the loop over ``wp.Bvh``, by its median."""
+    return min((name for name in contenders if contenders[name].baseline), key=lambda n: np.median(times[n].alone))
+
+
+def ratios(name: str, times: dict[str, Times], strongest: str) -> dict[str, dict[str, float]]:
+    """Return how many times faster than the strongest loop over ``wp.Bvh`` and than Embree, within each turn."""
+    found = {"over_wp_bvh": spread(times[strongest].alone / times[name].alone)}
     if EMBREE in times:
-        found["over_embree"] = times[name].faster_than(times[EMBREE])
+        found["over_embree"] = spread(times[EMBREE].alone / times[name].alone)
     return found
 
 
@@ -211,27 +253,17 @@ def measure_torus(effort: Effort, device: Any) -> dict[str, Any]:
     rays = cosine_rays(cloud, effort.points)
     ray_count = len(rays.origins)
     with ExitStack() as closing:
-        contenders, absent = contenders_for(cloud, rays, device, closing)
-        tasks = {name: entry.task for name, entry in contenders.items()}
-        times = take_turns(tasks, effort.repeats, device, two_threads=True)
-        product = contenders["wide product"].transmittances()
-        truth = truth_for(cloud, rays, product, effort.truth_rays)
+        plain = PLAIN_ON_CUDA if device.is_cuda else PLAIN_ON_CPU
+        contenders, absent = contenders_for(cloud, rays, device, closing, plain_forms=plain)
+        times = take_turns({name: entry.task for name, entry in contenders.items()}, effort.repeats, device)
+        strongest = strongest_bvh(times, contenders)
+        truth = truth_for(cloud, rays, contenders["wide product"].transmittances(), effort.truth_rays)
         table: dict[str, Any] = {}
         for name, entry in contenders.items():
-            values, seconds = entry.transmittances(), times[name]
-            row: dict[str, Any] = {"mray_per_second": rates(seconds.alone, ray_count)}
-            if seconds.two_threads is not None:
-                row["mray_per_second_two_threads"] = rates(seconds.two_threads, ray_count)
-                row["thread_gain"] = seconds.thread_gain()
-            row |= ratios(name, times, contenders)
-            row["mean_visibility"] = float(values.mean())
+            rates = spread(ray_count / times[name].alone / 1e6)
+            table[name] = {"mray_per_second": rates, **ratios(name, times, strongest)}
             if entry.exact:
-                row |= errors(values, truth)
-            else:
-                # Rays are sampled independently, each with variance V (1 - V) around the product.
-                spread = math.sqrt(float((product * (1.0 - product)).sum())) / ray_count
-                row["standard_errors_from_product"] = float((values.mean() - product.mean()) / spread)
-            table[name] = row
+                table[name] |= errors(entry.transmittances(), truth)
     return {
         "gaussians": len(cloud),
         "spacing": spacing,
@@ -239,8 +271,30 @@ def measure_torus(effort: Effort, device: Any) -> dict[str, Any]:
         "truth_rays": len(truth.rows),
         "repeats": effort.repeats,
         "clock": "wall" if device.is_cuda else "process CPU time of one thread",
+        "strongest_wp_bvh": strongest,
         "contenders": table,
         "absent": absent,
+        "bernoulli": measure_bernoulli(effort.seeds, cloud, rays, truth, device),
+    }
+
+
+def measure_bernoulli(seeds: int, cloud: GaussianCloud, rays: Rays, truth: Truth, device: Any) -> dict[str, Any]:
+    """Compare the mean of Bernoulli samples over rays with float64, for many seeds.
+
+    Rays are sampled independently, each with variance V (1 - V) around the float64 V, so without bias the error of the
+    mean over its standard error has mean 0 and deviation 1 over the seeds.
+    """
+    scene, options = Scene.from_gaussians(cloud, str(device)), TraceOptions(acceptance="bernoulli")
+    some = [wp.array(array[truth.rows], dtype=wp.vec3, device=device) for array in rays]
+    deviation = math.sqrt((truth.values * (1.0 - truth.values)).sum())
+    drawn = [float(visibility(scene, *some, options=options, seed=seed).numpy().sum()) for seed in range(seeds)]
+    z = (np.array(drawn) - truth.values.sum()) / deviation
+    return {
+        "rays": len(truth.rows),
+        "seeds": seeds,
+        "mean_z": float(z.mean()),
+        "standard_error_of_mean_z": 1.0 / math.sqrt(seeds),
+        "deviation_of_z": float(z.std()),
     }
 
 
@@ -253,7 +307,7 @@ def scene_tasks(cloud: GaussianCloud, device: Any) -> Iterator[tuple[str, Task]]
 def build_tasks(cloud: GaussianCloud, packed: PackedGaussians, device: Any) -> Iterator[tuple[str, Task]]:
     """Yield every way to build or to update what rays traverse; a new one is one more entry here."""
     for name, task in scene_tasks(cloud, device):
-        yield FROM_HOST + name, task
+        yield f"Scene.from_gaussians {name}", task
     placed = [
         wp.array(array, dtype=dtype, device=device)
         for array, dtype in ((cloud.positions, wp.vec3), (cloud.orientations, wp.quat), (cloud.scales, wp.vec3))
@@ -265,15 +319,14 @@ def build_tasks(cloud: GaussianCloud, packed: PackedGaussians, device: Any) -> I
         wp.array(np.ascontiguousarray(part), dtype=wp.vec3, device=device)
         for part in (packed.boxes[:, :3], packed.boxes[:, 3:])
     )
-    constructors = ("sah", "median", "cubql", "lbvh") if device.is_cuda else ("sah", "median", "cubql")
-    for name in constructors:
+    for name in ("sah", "cubql", "lbvh") if device.is_cuda else ("sah", "cubql"):
         yield f"wp.Bvh {name}, boxes given", Task(lambda c=name: wp.Bvh(lowers, uppers, constructor=c, leaf_size=1))
     bvh = wp.Bvh(lowers, uppers, constructor="lbvh" if device.is_cuda else "sah", leaf_size=1)
     yield "wp.Bvh refit", Task(bvh.refit)
     if device.is_cuda:
         return
     for quality in BUILD_QUALITIES:
-        yield f"{EMBREE} {quality}", Task(lambda q=quality: EmbreeScene(packed, q).close(), threaded=False)
+        yield f"{EMBREE} {quality}", Task(lambda q=quality: EmbreeScene(packed, q).close())
 
 
 def measure_builds(effort: Effort, device: Any) -> dict[str, Any]:
@@ -292,14 +345,7 @@ def measure_builds(effort: Effort, device: Any) -> dict[str, Any]:
     held = scene_bytes(cloud, device)
     return {
         "gaussians": len(cloud),
-        "milliseconds": {
-            name: {
-                "median": 1e3 * float(np.median(entry.alone)),
-                "lowest": 1e3 * float(entry.alone.min()),
-                "highest": 1e3 * float(entry.alone.max()),
-            }
-            for name, entry in times.items()
-        },
+        "milliseconds": {name: spread(1e3 * entry.alone) for name, entry in times.items()},
         "bytes_per_gaussian": {name: value / len(cloud) for name, value in held.items()},
         "absent": absent,
     }
@@ -351,23 +397,21 @@ class GrowthCase:
         return cls(gaussians, overlap, opacity, cloud, rays)
 
 
-def measure_growth(effort: Effort, device: Any, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Time the product, its build and its memory over counts, overlaps and opacities.
-
-    All rows take turns with each other. Times are the least of the repeats: the one that was disturbed least.
-    """
+def measure_growth(effort: Effort, device: Any) -> list[dict[str, Any]]:
+    """Time the product, its build and its memory over counts, overlaps and opacities; all rows take turns."""
     settings = [(count, 1.0, 0.9) for count in effort.counts]
-    settings += [(effort.sweep_count, overlap, 0.9) for overlap in effort.overlaps]
-    settings += [(effort.sweep_count, 1.0, opacity) for opacity in effort.opacities]
+    settings += [(effort.gaussians, overlap, 0.9) for overlap in effort.overlaps]
+    settings += [(effort.gaussians, 1.0, opacity) for opacity in effort.opacities]
+    plain = STRONGEST_ON_CUDA if device.is_cuda else PLAIN_ON_CPU
     found: list[dict[str, Any]] = []
     with ExitStack() as closing:
         cases: list[tuple[GrowthCase, dict[str, Contender]]] = []
         for setting in dict.fromkeys(settings):
-            say("growth: {:,} Gaussians, overlap {:g}, opacity {:g}".format(*setting))
             case = GrowthCase.make(effort, *setting)
-            contenders, _ = contenders_for(case.cloud, case.rays, device, closing, acceptances=("product",))
+            contenders, _ = contenders_for(
+                case.cloud, case.rays, device, closing, plain_forms=plain, acceptances=("product",)
+            )
             cases.append((case, contenders))
-        say("growth: timing")
         times = take_turns(
             {(row, name): entry.task for row, (_, entries) in enumerate(cases) for name, entry in entries.items()},
             effort.growth_repeats,
@@ -384,34 +428,33 @@ def measure_growth(effort: Effort, device: Any, say: Callable[[str], None]) -> l
         )
         for row, (case, contenders) in enumerate(cases):
             own = {name: times[row, name] for name in contenders}
+            strongest = strongest_bvh(own, contenders)
             product = contenders["wide product"].transmittances()
             truth_rays = min(effort.truth_rays, max(2, int(BRUTE_FORCE_PAIRS / case.gaussians)))
             truth = truth_for(case.cloud, case.rays, product, truth_rays)
-            traced = {
-                name: {
-                    "nanoseconds_per_ray": 1e9 * float(own[name].alone.min()) / len(case.rays.origins),
-                    **ratios(name, own, contenders),
-                    **errors(entry.transmittances(), truth),
-                }
-                for name, entry in contenders.items()
-            }
-            scenes = {
-                name: {
-                    "build_seconds": float(build_times[row, name].alone.min()),
-                    "bytes_per_gaussian": held / case.gaussians,
-                }
-                for name, held in scene_bytes(case.cloud, device).items()
-            }
             found.append(
                 {
+                    "name": f"{case.gaussians} {case.overlap:g} {case.opacity:g}",
                     "gaussians": case.gaussians,
                     "overlap": case.overlap,
                     "opacity": case.opacity,
                     "rays": len(case.rays.origins),
                     "truth_rays": len(truth.rows),
-                    "mean_visibility": float(product.mean()),
-                    "contenders": traced,
-                    "scenes": scenes,
+                    "contenders": {
+                        name: {
+                            "nanoseconds_per_ray": spread(1e9 * own[name].alone / len(case.rays.origins)),
+                            **ratios(name, own, strongest),
+                            **errors(entry.transmittances(), truth),
+                        }
+                        for name, entry in contenders.items()
+                    },
+                    "scenes": {
+                        name: {
+                            "build_ms": spread(1e3 * build_times[row, name].alone),
+                            "bytes_per_gaussian": held / case.gaussians,
+                        }
+                        for name, held in scene_bytes(case.cloud, device).items()
+                    },
                 }
             )
     return found
@@ -422,139 +465,57 @@ def measure_closest_surface(effort: Effort, device: Any) -> dict[str, Any]:
     cloud, _ = bumpy_torus(effort.gaussians)
     rays = camera_rays(cloud, *effort.image)
     origins, directions = (wp.array(array, dtype=wp.vec3, device=device) for array in rays)
-    scenes = {name: Scene.from_gaussians(cloud, str(device), **build) for name, build in SCENE_BUILDS.items()}
-    tasks = {
-        name: Task(lambda scene=scene: closest_surface(scene, origins, directions)) for name, scene in scenes.items()
-    }
-    times = take_turns(tasks, effort.growth_repeats, device)
+    scene = Scene.from_gaussians(cloud, str(device))
+    times = take_turns({"": Task(lambda: closest_surface(scene, origins, directions))}, effort.growth_repeats, device)
     return {
         "rays": len(rays.origins),
-        "covered": float((visibility(scenes["wide"], *rays) < 0.5).mean()),
-        "mray_per_second": {name: rates(entry.alone, len(rays.origins)) for name, entry in times.items()},
+        "covered": float((visibility(scene, *rays) < 0.5).mean()),
+        "mray_per_second": spread(len(rays.origins) / times[""].alone / 1e6),
     }
 
 
-def measure_parity(effort: Effort) -> dict[str, Any] | None:
-    """Compare CPU and CUDA without the early stop; None where there is no CUDA device.
+def measure_parity(effort: Effort, device: Any) -> dict[str, Any] | None:
+    """Compare a CUDA device with the CPU without the early stop; None on the CPU.
 
     A Gaussian whose alpha is within rounding of the cut 1/255 may count on one device only, which moves V by up to
     1/255: ``rays_beyond_1e-5`` tells such rays from a rounding that all share.
     """
-    if not wp.is_cuda_available():
+    if not device.is_cuda:
         return None
     cloud, _ = bumpy_torus(effort.gaussians)
     rays = cosine_rays(cloud, max(1, effort.parity_rays // 50), seed=2)
-    found: dict[str, Any] = {"rays": len(rays.origins)}
-    for name, build in SCENE_BUILDS.items():
-        here, there = (
-            visibility(Scene.from_gaussians(cloud, device, **build), *rays, options=TraceOptions(stop=0.0))
-            for device in ("cpu", "cuda:0")
-        )
-        gap = np.abs(here.astype(np.float64) - there)
-        found[name] = {
-            "largest": float(gap.max()),
-            "p99.9": float(np.quantile(gap, 0.999)),
-            "rays_beyond_1e-5": int((gap > 1e-5).sum()),
-        }
-    return found
+    here, there = (
+        visibility(Scene.from_gaussians(cloud, name), *rays, options=TraceOptions(stop=0.0))
+        for name in ("cpu", str(device))
+    )
+    gap = np.abs(here.astype(np.float64) - there)
+    return {
+        "rays": len(rays.origins),
+        "largest": float(gap.max()),
+        "p99.9": float(np.quantile(gap, 0.999)),
+        "rays_beyond_1e-5": int((gap > 1e-5).sum()),
+    }
 
 
-def goals(result: dict[str, Any], device: Any) -> list[dict[str, Any]]:
-    """Return what was to be reached beside what was."""
-    table = result["torus"]["contenders"]
-    exact, sampled = table["wide product"], table["wide bernoulli"]
-    rows: list[tuple[str, float | None, str, float]] = [
-        ("exact over wp.Bvh", exact["over_wp_bvh"], ">=", 2.0),
-        ("largest error of V against float64, stop 1e-4", exact["largest_error"], "<=", 2e-4),
-    ]
-    if device.is_cuda:
-        rebuild = result["builds"]["milliseconds"]["Scene.move wide fast"]["median"]
-        rows.append(("Bernoulli over wp.Bvh", sampled["over_wp_bvh"], ">=", 3.0))
-        rows.append(("fast rebuild of arrays on the device [ms]", rebuild, "<=", 2.0))
-    else:
-        rows.append(("exact over Embree", exact.get("over_embree"), ">=", 0.8))
-        rows.append(("two threads over one", exact["thread_gain"], ">=", 1.6))
-    if result["parity"] is not None:
-        rows.append(
-            ("largest difference of V between CPU and CUDA, no stop", result["parity"]["wide"]["largest"], "<=", 1e-5)
-        )
-    if device.is_cuda:
-        rate = result["closest_surface"]["mray_per_second"]["wide"]["median"]
-        rows.append(("sorted Mray/s", rate, ">=", 40.0))
-    return [
-        {
-            "goal": name,
-            "measured": value,
-            "wanted": f"{sign} {wanted:g}",
-            "reached": None if value is None else (value >= wanted if sign == ">=" else value <= wanted),
-        }
-        for name, value, sign, wanted in rows
-    ]
+SECTIONS: dict[str, Callable[[Effort, Any], Any]] = {
+    "torus": measure_torus,
+    "builds": measure_builds,
+    "closest_surface": measure_closest_surface,
+    "parity": measure_parity,
+    "growth": measure_growth,
+}
 
 
-def markdown(result: dict[str, Any]) -> str:
-    """Return the tables that a person reads first."""
-    torus = result["torus"]
-    lines = [
-        f"{result['machine']['device']} ({result['machine']['processor']}), commit {result['commit']}: "
-        f"{torus['gaussians']:,} Gaussians, {torus['rays']:,} rays, {torus['clock']}, median of {torus['repeats']}",
-        "",
-        "| | Mray/s (range) | × wp.Bvh | × Embree | 2 threads | mean V | largest error | where V > 1e-3 |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, row in torus["contenders"].items():
-        rate = row["mray_per_second"]
-        z = row.get("standard_errors_from_product")
-        lines.append(
-            f"| {name} | {rate['median']:.3g} ({rate['lowest']:.3g}–{rate['highest']:.3g}) | {row['over_wp_bvh']:.2f} "
-            f"| {_cell(row.get('over_embree'), '.2f')} | {_cell(row.get('thread_gain'), '.2f', '× ')} "
-            f"| {row['mean_visibility']:.5f} | {_cell(row.get('largest_error'), '.1e')}"
-            f"{'' if z is None else f'{z:+.1f} s.e.'} | {_cell(row.get('largest_error_above_1e-3'), '.1e')} |"
-        )
-    lines += [f"\n{name} is absent: {why}." for name, why in torus["absent"].items()]
-    builds = result["builds"]
-    lines += ["", f"| build of {builds['gaussians']:,} | ms (range) | bytes a Gaussian |", "|---|---|---|"]
-    for name, value in builds["milliseconds"].items():
-        held = builds["bytes_per_gaussian"].get(name.removeprefix(FROM_HOST))
-        lines.append(
-            f"| {name} | {value['median']:.3g} ({value['lowest']:.3g}–{value['highest']:.3g}) | {_cell(held, '.0f')} |"
-        )
-    growth = result["growth"]
-    names = list(growth[0]["contenders"])
-    lines += ["", "| Gaussians, overlap, opacity | " + " | ".join(f"{name} [ns/ray]" for name in names) + " | mean V |"]
-    lines.append("|---" * (len(names) + 2) + "|")
-    for row in growth:
-        cells = " | ".join(f"{row['contenders'][name]['nanoseconds_per_ray']:.3g}" for name in names)
-        label = f"{row['gaussians']:,}, {row['overlap']:g}, {row['opacity']:g}"
-        lines.append(f"| {label} | {cells} | {row['mean_visibility']:.4f} |")
-    lines += ["", "| goal | wanted | measured | |", "|---|---|---|---|"]
-    marks = {True: "reached", False: "missed", None: "not measured"}
-    lines += [
-        f"| {row['goal']} | {row['wanted']} | {_cell(row['measured'], '.3g')} | {marks[row['reached']]} |"
-        for row in result["goals"]
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _cell(value: float | None, form: str, before: str = "") -> str:
-    """Return a number for a table, nothing for None."""
-    return "" if value is None else f"{before}{value:{form}}"
-
-
-def measure(effort: Effort, device: Any, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return everything that is measured, ready for JSON; ``say`` hears what is being done."""
-    result: dict[str, Any] = {"machine": machine(device)}
-    say("torus")
-    result["torus"] = measure_torus(effort, device)
-    say("builds")
-    result["builds"] = measure_builds(effort, device)
-    result["growth_sweep_gaussians"] = effort.sweep_count
-    result["growth"] = measure_growth(effort, device, say)
-    say("closest surface, CPU against CUDA")
-    result["closest_surface"] = measure_closest_surface(effort, device)
-    result["parity"] = measure_parity(effort)
-    result["load_average_after"] = machine(device)["load_average"]
-    result["goals"] = goals(result, device)
+def measure(effort: Effort, device: Any, write: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Measure every section, and write after each; one that fails is named under ``failed``."""
+    result: dict[str, Any] = {"failed": {}}
+    for name, section in SECTIONS.items():
+        print(name, file=sys.stderr, flush=True)
+        try:
+            result[name] = section(effort, device)
+        except Exception:
+            result["failed"][name] = traceback.format_exc(limit=-3)
+        write(result)
     return result
 
 
@@ -562,14 +523,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     record.add_arguments(parser)
-    parser.add_argument("--quick", action="store_true", help="fewer rays and repeats: a minute on two cores")
+    parser.add_argument("--quick", action="store_true", help="fewer rays and repeats")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
-    result = measure(effort, device, lambda text: print(text, file=sys.stderr, flush=True))
-    record.write_result(arguments, device, result)
-    print(markdown(result), end="")
-    return 0
+    result = measure(effort, device, lambda found: record.write_result(arguments, device, found))
+    return 1 if result["failed"] else 0
 
 
 if __name__ == "__main__":

@@ -23,8 +23,6 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.quaternions import rotation_matrices
 
-wp.set_module_options({"enable_backward": False})
-
 COMPILER_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared")
 """Not -ffast-math: loading a library built with it changes denormals for the whole process, and it gains nothing."""
 
@@ -44,6 +42,10 @@ class PackedGaussians(NamedTuple):
     rows: NDArray[np.float32]
     boxes: NDArray[np.float32]
 
+    def sorted_by(self, order: NDArray[np.integer]) -> PackedGaussians:
+        """Return them in another order in memory."""
+        return PackedGaussians(self.rows[order], self.boxes[order])
+
 
 def pack_gaussians(cloud: GaussianCloud) -> PackedGaussians:
     """Pack every Gaussian that a ray can see, without recentring or clamping: for scenes that need neither."""
@@ -62,57 +64,58 @@ def pack_gaussians(cloud: GaussianCloud) -> PackedGaussians:
     return PackedGaussians(rows, np.concatenate([centers - halves, centers + halves], axis=1).astype(np.float32))
 
 
-@wp.kernel
-def trace_plain_bvh_kernel(
-    first: int,
-    bvh: wp.uint64,
-    rows: wp.array2d[wp.vec4],
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    stop: float,
-    out_transmittance: wp.array[float],
-):
-    i = first + wp.tid()
-    origin = origins[i]
-    direction = directions[i]
-    v = wp.float32(1.0)
-    query = wp.bvh_query_ray(bvh, origin, direction)
-    index = wp.int32(0)
-    while wp.bvh_query_next(query, index):
-        head = rows[index, 0]
-        a = rows[index, 1]
-        b = rows[index, 2]
-        c = rows[index, 3]
-        p = origin - wp.vec3(head[0], head[1], head[2])
-        t_closest = -wp.dot(p, direction)
-        p = p + direction * t_closest
-        row_a = wp.vec3(a[0], a[1], a[2])
-        row_b = wp.vec3(b[0], b[1], b[2])
-        row_c = wp.vec3(c[0], c[1], c[2])
-        q = wp.vec3(wp.dot(row_a, p), wp.dot(row_b, p), wp.dot(row_c, p))
-        d = wp.vec3(wp.dot(row_a, direction), wp.dot(row_b, direction), wp.dot(row_c, direction))
-        dd = wp.dot(d, d)
-        x = wp.cross(q, d)
-        xx = wp.dot(x, x)
-        if xx < a[3] * dd and t_closest - wp.dot(q, d) / dd > 0.0:
-            alpha = wp.min(ALPHA_MAX, head[3] * wp.exp(-0.5 * xx / dd))
-            if alpha >= ALPHA_MIN:
-                v *= 1.0 - alpha
-                if v < stop:
-                    break
-    out_transmittance[i] = v
+def make_plain_bvh_kernel(fast_math: bool) -> Any:
+    """Return the loop as a kernel of its own, compiled with or without Warp's fast math."""
 
-
-def launch_trace_plain_bvh(bvh, rows, origins, directions, stop, out_transmittance, device):
-    """Trace one ray a thread through ``wp.Bvh``."""
-    launch(
-        trace_plain_bvh_kernel,
-        len(origins),
-        inputs=[bvh.id, rows, origins, directions, stop],
-        outputs=[out_transmittance],
-        device=device,
-        block_dim=64,
+    @wp.kernel(
+        name="trace_plain_bvh_fast" if fast_math else "trace_plain_bvh",
+        enable_backward=False,
+        module="unique",
+        module_options={"fast_math": fast_math},
     )
+    def trace_plain_bvh_kernel(
+        first: int,
+        bvh: wp.uint64,
+        rows: wp.array2d[wp.vec4],
+        origins: wp.array[wp.vec3],
+        directions: wp.array[wp.vec3],
+        stop: float,
+        out_transmittance: wp.array[float],
+    ):
+        i = first + wp.tid()
+        origin = origins[i]
+        direction = directions[i]
+        v = wp.float32(1.0)
+        query = wp.bvh_query_ray(bvh, origin, direction)
+        index = wp.int32(0)
+        while wp.bvh_query_next(query, index):
+            head = rows[index, 0]
+            a = rows[index, 1]
+            b = rows[index, 2]
+            c = rows[index, 3]
+            p = origin - wp.vec3(head[0], head[1], head[2])
+            t_closest = -wp.dot(p, direction)
+            p = p + direction * t_closest
+            row_a = wp.vec3(a[0], a[1], a[2])
+            row_b = wp.vec3(b[0], b[1], b[2])
+            row_c = wp.vec3(c[0], c[1], c[2])
+            q = wp.vec3(wp.dot(row_a, p), wp.dot(row_b, p), wp.dot(row_c, p))
+            d = wp.vec3(wp.dot(row_a, direction), wp.dot(row_b, direction), wp.dot(row_c, direction))
+            dd = wp.dot(d, d)
+            x = wp.cross(q, d)
+            xx = wp.dot(x, x)
+            if xx < a[3] * dd and t_closest - wp.dot(q, d) / dd > 0.0:
+                alpha = wp.min(ALPHA_MAX, head[3] * wp.exp(-0.5 * xx / dd))
+                if alpha >= ALPHA_MIN:
+                    v *= 1.0 - alpha
+                    if v < stop:
+                        break
+        out_transmittance[i] = v
+
+    return trace_plain_bvh_kernel
+
+
+PLAIN_BVH_KERNELS = {fast_math: make_plain_bvh_kernel(fast_math) for fast_math in (False, True)}
 
 
 class PlainBvh:
@@ -122,11 +125,12 @@ class PlainBvh:
         packed: Gaussians.
         device: Warp device.
         constructor: Of ``wp.Bvh``.
+        fast_math: Whether the kernel is compiled with Warp's fast math, as ours is.
     """
 
-    def __init__(self, packed: PackedGaussians, device: Any, constructor: str) -> None:
+    def __init__(self, packed: PackedGaussians, device: Any, constructor: str, *, fast_math: bool = False) -> None:
         """Upload and build."""
-        self._device = device
+        self._device, self._kernel = device, PLAIN_BVH_KERNELS[fast_math]
         self._rows = wp.array(packed.rows, dtype=wp.vec4, device=device)
         lowers, uppers = (
             wp.array(np.ascontiguousarray(part), dtype=wp.vec3, device=device)
@@ -135,9 +139,16 @@ class PlainBvh:
         self._bvh = wp.Bvh(lowers, uppers, constructor=constructor, leaf_size=1)
 
     def visibility(self, origins: wp.array, directions: wp.array, *, stop: float = TRANSMITTANCE_STOP) -> wp.array:
-        """Return transmittances ``(N,)`` on the device."""
+        """Return transmittances ``(N,)`` on the device, of one ray a thread."""
         result = wp.empty(len(origins), dtype=float, device=self._device)
-        launch_trace_plain_bvh(self._bvh, self._rows, origins, directions, stop, result, self._device)
+        launch(
+            self._kernel,
+            len(origins),
+            inputs=[self._bvh.id, self._rows, origins, directions, stop],
+            outputs=[result],
+            device=self._device,
+            block_dim=64,
+        )
         return result
 
 

@@ -1,0 +1,84 @@
+"""What pages say of estimators: samplers, densities, and the chart of error against time."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tables import Row, Rows, figure, number, step, table
+
+from beam_warp.study.picture import write_image
+from beam_warp.study.table import read_table
+
+BALL_AND_FIGURE = "estimators_cpu.json", "estimators_figure_cpu.json"
+
+
+@table("sampling_occlusion", *BALL_AND_FIGURE)
+def sampling_occlusion(ball: Row, human: Row) -> Rows:
+    """Ambient occlusion by sampler and rays."""
+    rows: list[list[Any]] = [["rays", "ball on a floor by a wall", "worth", "figure", "worth"]]
+    for on_ball, on_figure in zip(ball["occlusion"]["rows"], human["occlusion"]["rows"], strict=True):
+        cells = [(f"{row['psnr_db']:.1f} dB", f"{row['worth_iid_rays']:.0f}") for row in (on_ball, on_figure)]
+        rows.append([on_ball["name"], *cells[0], *cells[1]])
+    return rows
+
+
+@table("sampling_irradiance", *BALL_AND_FIGURE)
+def sampling_irradiance(ball: Row, human: Row) -> Rows:
+    """Relative error of irradiance by estimator, under every sky."""
+    skies = [(name, sky) for name, result in (("ball", ball), ("figure", human)) for sky in result["skies"].values()]
+    rows: list[list[Any]] = [["", *(f"{name}: {sky['peak_over_mean']:,.0f}" for name, sky in skies)]]
+    for place, row in enumerate(skies[0][1]["rows"]):
+        rows.append([row["name"], *(f"{sky['rows'][place]['relative_rmse']:.3f}" for _, sky in skies)])
+    return rows
+
+
+@number("sampling_bias", *BALL_AND_FIGURE)
+def sampling_bias(ball: Row, human: Row) -> float:
+    """The largest mean error of the default estimator and of MIS at 64 rays, in its standard errors."""
+    return max(
+        abs(step(sky["rows"], name)["bias_in_standard_errors"])
+        for result in (ball, human)
+        for sky in result["skies"].values()
+        for name in ("product_ratio_owen_64", "mis_ratio_owen_64")
+    )
+
+
+@figure("estimators.png", BALL_AND_FIGURE[0])
+def estimators(result: Row, path: Path) -> None:
+    """Draw error against rays, both logarithmic: one panel for occlusion, one a sky."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    counts = result["curve_counts"]
+    panels = {"occlusion": result["occlusion"], **result["skies"]}
+    drawing, axes = plt.subplots(1, len(panels), figsize=(4.4 * len(panels), 4.6), layout="constrained")
+    colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(n for p in panels.values() for n in p["curves"]))}
+    for axis, (name, panel) in zip(axes, panels.items(), strict=True):
+        for label, errors in panel["curves"].items():
+            axis.loglog(counts, errors, "o-", ms=3.5, label=label, color=colors[label])
+        first = next(iter(panel["curves"].values()))[0]
+        axis.loglog(counts, [first * math.sqrt(counts[0] / c) for c in counts], "--", color="0.6", label="1/√rays")
+        peak = "" if name == "occlusion" else f", peak {panel['peak_over_mean']:g} × mean"
+        axis.set_title(name + peak)
+        axis.set_xlabel("rays a point")
+        axis.set_xticks(counts, [str(c) for c in counts])
+        axis.minorticks_off()
+        axis.grid(True, which="both", alpha=0.25)
+        axis.legend(fontsize=7)
+    axes[0].set_ylabel("error (RMS; irradiance: relative)")
+    drawing.savefig(path, dpi=110)
+    plt.close(drawing)
+
+
+@figure("chart_tracing.png", "chart_tracing_h200.json")
+def chart_tracing(result: Row, path: Path) -> None:
+    """Draw what the command draws."""
+    with tempfile.TemporaryDirectory() as folder:
+        rows = Path(folder) / "tracing.csv"
+        rows.write_text("\n".join(result["table"]) + "\n", encoding="utf-8")
+        write_image(read_table(rows), path)
