@@ -106,7 +106,7 @@ QUICK = Effort(
     repeats=2,
     large_size=(96, 54),
     large_views=4,
-    large_tracked=2,
+    large_tracked=3,
     samples=2,
     surface_samples=2_000,
     fitting={"color_iterations": 8, "normal_iterations": 8, "refine_every": 4},
@@ -190,7 +190,7 @@ class Bench:
 def measure_captures(bench: Bench) -> Iterator[Row]:
     """Yield scores of the frames with truth of every capture, drift up to the last of them, and seconds."""
     bench.warm(bench.capture)
-    found: Row = {}
+    rows: list[Row] = []
     for name, capture in bench.captures.items():
         contender = bench.make(bench.fitting, bench.effort.tracking)
         known = truth_frames(capture)
@@ -206,7 +206,8 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
             device=bench.device.alias,
         )
         views = capture.select(split="train", frames=frames[:1])
-        found[name] = {
+        row = {
+            "name": name,
             "views": len(views),
             "size": [views[0].camera.width, views[0].camera.height],
             "frames": [
@@ -215,10 +216,10 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
                     "seconds": entry.seconds,
                     "training_psnr": entry.report["psnr"],
                     "lost": entry.report.get("lost", ""),
-                    "drift": row.as_dict(),
+                    "drift": moved.as_dict(),
                     **(bench.scored(contender, entry, capture) if entry.frame in known else {}),
                 }
-                for entry, row in zip(modelled, drift, strict=True)
+                for entry, moved in zip(modelled, drift, strict=True)
             ],
             "drawn": drawn(bench, modelled[0], capture, contender.options),
             "first_seconds": spread([modelled[0].seconds]),
@@ -229,13 +230,14 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
             write_sequence(path, capture, modelled, contender.options or CLASSIC)
         if capture is bench.capture:
             again = [next(bench.follow(contender, capture, frames[:1])) for _ in range(bench.effort.repeats - 1)]
-            found[name]["first_seconds"] = spread([entry.seconds for entry in (modelled[0], *again)])
-            found[name]["same_bits"] = all(
+            row["first_seconds"] = spread([entry.seconds for entry in (modelled[0], *again)])
+            row["same_bits"] = all(
                 np.array_equal(array, modelled[0].cloud.arrays()[key])
                 for entry in again
                 for key, array in entry.cloud.arrays().items()
             )
-        yield found
+        rows.append(row)
+        yield {"rows": rows}
 
 
 def drawn(bench: Bench, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None) -> Row:

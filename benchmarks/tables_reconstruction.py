@@ -48,7 +48,8 @@ def results(main: Row) -> Rows:
 
 def _scored_frames(main: Row) -> Iterator[tuple[str, Row, Row]]:
     """Yield a label, the row and the seconds of every frame with truth of every capture."""
-    for name, part in main["captures"].items():
+    for part in main["captures"]["rows"]:
+        name = part["name"]
         first, *others = [row for row in part["frames"] if "psnr" in row]
         yield f"{name}, frame {first['frame']}", first, part["first_seconds"]
         for row in others:
@@ -73,10 +74,10 @@ def _scores(label: str, row: Row, seconds: Row) -> list[str]:
 def drawn(main: Row) -> Rows:
     """Return what first frames score when they are drawn as they were fitted, and as splat viewers draw."""
     rows = []
-    for name, part in main["captures"].items():
+    for part in main["captures"]["rows"]:
         side = part["frames"][0]["samples"]
         found = (part["drawn"][f"{way}_{samples}"] for samples in SAMPLES for way in ("fitted", "classic"))
-        rows.append([f"{name}, {side} × {side} samples in the fit", *(f"{value:.1f} dB" for value in found)])
+        rows.append([f"{part['name']}, {side} × {side} samples in the fit", *(f"{value:.1f} dB" for value in found)])
     heads = (f"{way}, {samples}" for samples in SAMPLES.values() for way in ("as fitted", "classically"))
     return [["", *heads], *rows]
 
@@ -138,13 +139,13 @@ def large(main: Row) -> Rows:
 @number("frames_tracked", MAIN)
 def frames_tracked(main: Row) -> int:
     """Return the number of tracked frames of all captures."""
-    return sum(len(part["frames"]) - 1 for part in main["captures"].values())
+    return sum(len(part["frames"]) - 1 for part in main["captures"]["rows"])
 
 
 @number("frames_lost", MAIN)
 def frames_lost(main: Row) -> int:
     """Return the number of those that were lost."""
-    return sum(bool(row["lost"]) for part in main["captures"].values() for row in part["frames"])
+    return sum(bool(row["lost"]) for part in main["captures"]["rows"] for row in part["frames"])
 
 
 @number("host_growth", MAIN)
@@ -190,15 +191,18 @@ def draw(main: Row, choices: Row, path: Path) -> None:
         counts = [entry[across] for entry in rows]
         for axes, (title, value) in zip(row, MEASURES, strict=False):
             axes.plot(counts, [value(entry) for entry in rows], "o-", label="in the box")
-            axes.set(title=title, xlabel=across, ylim=(0.0, None) if axes is not row[0] else None)
+            axes.set(title=title, xlabel=across)
         row[0].plot(counts, [entry["whole_psnr"] for entry in rows], "s--", label="of whole images")
         row[0].legend()
+    for axes in panels[:, 1:3].flat:
+        axes.set_ylim(0.0, None)
     for axes in panels[0, :3]:
         axes.set_xscale("log")
         counts = sorted({entry["gaussians"] for entry in [*choices["gaussians"]["rows"], ours]})
         axes.set_xticks(counts, [f"{count / 1000:g}k" for count in counts])
         axes.set_xticks([], minor=True)
-    for name, part in main["captures"].items():
+    for part in main["captures"]["rows"]:
+        name = part["name"]
         frames = [row["frame"] for row in part["frames"]]
         panels[0, 3].plot(frames, [row["drift"]["vertices"]["mean_mm"] for row in part["frames"]], "o-", label=name)
         panels[1, 3].plot(frames, [row["training_psnr"] for row in part["frames"]], "o-", label=name)

@@ -121,14 +121,14 @@ class TestSections:
         kept = []
         result = benchmark.measure(bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist)))
         assert result["failed"] == []
-        assert len(kept) == 2 + 3 + 4 + 6 + 1 + 1 + 1  # after every row
-        walker = result["captures"]["walker"]
+        assert len(kept) == 2 + 4 + 4 + 6 + 1 + 1 + 1  # after every row
+        walker, _ = result["captures"]["rows"]
         assert [row["frame"] for row in walker["frames"]] == [0, 1]
         assert walker["frames"][0]["surface"]["chamfer_mm"] < 1e-3  # the made-up mesh is the truth
         assert walker["frames"][1]["drift"]["gaussians"]["p95_mm"] < 0.01
         assert walker["first_seconds"]["count"] == TINY.repeats
         assert walker["same_bits"]
-        assert [row["steps"] for row in result["large"]["frames"]] == ["default", "default", "draft"]
+        assert [row["steps"] for row in result["large"]["frames"]] == ["default", "default", "draft", "draft"]
         for function in (tables.captures, tables.results, tables.drawn, tables.large, tables.rade, tables.variants):
             head, *rows = function(result)
             assert len(rows) >= 2
