@@ -79,7 +79,7 @@ class Effort:
     """
 
     gaussians: int = 140_000
-    counts: tuple[int, ...] = (20_000, 50_000, 300_000)
+    counts: tuple[int, ...] = (20_000, 50_000)
     cameras: tuple[int, ...] = (8, 12, 16)
     few: tuple[int, int] = (20_000, 60_000)
     long: int = 4
