@@ -388,14 +388,13 @@ def trials(make: Callable[[Bench], Sequence[Trial]]) -> Callable[[Bench], Iterat
         rows: list[Row] = []
         names = training_cameras(bench.capture)
         for trial in make(bench):
-            fewer = trial.cameras is not None and trial.cameras < len(names)
+            count = min(trial.cameras or len(names), len(names))
             # What counts of the surface is what these cameras see: fewer cameras are judged by less of it.
-            capture = with_cameras(bench.capture, evenly(names, trial.cameras)) if fewer else bench.capture
+            capture = bench.capture if count == len(names) else with_cameras(bench.capture, evenly(names, count))
             contender = bench.make(trial.options, bench.effort.tracking)
             modelled = next(bench.follow(contender, capture, truth_frames(capture)[:1]))
             steps = trial.options.color_iterations + trial.options.normal_iterations
-            cameras = trial.cameras if fewer else len(names)
-            row = {"name": trial.name, "cameras": cameras, "steps": steps, "seconds": modelled.seconds}
+            row = {"name": trial.name, "cameras": count, "steps": steps, "seconds": modelled.seconds}
             rows.append(row | bench.scored(contender, modelled, capture))
             yield {"rows": rows}
 

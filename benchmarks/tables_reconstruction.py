@@ -172,7 +172,9 @@ def exposures(result: Row) -> Rows:
             reported, cases = (sum(part[key] for part in parts) for key in ("found", "cases"))
             cells.append(f"{low:.2f} to {high:.2f}, {reported} of {cases} reported")
         ends = [max(row[key] for row in same) for key in ("sound", "others")]
-        found.append([f"{count}", f"{ends[0]:.2f}", *cells, f"{ends[1]:.2f}", f"{sum(row['blamed'] for row in same)}"])
+        right = len(same) * (count + len(errors) * count * (count - 1))  # views that were compared as they are
+        blamed = f"{sum(row['blamed'] for row in same)} of {right:,}"
+        found.append([f"{count}", f"{ends[0]:.2f}", *cells, f"{ends[1]:.2f}", blamed])
     return found
 
 
