@@ -34,7 +34,7 @@ POINTS = 1_500
 REDUCTION = 4
 
 WRONG = (-1.0, -0.5, 0.5, 1.0)
-"""By how much a view is made wrong [stop]."""
+"""Errors of exposure that a view is given [stop]."""
 
 
 def measure(views: Sequence[CapturedView], device: str) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def main() -> int:
             chosen = with_cameras(capture, evenly(training_cameras(capture), count))
             records = chosen.select(split="train", frames=capture.frames[:1])
             views = [record.view().reduced(REDUCTION) for record in records]
-            rows.append({"name": name, "cameras": count, **measure(views, arguments.device)})
+            rows.append({"name": f"{name} {count}", "cameras": count, **measure(views, arguments.device)})
             print(rows[-1], file=sys.stderr, flush=True)
             record.write_result(arguments, resolve_device(arguments.device), {"rows": rows})
     return 0
