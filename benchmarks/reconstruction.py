@@ -1,68 +1,61 @@
-"""Quality of a reconstruction, its loss over tracked frames, and its time.
+"""Quality of reconstructions, their loss over tracked frames, their time and memory, and what each choice is worth.
 
-    python benchmarks/reconstruction.py [--device cuda:0] [--data DIR] [--out results.json] [--only SECTION] [--quick]
+    python benchmarks/reconstruction.py --out FILE [--device cuda:0] [--data DIR] [--only SECTION ...] [--keep DIR]
 
-Sections: ``walker`` scores the first and the last frame with truth, for ours and for others' settings, with drift in
-every frame; ``gaussians`` and ``cameras`` vary the number of either on the first frame; ``large`` times the first and
-the tracked frames of a capture of 24 views of 1920 x 1080, which is path traced first, and says what memory it takes;
-``stability`` runs the captures on which reconstructions fail. ``--quick`` takes the demo's capture and few Gaussians.
+Timed, so alone on a device: ``captures`` fits the first frame with truth of three captures by the defaults and tracks
+to the last; ``large`` does so for images of 1920 x 1080, which are path traced first, and then goes back and forth
+between their two frames in few steps, to say what memory a longer take needs.
 
-Images are read before the clock starts; scores and meshes are made after it stops. A section that fails says so in its
-place, and the program returns 1. Writes the JSON after each section, and tables to the terminal.
+Scored only, each row the walker's first frame: ``rade`` has others' choices, made ours one by one, ``rade_long`` the
+last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
+and ``cameras`` vary the number of either.
+
+``--keep DIR`` writes the sequences of ``captures`` as ``DIR/NAME/gaussians.usda``, for benchmarks that need them.
+``--quick`` takes the demo's capture and few Gaussians: does all of it run? Images are read before the clock starts;
+scores and meshes are made after it stops. A section that fails says so in its place, and the program returns 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import os
-import resource
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import record
+from device_memory import peak_memory
 from reconstruction_captures import write_large_capture
-from reconstruction_contenders import Contender, ModelledFrame, follow, ours, rade_gs_like, reconstruct_stressed
-from timing import machine
+from reconstruction_contenders import Contender, ModelledFrame, follow, of_options, write_sequence
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.mesh.distances import SAMPLE_COUNT
+from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
-from beam_warp.reconstruction.scores import FrameScores, read_truth_mesh, score_frame, truth_frames
-from beam_warp.stability.capture_cases import CAPTURE_CASES, TRACED_CASES
+from beam_warp.reconstruction.fit import FitOptions
+from beam_warp.reconstruction.joint_tracking import JointOptions
+from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, truth_frames
+from beam_warp.reconstruction.targets import MOST_SAMPLES
+from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.stability.capture_cases.alterations import evenly, training_cameras, with_cameras
-from beam_warp.stability.capture_cases.studio import StressStudio
-from beam_warp.stability.captures import run_capture_case
 
 Row = dict[str, Any]
 
-Make = Callable[[str, int], Contender]
-"""Makes a contender of a name, `OURS` or one of `OTHERS`, for a number of Gaussians."""
+CAPTURES = ("walker", "runner", "robot")
 
-OURS = "ours"
-RADE_GS_LIKE = "RaDe-GS-like settings"
-OTHERS = (RADE_GS_LIKE,)
-
-TARGETS = {
-    "psnr": (37.0, "at least"),
-    "whole_psnr": (37.0, "at least"),
-    "normals_median_degrees": (6.0, "at most"),
-    "chamfer_mm": (2.0, "at most"),
-}
-"""Targets of the first frame: PSNR in the subject's box, and of whole images."""
-
-LARGEST_LOSS = {"psnr": 1.0, "chamfer_mm": 1.0}
-"""Largest loss of the last frame."""
-
-PAPER = {"psnr_20_cameras": 34.56, "psnr_30_cameras": 38.40}
+CLASSIC = RasterOptions()
+"""How programs draw splats that state nothing."""
 
 
 @dataclass(frozen=True)
@@ -70,182 +63,212 @@ class Effort:
     """Amount that is measured.
 
     Attributes:
-        gaussians: Gaussians of every measurement but the ablation over them.
-        counts: Gaussians of that ablation.
-        cameras: Cameras of the other one.
-        large_gaussians: Gaussians of the capture at full resolution.
-        large_size: Its images.
+        gaussians: Gaussians of every measurement that does not say otherwise.
+        counts: Gaussians of the sweep over them, beside those.
+        cameras: Cameras of the other sweep, beside all of them.
+        few: Gaussians of the first and of the later rows of ``variants``.
+        long: Steps of ``rade_long`` over ours.
+        repeats: Fits of the first capture's first frame.
+        large_size: Images of ``large``.
         large_views: Its training cameras.
-        large_frames: Its frames.
+        large_tracked: Its tracked frames.
         samples: Paths per pixel of what is path traced here.
         surface_samples: Points on each surface of a Chamfer distance.
-        iterations: Of others' settings; None for theirs.
         fitting: Changes of our defaults.
+        tracking: How frames are tracked.
     """
 
-    gaussians: int
-    counts: tuple[int, ...]
-    cameras: tuple[int, ...]
-    large_gaussians: int
-    large_size: tuple[int, int]
-    large_views: int
-    large_frames: int
-    samples: int
-    surface_samples: int
-    iterations: int | None
-    fitting: Row
+    gaussians: int = 140_000
+    counts: tuple[int, ...] = (20_000, 50_000)
+    cameras: tuple[int, ...] = (8, 12, 16)
+    few: tuple[int, int] = (20_000, 60_000)
+    long: int = 4
+    repeats: int = 3
+    large_size: tuple[int, int] = (1920, 1080)
+    large_views: int = 24
+    large_tracked: int = 8
+    samples: int = 32
+    surface_samples: int = SAMPLE_COUNT
+    fitting: Row = field(default_factory=dict)
+    tracking: TrackOptions = field(default_factory=TrackOptions)
 
 
-FULL = Effort(
-    gaussians=140_000,
-    counts=(20_000, 50_000, 100_000, 200_000, 300_000),
-    cameras=(8, 12, 16, 24),
-    large_gaussians=140_000,
-    large_size=(1920, 1080),
-    large_views=24,
-    large_frames=4,
-    samples=32,
-    surface_samples=SAMPLE_COUNT,
-    iterations=None,
-    fitting={},
+BRIEF = TrackOptions(
+    joints=JointOptions(levels=(2,), iterations=(4,)),
+    refinement=replace(TrackOptions().refinement, normal_iterations=4),
 )
 QUICK = Effort(
     gaussians=2_000,
-    counts=(1_000, 2_000),
-    cameras=(4, 8),
-    large_gaussians=2_000,
+    counts=(1_000,),
+    cameras=(4,),
+    few=(500, 1_000),
+    long=2,
+    repeats=2,
     large_size=(96, 54),
     large_views=4,
-    large_frames=2,
+    large_tracked=3,
     samples=2,
     surface_samples=2_000,
-    iterations=60,
-    fitting={"color_iterations": 30, "normal_iterations": 30},
+    fitting={"color_iterations": 8, "normal_iterations": 8, "refine_every": 4},
+    tracking=BRIEF,
 )
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Arguments that all sections share.
+    """Inputs that all sections share.
 
     Attributes:
-        capture: The capture with truth.
+        captures: Captures with truth, by name; the first is the one of all sections but ``captures``.
         effort: Amount that is measured.
         make: Makes contenders.
         device: Where they run.
         say: Hears what is being done.
+        keep: Folder of the sequences of ``captures``; None for none.
     """
 
-    capture: Capture
+    captures: Mapping[str, Capture]
     effort: Effort
-    make: Make
+    make: Callable[[FitOptions, TrackOptions], Contender]
     device: Any
     say: Callable[[str], None]
+    keep: Path | None = None
 
-    def scored(self, contender: Contender, modelled: ModelledFrame, capture: Capture | None = None) -> Row:
-        """Return the scores of a frame that has truth, its surface included, beside what it cost."""
-        chosen = capture or self.capture
-        seeing = [record.camera for record in chosen.select(split="train", frames=[modelled.frame])]
-        scores: FrameScores = score_frame(
+    @property
+    def capture(self) -> Capture:
+        """The first of the captures."""
+        return next(iter(self.captures.values()))
+
+    @property
+    def fitting(self) -> FitOptions:
+        """How ours fits."""
+        return FitOptions(gaussian_count=self.effort.gaussians, **self.effort.fitting)
+
+    def follow(self, contender: Contender, capture: Capture, frames: Sequence[int]) -> Iterator[ModelledFrame]:
+        """Fit the first of some frames, and track the others."""
+        return follow(contender, capture, frames, self.device, self.say)
+
+    def scored(self, contender: Contender, modelled: ModelledFrame, capture: Capture) -> Row:
+        """Return the scores of a frame: of test views where it has some, of its surface where that is known.
+
+        Views are drawn with the samples of the fit; ``fine_psnr`` is with `MOST_SAMPLES`, the same for all.
+        """
+        seeing = [record.camera for record in capture.select(split="train", frames=[modelled.frame])]
+        draw = partial(self.psnr, modelled, capture, contender.options)
+        scores = score_frame(
             modelled.cloud,
-            chosen.select(split="test", frames=[modelled.frame]),
+            capture.select(split="test", frames=[modelled.frame]),
             contender.mesh(modelled.cloud, seeing),
-            truth_mesh=read_truth_mesh(chosen, modelled.frame),
+            truth_mesh=read_truth_mesh(capture, modelled.frame),
             seeing=seeing,
             options=contender.options,
             samples=modelled.samples,
             sample_count=self.effort.surface_samples,
             device=self.device.alias,
-        )
+        ).as_dict()
+        same = modelled.samples == MOST_SAMPLES
         return {
-            "frame": modelled.frame,
             "gaussians": len(modelled.cloud),
-            "seconds": round(modelled.seconds, 3),
-            **scores.as_dict(),
+            "samples": modelled.samples,
+            **scores,
+            "fine_psnr": scores["psnr"] if same else draw(MOST_SAMPLES),
         }
 
-    def first_frame(self, capture: Capture, contender: Contender) -> Row:
-        """Return the scores of the first frame with truth of a capture."""
-        frame = truth_frames(capture)[0]
-        return self.scored(contender, next(follow(contender, capture, [frame], self.device, self.say)), capture)
+    def psnr(self, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None, samples: int) -> float:
+        """Return the PSNR of test views in the subject's box, drawn in some way [dB]."""
+        records = capture.select(split="test", frames=[modelled.frame])
+        return score_frame(modelled.cloud, records, options=options, samples=samples, device=self.device.alias).psnr
+
+    def warm(self, capture: Capture) -> None:
+        """Compile and load what is timed afterwards."""
+        few = replace(
+            self.fitting, gaussian_count=500, color_iterations=2, normal_iterations=2, refine_every=2, samples=2
+        )
+        list(follow(self.make(few, BRIEF), capture, capture.frames[:2], self.device))
 
 
-def measure_walker(bench: Bench) -> Row:
-    """Score the first and last frame with truth of every contender, and drift between them."""
-    capture = bench.capture
-    known = truth_frames(capture)
-    frames = [frame for frame in capture.frames if known[0] <= frame <= known[-1]]
-    meshes = [read_truth_mesh(capture, frame) for frame in frames]
-    seeing = [record.camera for record in capture.select(split="train", frames=frames[:1])]
-    found: Row = {"paper": PAPER, "targets": {name: value for name, (value, _) in TARGETS.items()}, "contenders": {}}
-    for name in (OURS, *OTHERS):
-        contender = bench.make(name, bench.effort.gaussians)
-        modelled = list(follow(contender, capture, frames, bench.device, bench.say))
-        rows = [bench.scored(contender, entry) for entry in modelled if entry.frame in (known[0], known[-1])]
+def measure_captures(bench: Bench) -> Iterator[Row]:
+    """Yield scores of the frames with truth of every capture, drift up to the last of them, and seconds."""
+    bench.warm(bench.capture)
+    rows: list[Row] = []
+    for name, capture in bench.captures.items():
+        contender = bench.make(bench.fitting, bench.effort.tracking)
+        known = truth_frames(capture)
+        last = max(known[-1], known[0] + 1)  # a capture of one frame with truth is tracked for one, too
+        frames = [frame for frame in capture.frames if known[0] <= frame <= last]
+        modelled = list(bench.follow(contender, capture, frames))
+        meshes = [read_truth_mesh(capture, frame) for frame in frames]
         drift = tracking_drift(
             (entry.cloud for entry in modelled),
             (mesh.vertices for mesh in meshes),
             meshes[0].faces,
-            cameras=seeing,
+            cameras=[record.camera for record in capture.select(split="train", frames=frames[:1])],
             device=bench.device.alias,
         )
-        found["contenders"][name] = {
-            "frames": rows,
-            "seconds": [round(entry.seconds, 3) for entry in modelled],
-            "training_psnr": [round(entry.report["psnr"], 3) for entry in modelled],
-            "lost": [entry.report.get("lost", "") for entry in modelled],
-            "drift": [{"frame": frame, **row.as_dict()} for frame, row in zip(frames, drift, strict=True)],
-            "reached": reached(rows),
+        views = capture.select(split="train", frames=frames[:1])
+        row = {
+            "name": name,
+            "views": len(views),
+            "size": [views[0].camera.width, views[0].camera.height],
+            "frames": [
+                {
+                    "frame": entry.frame,
+                    "seconds": entry.seconds,
+                    "training_psnr": entry.report["psnr"],
+                    "lost": entry.report.get("lost", ""),
+                    "drift": moved.as_dict(),
+                    **(bench.scored(contender, entry, capture) if entry.frame in known else {}),
+                }
+                for entry, moved in zip(modelled, drift, strict=True)
+            ],
+            "drawn": drawn(bench, modelled[0], capture, contender.options),
+            "first_seconds": spread([modelled[0].seconds]),
+            "tracked_seconds": spread([entry.seconds for entry in modelled[1:]]),
         }
-    return found
+        if bench.keep is not None:
+            path = bench.keep / name / "gaussians.usda"
+            write_sequence(path, capture, modelled, contender.options or CLASSIC)
+        if capture is bench.capture:
+            again = [next(bench.follow(contender, capture, frames[:1])) for _ in range(bench.effort.repeats - 1)]
+            row["first_seconds"] = spread([entry.seconds for entry in (modelled[0], *again)])
+            row["same_bits"] = all(
+                np.array_equal(array, modelled[0].cloud.arrays()[key])
+                for entry in again
+                for key, array in entry.cloud.arrays().items()
+            )
+        rows.append(row)
+        yield {"rows": rows}
 
 
-def reached(rows: Sequence[Row]) -> Row:
-    """Return which of the targets the first frame reaches, and whether the last one is no worse than it may be."""
-
-    def value(row: Row, name: str) -> float:
-        return float(row["surface"][name] if name == "chamfer_mm" else row[name])
-
-    # Phrased so that NaN fails.
-    found = {
-        name: bool(value(rows[0], name) >= wanted if sense == "at least" else value(rows[0], name) <= wanted)
-        for name, (wanted, sense) in TARGETS.items()
+def drawn(bench: Bench, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None) -> Row:
+    """Return the PSNR of test views as fitted and as other programs draw, with one and with the fit's samples [dB]."""
+    return {
+        f"{name}_{word}": bench.psnr(modelled, capture, way, samples)
+        for name, way in (("fitted", options), ("classic", CLASSIC))
+        for word, samples in (("one_sample", 1), ("samples_of_fit", modelled.samples))
     }
-    losses = {
-        "psnr": value(rows[0], "psnr") - value(rows[-1], "psnr"),
-        "chamfer_mm": value(rows[-1], "chamfer_mm") - value(rows[0], "chamfer_mm"),
-    }
-    return found | {f"{name} after tracking": bool(losses[name] <= most) for name, most in LARGEST_LOSS.items()}
 
 
-def measure_gaussians(bench: Bench) -> Row:
-    """Score the first frame with more and more Gaussians."""
-    return {"rows": [bench.first_frame(bench.capture, bench.make(OURS, count)) for count in bench.effort.counts]}
+def spread(values: Sequence[float]) -> Row:
+    """Return median and range."""
+    return {"median": float(np.median(values)), "lowest": min(values), "highest": max(values), "count": len(values)}
 
 
-def measure_cameras(bench: Bench) -> Row:
-    """Score the first frame seen by more and more cameras."""
-    names = training_cameras(bench.capture)
-    rows = []
-    for count in bench.effort.cameras:
-        if count <= len(names):
-            fewer = with_cameras(bench.capture, evenly(names, count))
-            rows.append({"cameras": count, **bench.first_frame(fewer, bench.make(OURS, bench.effort.gaussians))})
-    # What counts of the surface is what those cameras see: fewer cameras are judged by less of it.
-    return {"rows": rows}
+def measure_large(bench: Bench) -> Iterator[Row]:
+    """Yield time, scores and memory of frames at full resolution.
 
-
-def measure_large(bench: Bench) -> Row:
-    """Time frames of a capture at full resolution, and say what memory each takes."""
+    The first two frames take the default's steps. Then tracking goes back and forth between them in a draft's steps,
+    of which only memory is of interest.
+    """
     effort = bench.effort
-    frames = bench.capture.frames[: effort.large_frames]
+    bench.warm(bench.capture)
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
         width, height = effort.large_size
         capture = write_large_capture(
-            Path(folder) / "capture",
+            Path(folder) / "large",
             bench.capture,
-            frames=frames,
+            frames=bench.capture.frames[:2],
             camera_count=effort.large_views,
             width=width,
             height=height,
@@ -253,143 +276,172 @@ def measure_large(bench: Bench) -> Row:
             subdivisions=2 if width > 960 else 0,
             device=bench.device.alias,
         )
-        bench.say(f"path traced in {time.perf_counter() - started:.1f} s")
         found: Row = {
             "views": effort.large_views,
             "width": width,
             "height": height,
-            "seconds_to_path_trace": round(time.perf_counter() - started, 1),
+            "seconds_to_path_trace": time.perf_counter() - started,
             "frames": [],
         }
-        contender = bench.make(OURS, effort.large_gaussians)
-        for modelled in follow(contender, capture, capture.frames, bench.device, bench.say):
-            found["frames"].append(
-                {
-                    "frame": modelled.frame,
-                    "gaussians": len(modelled.cloud),
-                    "seconds": round(modelled.seconds, 3),
-                    **memory(bench.device),
-                    **score_frame(
-                        modelled.cloud,
-                        capture.select(split="test", frames=[modelled.frame]),
-                        options=contender.options,
-                        samples=modelled.samples,
-                        device=bench.device.alias,
-                    ).as_dict(),
-                }
-            )
-        return found
+        bench.say(f"path traced in {found['seconds_to_path_trace']:.1f} s")
+        draft = TrackOptions.of_preset("draft") if effort.tracking is not BRIEF else BRIEF
+        contenders = [bench.make(bench.fitting, tracking) for tracking in (effort.tracking, draft)]
+        track = None
+        for index in range(effort.large_tracked + 1):
+            frame, is_scored = capture.frames[index % 2], index < 2
+            contender = contenders[0 if is_scored else 1]
+            with peak_memory(bench.device) as peak:
+                modelled = next(follow(contender, capture, [frame], bench.device, bench.say, track=track))
+            track = modelled.track
+            row = {"name": str(index), "steps": "default" if is_scored else "draft", "seconds": modelled.seconds}
+            row |= memory(bench.device) | peak
+            if is_scored:
+                records = capture.select(split="test", frames=[frame])
+                scores = score_frame(
+                    modelled.cloud,
+                    records,
+                    options=contender.options,
+                    samples=modelled.samples,
+                    device=bench.device.alias,
+                )
+                row |= {"gaussians": len(modelled.cloud), "samples": modelled.samples, **scores.as_dict()}
+            found["frames"].append(row)
+            yield found
 
 
 def memory(device: Any) -> Row:
-    """Return the most memory of this process so far, and what is taken of the device now [bytes]."""
-    found: Row = {"peak_host_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    """Return what this process holds of the host, as it is and after all that is free was given back [bytes].
+
+    What is given back is what Python's collector finds, and what the allocator keeps of freed memory. On CUDA, also
+    what is taken of the device, context included.
+    """
+    found: Row = {"host_bytes": _resident()}
+    gc.collect()
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
+    found["host_bytes_after_trim"] = _resident()
     return found | ({"device_bytes": device.total_memory - device.free_memory} if device.is_cuda else {})
 
 
-def measure_stability(bench: Bench) -> Row:
-    """Reconstruct the captures on which reconstructions fail: of this capture and, path traced, of the demo figure."""
-    effort = bench.effort
-    reconstruct = reconstruct_stressed(bench.make(OURS, effort.gaussians), bench.device.alias)
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        given = StressStudio(Path(folder), given=bench.capture, device=bench.device.alias)
-        drawn = StressStudio(
-            Path(folder),
-            camera_count=len(training_cameras(bench.capture)),
-            size=bench.capture.records[0].camera.height,
-            samples=effort.samples,
-            device=bench.device.alias,
-        )
-        for studio, traced in ((given, False), (drawn, True)):
-            cases = [case for case in CAPTURE_CASES if (case in TRACED_CASES) is traced]
-            for case in cases:
-                outcome = run_capture_case(reconstruct, studio, case)
-                bench.say(f"{outcome.case}: {'; '.join(outcome.faults) or 'ok'}")
-                rows.append(outcome.as_dict())
-    return {"rows": rows, "passed": all(row["passed"] for row in rows)}
+def _resident() -> int:
+    """Return the bytes of this process that are in the host's memory; 0 where the system does not say."""
+    path = Path("/proc/self/statm")
+    return int(path.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if path.exists() else 0
 
 
-SECTIONS: dict[str, Callable[[Bench], Row]] = {
-    "walker": measure_walker,
-    "gaussians": measure_gaussians,
-    "cameras": measure_cameras,
+@dataclass(frozen=True)
+class Trial:
+    """A first frame to fit and score.
+
+    Attributes:
+        name: In tables.
+        options: How it is fitted.
+        cameras: Number of training cameras; None for all.
+    """
+
+    name: str
+    options: FitOptions
+    cameras: int | None = None
+
+
+def rade_trials(bench: Bench) -> list[Trial]:
+    """Return RaDe-GS's choices with as many steps as ours, then what ours has beside them, then ours."""
+    return [*_rade_trials(bench, 1), Trial("ours", bench.fitting)]
+
+
+def _rade_trials(bench: Bench, longer: int) -> list[Trial]:
+    ours = bench.fitting
+    half = longer * (ours.color_iterations + ours.normal_iterations) // 2  # with normals in the second half
+    alone = FitOptions.of_preset(
+        "rade", gaussian_count=ours.gaussian_count, color_iterations=half, normal_iterations=half
+    )
+    fine = replace(alone, samples=ours.samples)
+    masked = replace(fine, weights=replace(fine.weights, alpha=ours.weights.alpha))
+    return [
+        Trial("RaDe-GS's choices", alone),
+        Trial("with our samples a pixel", fine),
+        Trial("with our samples and loss on masks", masked),
+    ]
+
+
+def variant_trials(bench: Bench) -> list[Trial]:
+    """Return ours drawn as 3DGS draws, and what differs added one by one: the last is ours with fewer Gaussians."""
+    few, more = bench.effort.few
+    plain = replace(bench.fitting, gaussian_count=few, raster=CLASSIC, samples=1, hidden_share=0.0)
+    sharp = replace(plain, raster=bench.fitting.raster)
+    dense = replace(sharp, gaussian_count=more)
+    fine = replace(dense, samples="auto")
+    return [
+        Trial("drawn as 3DGS does", plain),
+        Trial("antialiased", replace(plain, raster=replace(CLASSIC, antialiased=True))),
+        Trial("low-pass 0.1", sharp),
+        Trial("more Gaussians", dense),
+        Trial("more samples", fine),
+        Trial("hidden ones replaced", replace(fine, hidden_share=bench.fitting.hidden_share)),
+    ]
+
+
+def trials(make: Callable[[Bench], Sequence[Trial]]) -> Callable[[Bench], Iterator[Row]]:
+    """Return the section that fits and scores some trials on the first capture."""
+
+    def measure_trials(bench: Bench) -> Iterator[Row]:
+        rows: list[Row] = []
+        names = training_cameras(bench.capture)
+        for trial in make(bench):
+            count = min(trial.cameras or len(names), len(names))
+            # What counts of the surface is what these cameras see: fewer cameras are judged by less of it.
+            capture = bench.capture if count == len(names) else with_cameras(bench.capture, evenly(names, count))
+            contender = bench.make(trial.options, bench.effort.tracking)
+            modelled = next(bench.follow(contender, capture, truth_frames(capture)[:1]))
+            steps = trial.options.color_iterations + trial.options.normal_iterations
+            row = {"name": trial.name, "cameras": count, "steps": steps, "seconds": modelled.seconds}
+            rows.append(row | bench.scored(contender, modelled, capture))
+            yield {"rows": rows}
+
+    return measure_trials
+
+
+SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
+    "captures": measure_captures,
     "large": measure_large,
-    "stability": measure_stability,
+    "rade": trials(rade_trials),
+    "variants": trials(variant_trials),
+    "gaussians": trials(
+        lambda bench: [Trial(f"{count}", replace(bench.fitting, gaussian_count=count)) for count in bench.effort.counts]
+    ),
+    "cameras": trials(
+        lambda bench: [Trial(f"{count}", bench.fitting, cameras=count) for count in bench.effort.cameras]
+    ),
+    "rade_long": trials(lambda bench: _rade_trials(bench, bench.effort.long)[-1:]),
 }
 
 
 def measure(bench: Bench, *, only: Sequence[str] = (), keep: Callable[[Row], None] = lambda result: None) -> Row:
-    """Return everything that is measured, for JSON; ``keep`` gets each state."""
-    result: Row = {"machine": machine(bench.device), "failed": []}
-    for name, run in SECTIONS.items():
+    """Return everything that is measured, for JSON; ``keep`` gets each state. What failed keeps what it had found."""
+    result: Row = {"failed": []}
+    for name, section in SECTIONS.items():
         if only and name not in only:
             continue
         bench.say(name)
         started = time.perf_counter()
+        result[name] = {}
         try:
-            result[name] = {**run(bench), "section_seconds": round(time.perf_counter() - started, 1)}
+            for state in section(bench):
+                result[name] = {**state, "section_seconds": time.perf_counter() - started}
+                keep(result)
         except Exception as error:  # minutes on a lent device are not lost to what comes later
             traceback.print_exc()
-            result[name] = {"failed": f"{type(error).__name__}: {error}"}
+            result[name] = {**result[name], "failed": f"{type(error).__name__}: {error}"}
             result["failed"].append(name)
-        keep(result)
+            keep(result)
     return result
-
-
-def markdown(result: Row) -> str:
-    """Return the tables that a person reads first."""
-    lines = [f"{result['machine']['device']} ({result['machine']['processor']}), commit {result['commit']}"]
-    lines += [f"\n{name} failed: {result[name]['failed']}" for name in result["failed"]]
-    heads = "PSNR [dB] | solid | SSIM | normals, median [°] | Chamfer [mm] | Gaussians | seconds |"
-    measured = {name: part for name, part in result.items() if isinstance(part, dict) and "failed" not in part}
-    tables: dict[str, list[tuple[str, Row]]] = {}
-    for name, part in measured.get("walker", {}).get("contenders", {}).items():
-        tables[name] = [(f"frame {row['frame']}", row) for row in part["frames"]]
-    for section, label in (("gaussians", "gaussians"), ("cameras", "cameras")):
-        tables[section] = [(f"{row[label]:,} {label}", row) for row in measured.get(section, {}).get("rows", [])]
-    tables["large"] = [(f"frame {row['frame']}", row) for row in measured.get("large", {}).get("frames", [])]
-    for title, rows in tables.items():
-        if rows:
-            lines += ["", f"| {title} | {heads}", "|---" * 8 + "|", *(_line(label, row) for label, row in rows)]
-    for name, part in measured.get("walker", {}).get("contenders", {}).items():
-        last = part["drift"][-1]["vertices"]
-        lines.append(f"\n{name}: drift per vertex at the end {last['mean_mm']:.2f} mm; reached: {part['reached']}")
-    for row in measured.get("stability", {}).get("rows", []):
-        lines.append(f"- {row['case']}: {'; '.join(row['faults']) or 'ok'} ({', '.join(row['detected']) or 'nothing'})")
-    return "\n".join(lines) + "\n"
-
-
-def _line(label: str, row: Row) -> str:
-    """Return one line of a table."""
-    shown = (
-        (row["psnr"], ".2f"),
-        (row["solid_psnr"], ".2f"),
-        (row["ssim"], ".4f"),
-        (row.get("normals_median_degrees"), ".2f"),
-        (row.get("surface", {}).get("chamfer_mm"), ".2f"),
-        (row["gaussians"], ",d"),
-        (row["seconds"], ".1f"),
-    )
-    return f"| {label} | " + " | ".join("" if value is None else format(value, form) for value, form in shown) + " |"
-
-
-def maker(effort: Effort, device: str) -> Make:
-    """Return what makes the package's own contenders."""
-
-    def make(name: str, count: int) -> Contender:
-        if name == RADE_GS_LIKE:
-            return rade_gs_like(count, device, effort.iterations)
-        return ours(count, device, **effort.fitting)
-
-    return make
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
-    parser.add_argument("--gaussians", type=int, help="other than by default")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="write the sequences of captures there")
     record.add_arguments(parser)
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"
@@ -397,22 +449,21 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="the demo's capture, small: does all of it run?")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    effort = QUICK if arguments.quick else FULL
-    if arguments.gaussians:
-        effort = replace(effort, gaussians=arguments.gaussians)
-    keep = partial(record.write_result, arguments, device)
-
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
-            capture = write_demo_capture(
-                Path(folder) / "demo", camera_count=8, size=64, samples=4, frame_count=4, device=arguments.device
-            )
+            small: Row = {"camera_count": 8, "size": 64, "samples": 4, "frame_count": 2, "device": arguments.device}
+            captures = {"walker": write_demo_capture(Path(folder) / "demo", **small)}
         else:
-            capture = Capture.read(arguments.data / "captures" / "walker")
-        say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
-        bench = Bench(capture, effort, maker(effort, arguments.device), device, say)
-        result = measure(bench, only=arguments.only, keep=keep)
-    print(markdown(result), end="")
+            captures = {name: Capture.read(arguments.data / "captures" / name) for name in CAPTURES}
+        bench = Bench(
+            captures,
+            QUICK if arguments.quick else Effort(),
+            lambda fitting, tracking: of_options(fitting, arguments.device, tracking),
+            device,
+            lambda text: print(text, file=sys.stderr, flush=True),
+            arguments.keep,
+        )
+        result = measure(bench, only=arguments.only, keep=partial(record.write_result, arguments, device))
     return 1 if result["failed"] else 0
 
 

@@ -1,29 +1,36 @@
-"""The contenders of the reconstruction benchmark: the only place where it calls fitting, tracking and meshing.
+"""Ways to reconstruct: the only place where benchmarks call fitting, tracking and meshing.
 
-Settings of others are ours run with their choices where these can be made here: they say what the choices are worth,
-not how fast other people's programs are.
+Others' choices are made in our code where it has them: that says what the choices are worth, not how fast or how good
+other people's programs are.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import trimesh
 import warp as wp
 
+from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
-from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.listeners import no_progress
+from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.raster.records import RasterOptions
-from beam_warp.stability.capture_cases.alterations import training_cameras
-from beam_warp.stability.capture_cases.case import TRACKING_LOST, Detection, detections_of
-from beam_warp.stability.captures import Reconstructed
+from beam_warp.reconstruction.fit import FitOptions
+from beam_warp.reconstruction.steps import FitAndTrack
+from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.metadata import capture_frames_metadata
+
+READING_THREADS = 8
+"""Images that are decoded at a time, as in a job."""
 
 
 class StepsLike(Protocol):
@@ -43,13 +50,11 @@ class Contender:
     """One way to reconstruct.
 
     Attributes:
-        name: In tables.
         steps: Fits and tracks; a track has its ``cloud``.
         mesh: Extracts the surface of a cloud as some cameras see it.
         options: How its Gaussians are drawn.
     """
 
-    name: str
     steps: StepsLike
     mesh: Callable[[GaussianCloud, Sequence[Camera]], trimesh.Trimesh]
     options: RasterOptions | None = None
@@ -57,28 +62,15 @@ class Contender:
 
 def ours(gaussian_count: int, device: str | None, **fitting: Any) -> Contender:
     """Return this package's reconstruction, with its defaults but for what is given."""
-    return _of_preset("ours", "fast", gaussian_count, device, fitting)
+    return of_options(FitOptions(gaussian_count=gaussian_count, **fitting), device)
 
 
-def rade_gs_like(gaussian_count: int, device: str | None, iterations: int | None = None) -> Contender:
-    """Return ours with RaDe-GS's choices; ``iterations`` in all, half of them with normals, if not the preset's."""
-    changes: dict[str, Any] = {}
-    if iterations is not None:
-        changes = {"color_iterations": iterations // 2, "normal_iterations": iterations - iterations // 2}
-    return _of_preset("RaDe-GS-like settings", "rade", gaussian_count, device, changes)
-
-
-def _of_preset(name: str, preset: str, count: int, device: str | None, changes: dict[str, Any]) -> Contender:
-    from beam_warp.mesh.extract import mesh_of_gaussians
-    from beam_warp.reconstruction.fit import FitOptions
-    from beam_warp.reconstruction.steps import FitAndTrack
-
-    options = FitOptions.of_preset(preset, gaussian_count=count, **changes)
+def of_options(fitting: FitOptions, device: str | None, tracking: TrackOptions | None = None) -> Contender:
+    """Return the way of some options."""
     return Contender(
-        name,
-        FitAndTrack(fitting=options, device=device),
-        lambda cloud, cameras: mesh_of_gaussians(cloud, cameras, options=options.raster, device=device),
-        options.raster,
+        FitAndTrack(fitting=fitting, tracking=tracking or TrackOptions(), device=device),
+        lambda cloud, cameras: mesh_of_gaussians(cloud, cameras, options=fitting.raster, device=device),
+        fitting.raster,
     )
 
 
@@ -88,17 +80,22 @@ class ModelledFrame:
 
     Attributes:
         frame: Its number in the capture.
-        cloud: Its Gaussians.
-        seconds: From images in memory to Gaussians on the device's host.
+        track: What the next frame follows from; its ``cloud`` are the Gaussians.
+        seconds: From images in memory to Gaussians in the host's memory.
         report: What the step said.
-        samples: Side of the square of samples that a pixel was the mean of, in the key frame's fit.
+        samples: Side of the square of samples that a pixel was the mean of.
     """
 
     frame: int
-    cloud: GaussianCloud
+    track: Any
     seconds: float
     report: dict[str, Any]
     samples: int
+
+    @property
+    def cloud(self) -> GaussianCloud:
+        """The frame's Gaussians."""
+        return self.track.cloud
 
 
 def follow(
@@ -107,64 +104,39 @@ def follow(
     frames: Sequence[int],
     device: Any,
     say: Callable[[str], None] = lambda text: None,
+    *,
+    track: Any = None,
 ) -> Iterator[ModelledFrame]:
-    """Fit the first of some frames and track the others; reading images is not timed."""
-    track, samples = None, 1
+    """Fit the first of some frames, unless there is a track already, and track the others; reading is not timed."""
     for frame in frames:
-        views = [record.view() for record in capture.select(split="train", frames=[frame])]
+        views = _read(capture, frame)
         started = time.perf_counter()
         if track is None:
-            track, report = contender.steps.begin(views, _nobody)
-            samples = int(report.get("samples", 1))
+            track, report = contender.steps.begin(views, no_progress)
         else:
-            track, report = contender.steps.advance(track, views, _nobody)
+            track, report = contender.steps.advance(track, views, no_progress)
         if device.is_cuda:
             wp.synchronize_device(device)
         seconds = time.perf_counter() - started
-        say(f"{contender.name}, frame {frame}: {len(track.cloud):,} Gaussians, {seconds:.1f} s")
-        yield ModelledFrame(frame, track.cloud, seconds, report, samples)
+        del views  # the images of a frame are not kept while it is scored, nor while the next ones are read
+        say(f"{capture.folder.name}, frame {frame}: {len(track.cloud):,} Gaussians, {seconds:.1f} s")
+        yield ModelledFrame(frame, track, seconds, report, int(report.get("samples", 1)))
 
 
-def reconstruct_stressed(contender: Contender, device: str | None) -> Callable[[Capture], Reconstructed]:
-    """Return what `beam_warp.stability.captures` tries: inspect, leave out what cannot be used, fit and track."""
-
-    def reconstruct(capture: Capture) -> Reconstructed:
-        from beam_warp.capture.inspect import require_reconstructable
-
-        ready = require_reconstructable(capture)
-        detections = list(
-            detections_of((f for f in ready.fallbacks if f.severity != "note"), training_cameras(capture))
-        )
-        clouds, key_frames, track = [], [], None
-        for index, frame in enumerate(ready.capture.frames):
-            views = [record.view() for record in ready.capture.select(split="train", frames=[frame])]
-            report: dict[str, Any] = {"lost": "start"}
-            if track is not None:
-                track, report = contender.steps.advance(track, views, _nobody)
-                detections += _said(report, training_cameras(capture), frame)
-            if report.get("lost"):
-                track, report = contender.steps.begin(views, _nobody)
-                detections += _said(report, training_cameras(capture), frame)
-                key_frames.append(index)
-            clouds.append(track.cloud)
-        return Reconstructed(
-            sequence=GaussianSequence.from_clouds(clouds),
-            detections=detections,
-            key_frames=key_frames,
-            raster=contender.options,
-        )
-
-    resolve_device(device)
-    return reconstruct
+def _read(capture: Capture, frame: int) -> list[CapturedView]:
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        return list(pool.map(lambda record: record.view(), capture.select(split="train", frames=[frame])))
 
 
-def _said(report: dict[str, Any], cameras: Sequence[str], frame: int) -> list[Detection]:
-    """Return what a step noticed in a frame; a view that shows what is lost is not to blame for it."""
-    said = detections_of((replace(Finding(**entry), what="") for entry in report.get("findings", [])), cameras)
-    if report.get("lost") and not said:
-        said = (Detection(TRACKING_LOST),)
-    return [replace(detection, frame=frame) for detection in said]
-
-
-def _nobody(done: int, total: int, facts: Any = None) -> None:
-    """Report to nobody."""
+def write_sequence(path: Path, capture: Capture, modelled: Sequence[ModelledFrame], options: RasterOptions) -> None:
+    """Write reconstructed frames as an asset, as a job does: drawn as they were fitted, frames numbered as captured."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        "radiance_meaning": "captured",
+        "source_axes": WORLD_AXES,
+        **options.as_metadata(),
+        **capture_frames_metadata([entry.frame for entry in modelled]),
+    }
+    clouds = [replace(entry.cloud, axes=WORLD_AXES) for entry in modelled]
+    rate = capture.frames_per_second or 30.0
+    converters.write(GaussianSequence.from_clouds(clouds, frames_per_second=rate, metadata=metadata), path)

@@ -6,21 +6,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import reconstruction as benchmark
+import tables_reconstruction as tables
 import trimesh
 from reconstruction_captures import halved, refined, texture, textured_meshes, write_large_capture
 from reconstruction_contenders import Contender, follow
-from reconstruction_plot import draw
 from support.tracked_balls import tracked_balls
 
+from beam_warp import converters
 from beam_warp.device.arrays import resolve_device
+from beam_warp.reconstruction.fit import FIT_RASTER, FitOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.axes import change_axes
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 
 pytestmark = pytest.mark.slow  # a benchmark's own tests
 
 COUNT = 800
 
-TINY = replace(benchmark.QUICK, counts=(COUNT,), cameras=(4, 6), large_size=(96, 64), large_views=2, samples=1)
+TINY = replace(benchmark.QUICK, gaussians=COUNT, large_size=(96, 64), large_views=2, samples=1)
 
 
 @dataclass(frozen=True)
@@ -57,14 +60,11 @@ class FakeSteps:
 
 
 @pytest.fixture
-def bench(tiny_capture):
-    device = resolve_device("cpu")
+def bench(tiny_capture, tmp_path):
     steps = FakeSteps(tiny_capture)
-
-    def make(name, count):
-        return Contender(name, steps, steps.mesh)
-
-    return benchmark.Bench(tiny_capture, TINY, make, device, lambda text: None)
+    captures = {"walker": tiny_capture, "robot": tiny_capture}
+    make = lambda fitting, tracking: Contender(steps, steps.mesh, fitting.raster)  # noqa: E731
+    return benchmark.Bench(captures, TINY, make, resolve_device("cpu"), lambda text: None, tmp_path / "kept")
 
 
 class TestCapture:
@@ -111,49 +111,80 @@ class TestCapture:
 
 class TestSections:
     def test_first_frame_is_fitted_and_others_are_tracked(self, bench):
-        found = list(follow(bench.make("ours", COUNT), bench.capture, (0, 1), bench.device))
+        contender = bench.make(bench.fitting, TINY.tracking)
+        found = list(follow(contender, bench.capture, (0, 1), bench.device))
         assert [entry.frame for entry in found] == [0, 1]
         assert not np.array_equal(found[0].cloud.positions, found[1].cloud.positions)
-        assert all(entry.seconds >= 0.0 for entry in found)
+        (last,) = follow(contender, bench.capture, (1,), bench.device, track=found[0].track)
+        assert np.array_equal(last.cloud.positions, found[1].cloud.positions)
 
-    def test_all_sections_run_and_are_json(self, bench, tmp_path):
+    def test_all_sections_run_and_tables_show_them(self, bench, tmp_path):
         kept = []
-        names = ("walker", "gaussians", "cameras", "large")
-        result = benchmark.measure(bench, only=names, keep=lambda state: kept.append(len(state)))
+        result = benchmark.measure(bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist)))
         assert result["failed"] == []
-        assert len(kept) == len(names)
-        walker = result["walker"]["contenders"]
-        assert set(walker) == {"ours", "RaDe-GS-like settings"}
-        rows = walker["ours"]["frames"]
-        assert [row["frame"] for row in rows] == [0, 1]
-        assert rows[1]["surface"]["chamfer_mm"] < 1e-3  # the made-up mesh is the truth
-        assert walker["ours"]["drift"][1]["gaussians"]["p95_mm"] < 0.01
-        assert walker["ours"]["reached"]["chamfer_mm"]
-        assert not walker["ours"]["reached"]["psnr"]
-        assert [row["cameras"] for row in result["cameras"]["rows"]] == [4, 6]
-        assert len(result["large"]["frames"]) == 2
-        record = {"benchmark": "reconstruction", "commit": "none", **result}
-        path = tmp_path / "result.json"
-        path.write_text(json.dumps(record, default=benchmark._plain))
-        text = benchmark.markdown(record)
-        assert text.count("| frame 0 |") == 3
-        draw([json.loads(path.read_text())], tmp_path / "chart.png")
+        assert len(kept) == 2 + 4 + 4 + 6 + 1 + 1 + 1  # after every row
+        walker, _ = result["captures"]["rows"]
+        assert [row["frame"] for row in walker["frames"]] == [0, 1]
+        assert walker["frames"][0]["surface"]["chamfer_mm"] < 1e-3  # the made-up mesh is the truth
+        assert walker["frames"][1]["drift"]["gaussians"]["p95_mm"] < 0.01
+        assert walker["first_seconds"]["count"] == TINY.repeats
+        assert walker["same_bits"]
+        assert [row["steps"] for row in result["large"]["frames"]] == ["default", "default", "draft", "draft"]
+        for function in (tables.captures, tables.results, tables.drawn, tables.large, tables.rade, tables.variants):
+            head, *rows = function(result)
+            assert len(rows) >= 2
+            assert all(len(row) == len(head) for row in rows)
+        assert tables.frames_tracked(result) == 2
+        assert tables.frames_lost(result) == 0
+        tables.draw(result, result, tmp_path / "chart.png")
         assert (tmp_path / "chart.png").stat().st_size > 10_000
 
+    def test_kept_sequences_say_how_they_are_drawn_and_what_they_show(self, bench):
+        assert benchmark.measure(bench, only=("captures",))["failed"] == []
+        sequence = converters.read(bench.keep / "robot" / "gaussians.usda")
+        assert sequence.metadata["capture_frames"] == "0 1"
+        assert benchmark.RasterOptions.from_metadata(sequence.metadata) == FIT_RASTER
+        known = bench.make(bench.fitting, TINY.tracking).steps.clouds
+        for index in range(2):
+            found = change_axes(sequence[index], WORLD_AXES)
+            assert np.array_equal(found.positions, known[index].positions)
+            assert np.array_equal(found.ids, known[index].ids)
+
     def test_a_section_that_fails_says_so_and_others_run(self, bench):
-        def refuse(name, count):
+        def refuse(fitting, tracking):
             raise RuntimeError("no contender")
 
         result = benchmark.measure(replace(bench, make=refuse), only=("gaussians", "cameras"))
         assert result["failed"] == ["gaussians", "cameras"]
-        assert result["gaussians"] == {"failed": "RuntimeError: no contender"}
+        assert result["gaussians"]["failed"] == "RuntimeError: no contender"
 
-    def test_targets_are_missed_by_nothing_that_is_not_a_number(self):
-        good = {"psnr": 38.0, "whole_psnr": 40.0, "normals_median_degrees": 5.0, "surface": {"chamfer_mm": 1.5}}
-        assert all(benchmark.reached([good, good]).values())
-        worse = {"psnr": 36.9, "whole_psnr": 40.0, "normals_median_degrees": 9.0, "surface": {"chamfer_mm": 2.6}}
-        found = benchmark.reached([good, worse])
-        assert found["psnr"]
-        assert not found["psnr after tracking"]
-        assert not found["chamfer_mm after tracking"]
-        assert not any(benchmark.reached([good | {"psnr": np.nan}] * 2)[key] for key in ("psnr", "psnr after tracking"))
+
+class TestTrials:
+    """Rows differ in what they say, and end at what they are compared with."""
+
+    @pytest.fixture
+    def full(self, bench):
+        return replace(bench, effort=benchmark.Effort())
+
+    def test_ladders_end_at_ours(self, full):
+        few = replace(full.fitting, gaussian_count=full.effort.few[1])
+        assert benchmark.variant_trials(full)[-1].options == few
+        assert benchmark.rade_trials(full)[-1].options == full.fitting == FitOptions(gaussian_count=140_000)
+
+    def test_a_rival_has_as_many_steps_the_same_samples_and_the_loss_on_masks(self, full):
+        alone, fine, masked, ours = (trial.options for trial in benchmark.rade_trials(full))
+        for options in (alone, fine, masked):
+            total = options.color_iterations + options.normal_iterations
+            assert total == ours.color_iterations + ours.normal_iterations
+            assert options.gaussian_count == ours.gaussian_count
+        assert fine.samples == masked.samples == ours.samples
+        assert masked.weights.alpha == ours.weights.alpha > 0.0
+        preset = FitOptions.of_preset("rade", gaussian_count=140_000)
+        assert replace(masked, samples=1, weights=preset.weights) == alone
+        assert replace(alone, color_iterations=6_000, normal_iterations=6_000) == preset
+
+    def test_the_long_row_has_the_steps_of_the_preset(self, full):
+        (trial,) = benchmark._rade_trials(full, full.effort.long)[-1:]
+        preset = FitOptions.of_preset("rade")
+        assert trial.options.color_iterations == preset.color_iterations
+        assert trial.options.normal_iterations == preset.normal_iterations

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,16 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
-from beam_warp.reconstruction.track import TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.reconstruction.track import (
+    GAUSSIANS_PER_JOINT,
+    JOINT_LIMITS,
+    NOISE_PSNR,
+    SMALLEST_COSINE,
+    TrackOptions,
+    advance_track,
+    begin_track,
+    outward_normals,
+)
 
 CAMERAS = rig()
 
@@ -221,3 +231,21 @@ class TestRefusals:
         options = TrackOptions if changes.keys() <= vars(OPTIONS).keys() else JointOptions
         with pytest.raises(InvalidOptionError, match=match):
             options(**changes)
+
+
+def test_the_tracking_page_states_the_defaults():
+    page = Path(__file__).parents[2] / "docs" / "tracking.md"
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    options, joints = TrackOptions(), JointOptions()
+    fewest, most = JOINT_LIMITS
+    for phrase in (
+        f"one joint for every {GAUSSIANS_PER_JOINT} Gaussians, but at least {fewest} and at most {most:,}",
+        f"whose normals have a cosine below {SMALLEST_COSINE} are not neighbours",
+        "reduced {}, {}, {} and {} times, in {} steps".format(*joints.levels, sum(joints.iterations)),
+        f"λ = {joints.rigidity:g} divided by the square of the reduction",
+        f"are fitted in {options.refinement.normal_iterations} steps",
+        f"more than {options.largest_drop:g} dB below that of the key frame, which counts as at most {NOISE_PSNR:g} dB",
+        f"more than {100 * options.largest_gap:g} % of the subject is not covered",
+        f"More than {100 * options.largest_tear:g} % of the joints are torn",
+    ):
+        assert phrase in text, phrase
