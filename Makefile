@@ -29,7 +29,7 @@ demo: install
 
 test: lint types unit
 
-test-all: test slow docs
+test-all: test slow
 
 lint: install
 	$(BIN)/ruff check .
@@ -49,4 +49,4 @@ docs: install
 	$(BIN)/zensical build --clean --strict
 
 clean:
-	rm -rf $(VENV) build demo site *.egg-info
+	rm -rf $(VENV) build demo site .cache *.egg-info

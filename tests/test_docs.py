@@ -6,6 +6,8 @@ Pages that walk through the demo's output (`WALKS`) are executed line by line, c
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
@@ -315,6 +317,19 @@ def test_the_reference_is_that_of_commands_and_public_names():
     assert "--target-error E" in pages["reference/commands.md"]
     assert "::: beam_warp.rasterize\n" in pages["reference/beam_warp.md"]
     assert "::: beam_warp.trace.closest_surface\n" in pages["reference/beam_warp.trace.md"]
+
+
+@pytest.mark.slow
+def test_the_site_is_built_and_loads_nothing_from_elsewhere():
+    """What `make docs` does; strict: a link or anchor that leads nowhere fails."""
+    pytest.importorskip("zensical")
+    for command in (["docs/gather_pages.py"], ["-m", "zensical", "build", "--clean", "--strict"]):
+        done = subprocess.run([sys.executable, "-P", *command], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    pages = list((ROOT / "site").rglob("*.html"))
+    assert len(pages) > len(PAGES)
+    loaded = r"<(?:script|img|iframe|source)[^>]+src=\"?(?:https?:)?//|<link[^>]+stylesheet[^>]+href=\"?(?:https?:)?//"
+    assert [page.name for page in pages if re.search(loaded, page.read_text(encoding="utf-8"))] == []
 
 
 def test_the_readme_is_short():
