@@ -40,7 +40,9 @@ ELSEWHERE = {
 README = ROOT / "README.md"
 """What a Git host shows first; on the site, docs/index.md is there in its place."""
 
-LINK = re.compile(r"(?<=\]\()(?!\w+:|#)[^)#\s]+")
+LINK = re.compile(r"""(?:(?<=\]\()|(?<=href=")|(?<=src="))(?!\w+:|#)[^)#\s"]+""")
+"""Target of a link or picture, in Markdown or HTML, that is a file of the repository."""
+
 HELP_COLUMNS = 88
 """Characters of a line of help; the site shows them without scrolling."""
 

@@ -308,6 +308,9 @@ def test_links_between_pages_are_those_of_the_site():
     assert "[The asset's specification](spec.md)" in SITE.on_site(DOCS / "index.md")
     assert "[the start](../start.md)" in SITE.on_site(DOCS / "tutorials" / "splat.md")
     assert "](captures.md)" in SITE.on_site(ROOT / "CHANGELOG.md")
+    assert str(SITE.place(ROOT / "benchmarks" / "timing.py")) == "files/benchmarks/timing.py"
+    text = """[a](x.md#b "c") ![d](../e.png) <a href="f.json">[g](https://h) [i](#j)"""
+    assert SITE.LINK.findall(text) == ["x.md", "../e.png", "f.json"]
 
 
 def test_the_reference_is_that_of_commands_and_public_names():
@@ -336,6 +339,23 @@ def test_the_readme_is_short():
     assert len(PAGES["README.md"].splitlines()) <= 150
 
 
+def test_files_and_targets_that_pages_name_are_there():
+    """All but the changelog name what is there now."""
+    now = "\n".join(text for page, text in PAGES.items() if page != "CHANGELOG.md")
+    named = set(re.findall(r"`((?:beam_warp|kernels|schema|converters|tests|docs|benchmarks)/[\w./]*)`", now))
+    assert len(named) > 100
+    assert [name for name in named if not (ROOT / name).exists()] == []
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(re.findall(r"(?:`|^ {4})make ([\w-]+)", now, re.MULTILINE)) <= set(targets)
+
+
 def test_every_extra_is_described():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert set(re.findall(r"^\| `(\w+)` \|", PAGES["docs/commands.md"], re.MULTILINE)) == set(extras)
+    named = {
+        name
+        for text in PAGES.values()
+        for group in re.findall(r"beam-warp\[([\w,]+)\]", text)
+        for name in group.split(",")
+    }
+    assert named <= set(extras)
