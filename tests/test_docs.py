@@ -298,10 +298,15 @@ def test_links_lead_to_files():
     assert dead == []
 
 
-def test_the_site_has_every_page():
+@pytest.fixture(scope="module")
+def reference():
+    """The pages that are generated, by their paths."""
+    return {str(path): text for path, text in SITE.reference().items()}
+
+
+def test_the_site_has_every_page(reference):
     listed = set(re.findall(r"[\w./-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    gathered = {str(SITE.place(page)) for page in SITE.sources()} | {str(path) for path in SITE.reference()}
-    assert gathered == listed
+    assert {str(SITE.place(page)) for page in SITE.sources()} | set(reference) == listed
 
 
 def test_links_between_pages_are_those_of_the_site():
@@ -313,13 +318,13 @@ def test_links_between_pages_are_those_of_the_site():
     assert SITE.LINK.findall(text) == ["x.md", "../e.png", "f.json"]
 
 
-def test_the_reference_is_that_of_commands_and_public_names():
-    pages = {str(path): text for path, text in SITE.reference().items()}
+def test_the_reference_is_that_of_commands_and_public_names(reference):
+    said = reference["reference/commands.md"]
     for command in ("beam run", "beam chart tracing", "beam-convert inspect", "beam-validate"):
-        assert re.search(rf"^## {command}\n\n```text\nusage: {command} ", pages["reference/commands.md"], re.MULTILINE)
-    assert "--target-error E" in pages["reference/commands.md"]
-    assert "::: beam_warp.rasterize\n" in pages["reference/beam_warp.md"]
-    assert "::: beam_warp.trace.closest_surface\n" in pages["reference/beam_warp.trace.md"]
+        assert re.search(rf"^## {command}\n\n```text\nusage: {command} ", said, re.MULTILINE)
+    assert "--target-error E" in said
+    assert "::: beam_warp.rasterize\n" in reference["reference/beam_warp.md"]
+    assert "::: beam_warp.trace.closest_surface\n" in reference["reference/beam_warp.trace.md"]
 
 
 @pytest.mark.slow
