@@ -1,12 +1,13 @@
 # Two commands do everything on a fresh clone: `make demo` and `make test`. Each sets up .venv first.
-# `make test-all` adds what takes long: CUDA compilation, stability suites, the browser, the wheel, long seeds.
+# `make test-all` adds what takes long: CUDA compilation, stability suites, the browser, the documentation, the wheel,
+# long seeds. `make docs` builds the documentation in site/ and fails on dead links.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test test-all lint types unit slow install clean
+.PHONY: demo test test-all lint types unit slow docs install clean
 
 # A worker a core, each with one thread of launches and of BLAS; -P: the checkout in the working folder is not the
 # installed package.
@@ -43,5 +44,9 @@ unit: install
 slow: install
 	$(PYTEST) -m slow
 
+docs: install
+	$(BIN)/python -P docs/gather_pages.py
+	$(BIN)/zensical build --clean --strict
+
 clean:
-	rm -rf $(VENV) build demo *.egg-info
+	rm -rf $(VENV) build demo site .cache *.egg-info
