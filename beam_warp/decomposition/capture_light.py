@@ -83,7 +83,7 @@ def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOp
     roughness = stated_roughness(frame.original, stated)
     with frame.log.timer("exposure"):
         return float(
-            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.materials))
+            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.gathering))
         )
 
 

@@ -91,9 +91,7 @@ def run_report(
         seconds: Duration of the whole job.
     """
     sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.source.log.timer.seconds
-    measured = len(sequence) - measurement.resumed
     traced = stages.get("materials", 0.0)
-    rays = measured * count * plan.source.options.materials.sample_count * 2
     notes = [*sequence.metadata.get("notes", "").splitlines(), *measurement.notes, *_lines(findings, "note")]
     return {
         "input": {"frames": len(sequence), "gaussians": count, "notes": notes},
@@ -106,7 +104,7 @@ def run_report(
         "materials": solved.statistics,
         "roughness": roughness,
         "seconds": {**stages, "total": seconds},
-        "light_and_occlusion_rays_per_second": rays / traced if traced > 0.0 and measured else None,
+        "light_and_occlusion_rays_per_second": measurement.ray_count / traced if traced > 0.0 else None,
         "findings": findings,
         "warnings": [*_lines(findings, "warning"), *warnings_about(solved.statistics)],
     }

@@ -1,17 +1,28 @@
 """Check that a stated environment fits its capture: its turn, its handedness, its scale, its range.
 
-Two criteria need no base colours. Observed colours divided by the shading of the right light are base colours, which
-spread less over the surface than under any other light. Changes of a point's colour from view to view are gloss:
-whatever the base colour, they must follow the light that the views see mirrored. Both are linear in the light, so that
-all turns of an environment cost two matrix products.
+Two criteria need no base colours. Observed colours divided by the shading of the right light are base colours, in which
+most neighbours are alike; under another light, its shading is left between them. Changes of a point's colour from view
+to view are gloss: whatever the base colour, they must follow the light that the views see mirrored. Both are linear in
+the light, so that all turns of an environment cost two matrix products.
+
+Every verdict compares the light as stated with another one on the same points: what paint, noise and normals do to both
+cancels. The standard error of the difference comes from leaving out one part of the surface after the other. A verdict
+is given only where chance would hardly give it once in twenty captures, whichever of the other lights fits best.
+Otherwise the check is silent: an even light has no turn, a matt ball under a broad light says little.
+
+Source: shading removed by division, as in intrinsic images; sparse changes of paint, Land and McCann 1971; the
+jackknife, Efron and Stein 1981.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import t as student
 
 from beam_warp.capture.findings import Finding, count_of
 from beam_warp.checks import require_count
@@ -40,6 +51,9 @@ AGREEMENT = 0.9
 UNCUT = 0.1
 """Pixels by blending weights, agreement of normals and largest saturated part of Gaussians that are asked."""
 
+EVEN = 2 * LIGHT_COLUMNS
+"""Number of the even light among those that are compared: turns and their mirror images come first."""
+
 GLOSS_ROUGHNESS = 0.5
 """Roughness of the lobe that light is mirrored in. True ones of 0.3 to 0.9 correlate with it, only less."""
 
@@ -49,33 +63,26 @@ LEAST_LIGHT = 0.01
 LARGEST_CHANGE = 0.5
 """Changes from view to view are cut at this part of a point's own luminance: beyond are errors of matching."""
 
-CLEARLY_BETTER = 0.1
-"""Difference of misfit from which on another turn explains the capture better than the stated one.
+NEIGHBORS = 16
+"""Neighbours that a point is compared with: over a few, shading hardly changes; over many, paint does."""
 
-Measured on two captured figures, each under its own light and two others (6 in all): the true turn is behind the best
-by 0.023 at most. Turned away from it by 10 degrees it is behind by 0.06 to 0.28, by 15 by 0.10 to 0.74, by 30 by 0.21
-or more, by 90 or more by 0.67 or more. Mirrored, whatever the turn, by 0.35 or more but for turns that put a lone sun
-where it was, of which no capture could tell."""
+BLOCKS = 32
+LEAST_IN_BLOCK = 8
+"""Parts of the surface that are left out in turn, and fewest points in one: parts much larger than the distance of
+neighbours err independently."""
 
-HANDEDNESS = 0.05
-"""Difference of misfit from which on a mirror image is preferred to a turn: twice the largest that chance made."""
+CHANCE = 0.05
+"""Probability of a wrong verdict about a light that is right."""
 
-CONTRADICTED = 0.05
-"""Loss of correlation of gloss from which on it contradicts a turn that the spread of base colours prefers."""
+LEAST_GAIN = 0.01
+"""Difference of misfit that matters: a light that explains a capture 1 % better is as good."""
 
-LEAST_GLOSS = 0.4
-"""Correlation of gloss below which no turn of the environment explains what views show.
-
-Measured as above: 0.49 to 0.76 with the true environment; with others, each at its best turn, below 0.34 in 20 cases of
-24, and 0.45 to 0.61 in the rest, whose lights resemble the true ones."""
+NEAR = 1
+"""Turns, in columns, that count as none: neither lights nor normals are known better than by a cell."""
 
 GLOSSY_PART = 0.01
 """Change of luminance from view to view, of what is seen, above which gloss can be told from noise: 0.07 to 0.09 in
 captures."""
-
-UNREMOVED = 1.1
-"""Spread of base colours at the best turn, over that of what was seen, above which shading was put in, not removed:
-0.31 to 0.77 with the true environment."""
 
 WELL_LIT = 0.5
 BRIGHT, BRIGHTEST = 0.75, 0.95
@@ -105,6 +112,7 @@ class LightEvidence:
     """Evidence of some points on the light; cells are those of a lat-long grid, row-major.
 
     Attributes:
+        positions: Of the points [m], ``(M, 3)``.
         normals: Unit, ``(M, 3)``.
         openness: Visibility towards each of `LIGHT_ROWS` x `LIGHT_COLUMNS` cells, in [0, 1], ``(M, L)``.
         colors: Scene-linear radiance towards each view, ``(V, M, 3)``.
@@ -112,6 +120,7 @@ class LightEvidence:
         directions: Unit, towards each view, ``(V, M, 3)``.
     """
 
+    positions: NDArray[np.float32]
     normals: NDArray[np.float32]
     openness: NDArray[np.float32]
     colors: NDArray[np.float32]
@@ -127,12 +136,14 @@ class LightCheck:
         best_rotation_degrees: Turn by which it fits best, as `EnvironmentMap.rotated` takes it, in (-180, 180]; of
             the mirrored map if ``is_mirrored``.
         is_mirrored: Whether it fits best with its columns in reverse order.
-        spread_as_given: Mean absolute deviation of the logarithm of base colour from its median.
+        spread_as_given: Mean absolute difference of the logarithms of neighbours' base colours.
         spread_best: The same at the best turn.
-        spread_undivided: The same of what was seen, shading and all.
+        spread_even: The same under a light that is the same from all sides.
         gloss_as_given: Correlation of what changes from view to view with the gloss expected; 0 where nothing does.
         gloss_best: The same at the best turn.
         misfit_as_given: Logarithm of how much is left unexplained by either, above the best turn's.
+        certainty: Difference of misfit between the light as stated, or nearly so, and the best of all others, over the
+            difference that chance may make; above 1 the light is not the one that was stated.
         exposure_stops: Exposure that base colours as a whole ask for; 0 where they are plausible as they are.
         point_count: How many Gaussians were asked.
         findings: What is wrong; a check that could judge nothing says here why, and is 0 elsewhere.
@@ -142,10 +153,11 @@ class LightCheck:
     is_mirrored: bool = False
     spread_as_given: float = 0.0
     spread_best: float = 0.0
-    spread_undivided: float = 0.0
+    spread_even: float = 0.0
     gloss_as_given: float = 0.0
     gloss_best: float = 0.0
     misfit_as_given: float = 0.0
+    certainty: float = 0.0
     exposure_stops: float = 0.0
     point_count: int
     findings: tuple[Finding, ...] = ()
@@ -166,8 +178,6 @@ def check_light(
     Raises:
         InvalidArrayError: There are no images.
         InvalidOptionError: ``subset`` is out of range.
-
-    Source: shading removed by division, as in intrinsic images; the two terms are those of BEAM Eqs. 4 and 5.
     """
     require_count("subset", subset, LEAST_POINTS, 65_536)
     if not views.colors.shape[0]:
@@ -191,6 +201,7 @@ def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, sub
     openness = np.zeros((len(rows), len(cells)), np.float32)
     openness[point, cell] = visibility(scene, origins[point].astype(np.float32), cells[cell])
     return LightEvidence(
+        positions=points.positions.numpy()[rows],
         normals=normals,
         openness=openness,
         colors=seen[..., :3],
@@ -225,45 +236,129 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
     weights, total, observed, luminance = weights[:, asked], total[asked], observed[asked], luminance[:, asked]
     normals, openness = evidence.normals[asked], evidence.openness[asked]
     lights = _turns(environment)
+    tree = cKDTree(evidence.positions[asked])
+    blocks = np.empty(count, np.int64)
+    parts = np.array_split(tree.indices, min(BLOCKS, count // LEAST_IN_BLOCK))
+    for number, rows in enumerate(parts):
+        blocks[rows] = number
     # what each cell's radiance adds to the irradiance of each point
     diffuse = np.maximum(normals @ _cell_directions().T, 0.0) * openness * _cell_angles()
     irradiance = diffuse @ (lights @ LUMINANCE).T.astype(np.float32) / np.float32(np.pi)
-    spreads = _spreads(observed, irradiance)
+    apart, pairs = _differences(tree, normals, _base_colors(observed, irradiance), blocks)
     # Relative to what a point shows on the whole: bright points must not decide alone.
     relative = 1.0 / np.maximum(observed, 0.02 * np.median(observed))
     changes = _cut(_centered(luminance, weights, total) * relative)
-    power = float((weights * changes**2).sum())
-    gloss = np.zeros(len(lights))
-    if power > GLOSSY_PART**2 * float(weights.sum()):
+    seen = _by_block((weights * changes**2).sum(axis=0)[:, None], blocks)
+    met, expected_power = np.zeros_like(apart), np.zeros_like(apart)
+    if seen.sum() > GLOSSY_PART**2 * float(weights.sum()):
         mirrored = _mirrored(normals, openness, evidence.directions[:, asked], lights)
         for index in range(len(lights)):
             expected = _cut(_centered(mirrored[..., index], weights, total) * relative)
-            norm = float((weights * expected**2).sum())
-            gloss[index] = float((weights * expected * changes).sum()) / np.sqrt(max(norm * power, 1e-30))
-    misfits = np.log(np.maximum(spreads, 1e-6)) + 0.5 * np.log1p(-(np.clip(gloss, 0.0, 0.999) ** 2))
+            both = np.stack([(weights * expected * changes).sum(axis=0), (weights * expected**2).sum(axis=0)], axis=1)
+            met[:, index], expected_power[:, index] = _by_block(both, blocks).T
+    sums = BlockSums(apart, pairs, met, expected_power, seen)
+    whole, left_out = sums.misfits(), np.stack([sums.misfits(without=block) for block in range(len(parts))])
 
-    unmirrored, mirror = misfits[:LIGHT_COLUMNS], misfits[LIGHT_COLUMNS:]
-    best = int(np.argmin(unmirrored))
-    if mirror.min() < unmirrored[best] - HANDEDNESS:
-        best = LIGHT_COLUMNS + int(np.argmin(mirror))
-    is_mirrored = best >= LIGHT_COLUMNS
-    stops = _exposure_stops(
-        (weights[..., None] * evidence.colors[:, asked]).sum(axis=0) / total[:, None],
-        diffuse @ lights[best].astype(np.float32) / np.float32(np.pi),
-    )
+    def clearly(better: int, worse: int) -> float:
+        """Return how much better a light fits than another, over what chance may make of it."""
+        differences = left_out[:, worse] - left_out[:, better]
+        deviation = np.sqrt((len(parts) - 1) * differences.var())
+        chance = student.ppf(1.0 - CHANCE / len(lights), len(parts) - 1) * deviation
+        return float((whole[worse] - whole[better]) / max(chance, LEAST_GAIN))
+
+    here, there = int(np.argmin(whole[:LIGHT_COLUMNS])), LIGHT_COLUMNS + int(np.argmin(whole[LIGHT_COLUMNS:EVEN]))
+    best, other = (there, here) if clearly(there, here) > 1.0 else (here, there)
+    near = np.arange(-NEAR, NEAR + 1) % LIGHT_COLUMNS
+    stated = int(near[np.argmin(whole[near])])
+    others = np.setdiff1d(np.arange(EVEN), near)
+    rival = int(others[np.argmin(whole[others])])
+    spread, gloss = sums.spreads(), sums.gloss()
+    turns = {
+        turn: _refined(whole[:EVEN].reshape(2, -1)[turn // LIGHT_COLUMNS], turn % LIGHT_COLUMNS)
+        for turn in (best, other)
+    }
     check = LightCheck(
-        best_rotation_degrees=_refined(misfits.reshape(2, -1)[int(is_mirrored)], best % LIGHT_COLUMNS),
-        is_mirrored=is_mirrored,
-        spread_as_given=float(spreads[0]),
-        spread_best=float(spreads[best]),
-        spread_undivided=float(_spreads(observed, np.ones((len(observed), 1), np.float32))[0]),
+        best_rotation_degrees=turns[best],
+        is_mirrored=best >= LIGHT_COLUMNS,
+        spread_as_given=float(spread[0]),
+        spread_best=float(spread[best]),
+        spread_even=float(spread[EVEN]),
         gloss_as_given=float(gloss[0]),
         gloss_best=float(gloss[best]),
-        misfit_as_given=float(misfits[0] - misfits[best]),
-        exposure_stops=stops,
+        misfit_as_given=float(whole[0] - whole[best]),
+        certainty=clearly(rival, stated),
+        exposure_stops=_exposure_stops(
+            (weights[..., None] * evidence.colors[:, asked]).sum(axis=0) / total[:, None],
+            diffuse @ lights[best].astype(np.float32) / np.float32(np.pi),
+        ),
         point_count=count,
     )
-    return replace(check, findings=tuple(_findings(check, has_gloss=bool(gloss.any()))))
+    is_unlike = min(clearly(EVEN, here), clearly(EVEN, there)) > 1.0
+    fits = [best] if clearly(best, other) > 1.0 else [best, other]
+    return replace(check, findings=tuple(_findings(check, is_unlike, [(t >= LIGHT_COLUMNS, turns[t]) for t in fits])))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSums:
+    """Sums over the points of each part of the surface under each light; of all parts they give its misfit.
+
+    Attributes:
+        apart: Absolute differences of neighbours' base colours, ``(B, lights)``.
+        pairs: How many neighbours they are of, ``(B, 1)``.
+        met: Products of changes from view to view with those expected, ``(B, lights)``.
+        expected: Squares of those expected, ``(B, lights)``.
+        seen: Squares of those seen, ``(B, 1)``.
+    """
+
+    apart: NDArray[np.float64]
+    pairs: NDArray[np.float64]
+    met: NDArray[np.float64]
+    expected: NDArray[np.float64]
+    seen: NDArray[np.float64]
+
+    def spreads(self, *, without: int | None = None) -> NDArray[np.float64]:
+        """Return the mean difference of neighbours' base colours, ``(lights,)``, with or without a part."""
+        return _total(self.apart, without) / np.maximum(_total(self.pairs, without), 1.0)
+
+    def gloss(self, *, without: int | None = None) -> NDArray[np.float64]:
+        """Return the correlation of changes from view to view with those expected, ``(lights,)``."""
+        power = _total(self.expected, without) * _total(self.seen, without)
+        return _total(self.met, without) / np.sqrt(np.maximum(power, 1e-30))
+
+    def misfits(self, *, without: int | None = None) -> NDArray[np.float64]:
+        """Return log(spread) + log(1 - gloss²) / 2: logarithms of what is left unexplained of either."""
+        spread = np.log(np.maximum(self.spreads(without=without), 1e-6))
+        return spread + 0.5 * np.log1p(-(np.clip(self.gloss(without=without), 0.0, 0.999) ** 2))
+
+
+def _total(sums: NDArray[np.float64], without: int | None) -> NDArray[np.float64]:
+    """Return the sum over all parts, or all but one."""
+    return sums.sum(axis=0) - (0.0 if without is None else sums[without])
+
+
+def _by_block(values: NDArray[np.floating], blocks: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Add up rows of ``(M, K)`` values by the part of the surface that they belong to, ``(B, K)``."""
+    sums = np.zeros((int(blocks.max()) + 1, values.shape[1]))
+    np.add.at(sums, blocks, values)
+    return sums
+
+
+def _differences(
+    tree: cKDTree, normals: NDArray[np.float32], base: NDArray[np.float64], blocks: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sums of absolute differences of neighbours' base colours by block, and how many neighbours there are.
+
+    Neighbours that face away from each other are on two sides of a thin part, which are painted apart.
+    """
+    _, near = tree.query(tree.data, k=min(NEIGHBORS + 1, tree.n))
+    pairs = np.stack([np.repeat(np.arange(tree.n), near.shape[1]), near.reshape(-1)], axis=1)
+    first, second = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0).T
+    facing = (normals[first] * normals[second]).sum(axis=1) > 0.0
+    first, second = first[facing], second[facing]
+    apart = np.zeros((int(blocks.max()) + 1, base.shape[1]))
+    for light in range(base.shape[1]):
+        apart[:, light] = np.bincount(blocks[first], np.abs(base[first, light] - base[second, light]), len(apart))
+    return apart, np.bincount(blocks[first], minlength=len(apart)).astype(np.float64)[:, None]
 
 
 def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
@@ -306,15 +401,11 @@ def _cell_angles() -> NDArray[np.float32]:
 
 
 def _turns(environment: EnvironmentMap) -> NDArray[np.float64]:
-    """Return an environment under every turn by whole cells, then its mirror image, ``(2 LIGHT_COLUMNS, L, 3)``."""
+    """Return an environment under every turn by whole cells, its mirror images, and an even light, ``(., L, 3)``."""
     cells = environment.resized(LIGHT_ROWS, LIGHT_COLUMNS).radiance.astype(np.float64)
-    return np.stack(
-        [
-            np.roll(hand, -turn, axis=1).reshape(-1, 3)
-            for hand in (cells, cells[:, ::-1])
-            for turn in range(LIGHT_COLUMNS)
-        ]
-    )
+    turns = [np.roll(hand, -turn, axis=1) for hand in (cells, cells[:, ::-1]) for turn in range(LIGHT_COLUMNS)]
+    even = np.broadcast_to(environment.mean_radiance(), cells.shape)
+    return np.stack([*turns, even]).reshape(len(turns) + 1, -1, 3)
 
 
 def _mirrored(
@@ -355,11 +446,10 @@ def _cut(changes: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(changes, -LARGEST_CHANGE, LARGEST_CHANGE)
 
 
-def _spreads(observed: NDArray[np.float32], irradiance: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the spread of the logarithm of base colour under each light, ``(lights,)``."""
+def _base_colors(observed: NDArray[np.float32], irradiance: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the logarithm of base colour under each light, up to a constant, ``(M, lights)``."""
     least = np.maximum(LEAST_LIGHT * np.median(irradiance, axis=0), 1e-12)
-    base = np.log(observed.astype(np.float64))[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
-    return np.abs(base - np.median(base, axis=0)).mean(axis=0)
+    return np.log(observed.astype(np.float64))[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
 
 
 def _refined(misfits: NDArray[np.float64], best: int) -> float:
@@ -384,31 +474,34 @@ def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]
     return float(np.log2(brightest / PLAUSIBLE)) if brightest < TOO_DARK else 0.0
 
 
-def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
-    """Return findings about a light; if it does not fit at all, neither its turn nor its exposure mean anything."""
-    put_in = check.spread_best > UNREMOVED * check.spread_undivided
-    if (has_gloss and check.gloss_best < LEAST_GLOSS) or put_in:
+def _findings(check: LightCheck, is_unlike: bool, fits: Sequence[tuple[bool, float]]) -> list[Finding]:
+    """Return findings about a light; if it does not fit at all, neither its turn nor its exposure mean anything.
+
+    Args:
+        check: What was found.
+        is_unlike: Whether an even light explains the capture better than any turn.
+        fits: Turns that explain it best, the best first: whether mirrored, and by how much [degree].
+    """
+    if is_unlike:
         return [
             Finding(
-                # Small images blur gloss away under the right light too: then it is worth knowing, no more.
-                "warning" if put_in else "note",
+                "warning",
                 "environment-unexplained",
-                "environment does not explain the capture under any turn: correlation of gloss "
-                f"{check.gloss_best:.2f}, {LEAST_GLOSS:g} or more with the right one; spread of base colours "
-                f"{check.spread_best:.2f}, of what was seen {check.spread_undivided:.2f}",
-                remedy="Check that it is the light of this capture. Surfaces without any gloss, and blurred images, "
-                "can look so too.",
+                "environment does not explain the capture under any turn: a light that is the same from all sides "
+                f"explains it better, with a spread of base colours of {check.spread_even:.2f}, not "
+                f"{check.spread_best:.2f}",
+                remedy="Check that it is the light of this capture.",
             )
         ]
     findings = []
-    if check.misfit_as_given > CLEARLY_BETTER and check.gloss_best > check.gloss_as_given - CONTRADICTED:
+    if check.certainty > 1.0:
+        ways = [f"{'mirrored and ' if mirrored else ''}turned by {turn:+.0f} degrees" for mirrored, turn in fits]
         findings.append(
             Finding(
                 "warning",
                 "environment-turned",
                 f"environment explains the capture {np.exp(check.misfit_as_given):.2f} times better "
-                f"{'mirrored and ' if check.is_mirrored else ''}turned by {check.best_rotation_degrees:+.0f} degrees "
-                "about the up axis",
+                f"{', or '.join(ways)} about the up axis",
                 remedy="Check its convention: the centre of the image is +x, its left quarter +y. "
                 + ("Reverse its columns, then turn it." if check.is_mirrored else "Turn it by that."),
             )
