@@ -502,8 +502,8 @@ def _findings(check: LightCheck, is_unlike: bool, fits: Sequence[tuple[bool, flo
                 "environment-turned",
                 f"environment explains the capture {np.exp(check.misfit_as_given):.2f} times better "
                 f"{', or '.join(ways)} about the up axis",
-                remedy="Check its convention: the centre of the image is +x, its left quarter +y. "
-                + ("Reverse its columns, then turn it." if check.is_mirrored else "Turn it by that."),
+                remedy="Check its convention: the centre of the image is +x, its left quarter +y. Turn it by that; to "
+                "mirror it, reverse its columns first.",
             )
         )
     if check.exposure_stops:
