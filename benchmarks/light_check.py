@@ -184,8 +184,8 @@ def main() -> None:
             views, light = photographed(subject, Path(given.data), Path(folder), device)
         evidence = evidence_of(views, device)
         for stated in sweep(light):
-            cases.append({"subject": subject, **judged(judge_light(evidence, stated.light), stated, light)})
-        for case in cases[-sum(1 for _ in sweep(light)) :]:
+            case = {"subject": subject, **judged(judge_light(evidence, stated.light), stated, light)}
+            cases.append(case)
             print(
                 f"{subject:10} {case['light']:9}{case['off_by']:+6g}  {case['verdict']:7}"
                 f"certainty {case['certainty']:+.2f}  error left {case['error_left']:.2f}  {', '.join(case['said'])}",
@@ -195,7 +195,7 @@ def main() -> None:
         "benchmark": "light_check",
         "commit": given.commit,
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "machine": machine(device),
+        "machine": machine(resolve_device(device)),
         "options": {"subjects": list(given.subjects), "reduction": REDUCTION, "asked": ASKED},
         "seconds": time.perf_counter() - started,
         "summary": summary(cases),

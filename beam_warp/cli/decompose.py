@@ -203,11 +203,12 @@ def overview_options(measuring: Measuring) -> OverviewOptions:
 def outcome(result: RunResult, seconds: float) -> str:
     """Return what came out, in some lines."""
     materials = result.report["materials"]
-    frames = len(result.sequence)
+    frames, fitted = len(result.sequence), result.report["exposure_is_fitted"]
     return (
         f"wrote {result.asset}: {frames} frame{'s' if frames > 1 else ''}, "
         f"{result.report['input']['gaussians']:,} Gaussians, {seconds:.1f} s on {result.report['device']['name']}\n"
-        f"exposure of the light {result.report['exposure_stops']:+.2f} stops, "
+        f"exposure of the light {'fitted by ' if fitted else ''}{result.report['exposure_stops']:+.2f} stops"
+        f"{', as captured colour has no scale of its own' if fitted else ''}; "
         f"mean ambient occlusion {materials['mean_ambient_occlusion']:.3f}\n"
         f"mean standard error of base colour {materials['mean_base_color_error_where_measured']:.3f}, "
         f"{materials['flags']['FILLED']:,} Gaussians filled from neighbours\n"

@@ -86,7 +86,7 @@ class OverviewOptions:
     """Options of the contact sheet.
 
     Attributes:
-        second_light: Shown beside the light of the capture; that light turned by 180 degrees if None.
+        second_light: Shown beside the light that was given; that light turned by 180 degrees if None.
         azimuth: Camera angle; 0 looks along +y [degree].
         elevation: Camera angle above the horizon [degree].
         height: Height of a panel [pixel].
