@@ -34,7 +34,8 @@ from beam_warp.demo.from_images import FromImagesOptions, demo_steps
 from beam_warp.demo.lights import studio
 from beam_warp.device.arrays import resolve_device
 from beam_warp.materials.evidence import view_evidence
-from beam_warp.materials.light import LightCheck, LightEvidence, judge_light, light_evidence
+from beam_warp.materials.light import LightCheck, judge_light, light_evidence
+from beam_warp.materials.light_fits import LightEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
