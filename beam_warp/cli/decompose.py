@@ -53,12 +53,14 @@ class Measuring:
         arg(metavar="FILE", help="Mesh whose texture coordinates the roughness texture follows."),
         SECOND_PAGE,
     ] = None
-    samples: Annotated[int, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light.")] = 64
+    samples: Annotated[
+        int | None, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light; 64 by default.")
+    ] = None
     offset: Annotated[
-        float | Literal["auto"],
-        arg(metavar="M|auto", help="Lift of ray origins off the surface, in metres."),
+        float | Literal["auto"] | None,
+        arg(metavar="M|auto", help="Lift of ray origins off the surface, in metres; auto by default."),
         SECOND_PAGE,
-    ] = "auto"
+    ] = None
     bounce: Annotated[bool, arg(help="Account for one bounce of light between surfaces."), SECOND_PAGE] = True
 
 
@@ -172,10 +174,11 @@ def run_options(
         roughness = RoughnessTexture(stated, measuring.roughness_mesh)
     elif stated is None:
         roughness = 0.5 if capture is None or preset == "paper" else "estimate"
+    rays: dict[str, Any] = {"sample_count": measuring.samples, "offset": measuring.offset}
+    rays = {name: value for name, value in rays.items() if value is not None}
+    rays |= {} if measuring.bounce else {"bounce": False}
     return RunOptions(
-        materials=MaterialOptions(
-            sample_count=measuring.samples, offset=measuring.offset, bounce=measuring.bounce, seed=seed
-        ),
+        materials=MaterialOptions(**rays, seed=seed) if rays or preset == "direct" else None,
         images=ImagePathOptions(seed=seed) if preset == "paper" else None,
         roughness=roughness,
         exposure=measuring.exposure,
@@ -200,11 +203,12 @@ def overview_options(measuring: Measuring) -> OverviewOptions:
 def outcome(result: RunResult, seconds: float) -> str:
     """Return what came out, in some lines."""
     materials = result.report["materials"]
-    frames = len(result.sequence)
+    frames, fitted = len(result.sequence), result.report["exposure_is_fitted"]
     return (
         f"wrote {result.asset}: {frames} frame{'s' if frames > 1 else ''}, "
         f"{result.report['input']['gaussians']:,} Gaussians, {seconds:.1f} s on {result.report['device']['name']}\n"
-        f"exposure of the light {result.report['exposure_stops']:+.2f} stops, "
+        f"exposure of the light {'fitted by ' if fitted else ''}{result.report['exposure_stops']:+.2f} stops"
+        f"{', as captured colour has no scale of its own' if fitted else ''}; "
         f"mean ambient occlusion {materials['mean_ambient_occlusion']:.3f}\n"
         f"mean standard error of base colour {materials['mean_base_color_error_where_measured']:.3f}, "
         f"{materials['flags']['FILLED']:,} Gaussians filled from neighbours\n"

@@ -42,11 +42,13 @@ class CaptureLight:
         environment: The given one times the exposure.
         prepared: The same, prepared on the job's device.
         stops: The exposure, as a power of two.
+        is_fitted: Whether the exposure was found, because the captured colour has no scale of its own.
     """
 
     environment: EnvironmentMap
     prepared: PreparedEnvironment
     stops: float
+    is_fitted: bool
 
 
 def prepare_light(environment: EnvironmentMap, source: Source, described: str, folder: Path) -> CaptureLight:
@@ -62,9 +64,10 @@ def prepare_light(environment: EnvironmentMap, source: Source, described: str, f
     with source.log.timer("prepare light"):
         given = PreparedEnvironment(environment, device)
     stops = 0.0
+    is_fitted = options.exposure == "auto" and source.is_display_referred()
     if options.exposure != "auto":
         stops = float(options.exposure)
-    elif source.is_display_referred():
+    elif is_fitted:
         first = source.first
         text = f"{described} {source.image_digest(0)}"
         key = array_digest(environment.radiance, *first.cloud.arrays().values(), text=text)
@@ -72,7 +75,7 @@ def prepare_light(environment: EnvironmentMap, source: Source, described: str, f
             folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(first, given, options)])}
         )
         stops = float(found["stops"][0])
-    return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops)
+    return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops, is_fitted)
 
 
 def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOptions) -> float:
@@ -83,7 +86,7 @@ def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOp
     roughness = stated_roughness(frame.original, stated)
     with frame.log.timer("exposure"):
         return float(
-            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.materials))
+            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.gathering))
         )
 
 

@@ -84,7 +84,8 @@ def run(
 
     Args:
         sequence: Frames with captured radiance, in any axes.
-        environment: The light of the capture, in the world "rfu".
+        environment: The light of the capture, in the world "rfu". Where it is not known, another one: base colour
+            explains the captured colour by it, and relightings by it are not comparable with what was captured.
         out: Folder; made if its parent exists.
         options: See `RunOptions`.
         capture: The images that the Gaussians were reconstructed from: light is gathered where they show the surface,
@@ -137,7 +138,7 @@ def run(
         converters.write(relightable, asset)
     with log.timer("overview"):
         progress("overview", 0, 1)
-        draw_overview(picture, relightable, light.prepared, overview or OverviewOptions())
+        draw_overview(picture, relightable, plan, overview or OverviewOptions())
         progress("overview", 1, 1)
     seconds = time.perf_counter() - started
     report = run_report(plan, frames, solved, findings=findings, roughness=roughness.report, seconds=seconds)

@@ -25,12 +25,14 @@ class FrameMeasurement:
 
     Attributes:
         resumed: Frames that were found finished.
+        ray_count: Rays of light and occlusion that were traced for the others.
         notes: What a reader of the result should know.
     """
 
     def __init__(self, plan: JobPlan, roughness: RoughnessFinder) -> None:
         """Start with no frame; ``roughness`` finds that of each."""
         self.resumed = 0
+        self.ray_count = 0
         self.notes: list[str] = []
         self._plan, self._roughness = plan, roughness
 
@@ -84,11 +86,12 @@ class FrameMeasurement:
                 points,
                 roughness["roughness"],
                 self._plan.light.prepared,
-                options=self._plan.source.options.materials,
+                options=self._plan.source.options.gathering,
                 views=views,
                 frame=frame.number,
                 progress=frame.log.within("materials", frame.number),
             )
+        self.ray_count += measured.ray_count
         with frame.log.timer("fill"):
             occlusion, error = frame.filled_occlusion(measured.ambient_occlusion, measured.ambient_occlusion_error)
         arrays = {"ambient_occlusion": occlusion, "ambient_occlusion_error": error, **roughness}
@@ -114,6 +117,7 @@ class FrameMeasurement:
                 frame=frame.number,
                 progress=frame.log.within("materials", frame.number),
             )
+        self.ray_count += found.ray_count
         self.notes += [note for note in found.notes if note not in self.notes]
         return {
             "ambient_occlusion": found.ambient_occlusion,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from beam_warp.checks import require_number
+from beam_warp.errors import InvalidOptionError
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
@@ -19,7 +20,7 @@ class RunOptions:
     """Options of `beam_warp.run`.
 
     Attributes:
-        materials: Rays, offset, bounce, seed of the direct path.
+        materials: Rays, offset, bounce, seed of the direct path; None takes its defaults. The image path has none.
         images: Options of the image path, the paper's, which is then taken; None takes the direct path.
         roughness: Perceptual roughness of everything, a texture, or ``"estimate"``: found from the specular residue
             over views and frames.
@@ -31,10 +32,10 @@ class RunOptions:
         device: Warp device; None takes the first CUDA device, or the CPU.
 
     Raises:
-        InvalidOptionError: The exposure is out of range.
+        InvalidOptionError: The exposure is out of range, or both paths have options.
     """
 
-    materials: MaterialOptions = field(default_factory=MaterialOptions)
+    materials: MaterialOptions | None = None
     images: ImagePathOptions | None = None
     roughness: float | RoughnessTexture | Literal["estimate"] = 0.5
     exposure: float | Literal["auto"] = "auto"
@@ -42,7 +43,14 @@ class RunOptions:
     device: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the exposure; the other options check themselves."""
+        """Check the exposure, and that one path alone has options, which check themselves."""
+        if self.materials is not None and self.images is not None:
+            default = asdict(MaterialOptions())
+            stated = [f"{key} {value}" for key, value in asdict(self.materials).items() if value != default[key]]
+            raise InvalidOptionError(
+                "materials (sample_count, offset, bounce and so on) must be left out on the image path, which has "
+                f"options of its own, got {', '.join(stated) or 'defaults'}. Drop them, or take the direct path."
+            )
         if self.exposure != "auto":
             require_number("exposure", self.exposure, -32.0, 32.0)
 
@@ -53,10 +61,21 @@ class RunOptions:
             return "texture"
         return "estimated" if self.roughness == ESTIMATE else "constant"
 
+    @property
+    def gathering(self) -> MaterialOptions:
+        """How light is gathered at points: `materials`, or on the image path, where estimates need it, its defaults."""
+        return self.materials or MaterialOptions(seed=0 if self.images is None else self.images.seed)
+
     def as_dict(self) -> dict[str, Any]:
-        """Return the options as JSON-able values, without the device, which reports state by its name."""
+        """Return the options of the path that is taken as JSON-able values.
+
+        The device is left out, because reports state it by its name.
+        """
         described = asdict(self)
         described.pop("device")
+        described.pop("images" if self.images is None else "materials")
+        if self.images is None:
+            described["materials"] = asdict(self.gathering)
         if isinstance(self.roughness, RoughnessTexture):
             described["roughness"] = {key: str(value) for key, value in described["roughness"].items()}
         return described
@@ -67,7 +86,7 @@ class OverviewOptions:
     """Options of the contact sheet.
 
     Attributes:
-        second_light: Shown beside the light of the capture; that light turned by 180 degrees if None.
+        second_light: Shown beside the light that was given; that light turned by 180 degrees if None.
         azimuth: Camera angle; 0 looks along +y [degree].
         elevation: Camera angle above the horizon [degree].
         height: Height of a panel [pixel].

@@ -16,7 +16,6 @@ from beam_warp.decomposition.solve import SolvedFrames
 from beam_warp.decomposition.tally import warnings_about
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
-from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera
@@ -50,8 +49,9 @@ def relightable_sequence(plan: JobPlan, solved: SolvedFrames) -> GaussianSequenc
     )
 
 
-def draw_overview(path: Path, sequence: GaussianSequence, light: PreparedEnvironment, options: OverviewOptions) -> None:
+def draw_overview(path: Path, sequence: GaussianSequence, plan: JobPlan, options: OverviewOptions) -> None:
     """Draw the middle frame as captured and under two lights; panels are as wide as the subject needs."""
+    light = plan.light.prepared
     cloud = sequence[len(sequence) // 2]
     extent = np.ptp(bulk(cloud.positions, cloud.opacities), axis=0)
     aspect = float(np.clip(np.hypot(extent[0], extent[1]) / max(extent[2], 1e-9), 0.5, 1.8))
@@ -64,11 +64,20 @@ def draw_overview(path: Path, sequence: GaussianSequence, light: PreparedEnviron
         height=options.height,
     )
     lights = [
-        Relighting("relit by the light of the capture", light),
+        Relighting(f"relit by {_light_in_words(plan)}", light),
         options.second_light or Relighting("relit by that light turned by 180°", light, degrees=180.0),
     ]
     raster = RasterOptions.from_metadata(sequence.metadata)
     write_png(path, contact_sheet(cloud, camera, lights, options=raster, device=str(light.device)))
+
+
+def _light_in_words(plan: JobPlan) -> str:
+    """Return what is known of the light: only images with a scale of their own can be compared with a relighting."""
+    stops, is_fitted = plan.light.stops, plan.light.is_fitted
+    name = "the given light" if plan.source.images is None or is_fitted else "the light of the capture"
+    if is_fitted:
+        return f"{name}, exposure fitted by {stops:+.1f} stops"
+    return f"{name}, exposed by {stops:+.1f} stops" if stops else name
 
 
 def run_report(
@@ -91,22 +100,22 @@ def run_report(
         seconds: Duration of the whole job.
     """
     sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.source.log.timer.seconds
-    measured = len(sequence) - measurement.resumed
     traced = stages.get("materials", 0.0)
-    rays = measured * count * plan.source.options.materials.sample_count * 2
     notes = [*sequence.metadata.get("notes", "").splitlines(), *measurement.notes, *_lines(findings, "note")]
     return {
         "input": {"frames": len(sequence), "gaussians": count, "notes": notes},
         "device": device_facts(plan.light.prepared.device),
         "versions": versions(),
         "options": plan.source.options.as_dict(),
+        "light": _light_in_words(plan),
         "exposure_stops": plan.light.stops,
+        "exposure_is_fitted": plan.light.is_fitted,
         "resumed_frames": measurement.resumed,
         "persistent": plan.persistent,
         "materials": solved.statistics,
         "roughness": roughness,
         "seconds": {**stages, "total": seconds},
-        "light_and_occlusion_rays_per_second": rays / traced if traced > 0.0 and measured else None,
+        "light_and_occlusion_rays_per_second": measurement.ray_count / traced if traced > 0.0 else None,
         "findings": findings,
         "warnings": [*_lines(findings, "warning"), *warnings_about(solved.statistics)],
     }

@@ -71,7 +71,7 @@ class RoughnessFinder:
                     points,
                     self._plan.light.prepared,
                     views,
-                    options=self._plan.source.options.materials,
+                    options=self._plan.source.options.gathering,
                     frame=number,
                     progress=seen.log.within("roughness", number),
                 )

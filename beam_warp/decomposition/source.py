@@ -62,7 +62,7 @@ class Source:
                 "Import Gaussians with captured colour."
             )
         cloud = change_axes(original, WORLD_AXES)
-        return SeenFrame(number, original, cloud, self.images, self.options.materials, self.device, self.log)
+        return SeenFrame(number, original, cloud, self.images, self.options.gathering, self.device, self.log)
 
     def is_display_referred(self) -> bool:
         """Return whether the captured colour has no scale: that of the first frame's images, if there are any."""

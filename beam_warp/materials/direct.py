@@ -159,11 +159,15 @@ ColorEvidence.ARRAYS = tuple(field.name for field in fields(ColorEvidence) if fi
 
 @dataclass(frozen=True, eq=False)
 class MaterialMeasurement:
-    """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour."""
+    """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour.
+
+    ``ray_count`` is how many rays were traced for both, those of the bounce left out.
+    """
 
     ambient_occlusion: NDArray[np.float32]
     ambient_occlusion_error: NDArray[np.float32]
     evidence: ColorEvidence
+    ray_count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +281,10 @@ def measure_materials(
         unseen=by_row(np.zeros(len(lit)), lit, 1.0),
     )
     return MaterialMeasurement(
-        by_row(visibility, shown, 1.0), by_row(occlusion.standard_error.numpy(), shown, 1.0), evidence
+        by_row(visibility, shown, 1.0),
+        by_row(occlusion.standard_error.numpy(), shown, 1.0),
+        evidence,
+        options.sample_count * (len(shown) + len(lit)),
     )
 
 

@@ -139,6 +139,7 @@ class ImageMaterials:
         occlusion_evidence: The same of ambient occlusion, ``(N,)`` float32.
         filled: Where base colour, or ambient occlusion, comes from neighbours because no view says anything,
             ``(N, 2)`` bool.
+        ray_count: How many rays were traced for both.
         seconds: By stage.
         passes: Of baking, over the views.
         notes: What a reader of the result should know.
@@ -149,6 +150,7 @@ class ImageMaterials:
     color_evidence: NDArray[np.float32]
     occlusion_evidence: NDArray[np.float32]
     filled: NDArray[np.bool_]
+    ray_count: int
     seconds: dict[str, float]
     passes: float
     notes: tuple[str, ...]
@@ -239,6 +241,7 @@ def decompose_by_images(
         baked.evidence[:, :3].min(axis=1),
         np.ascontiguousarray(baked.evidence[:, 3]),
         filled,
+        shown * (chosen.occlusion_samples + chosen.light_samples),
         stages.seconds,
         baked.passes,
         tuple(notes),

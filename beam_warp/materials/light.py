@@ -1,9 +1,8 @@
 """Check that a stated environment fits its capture: its turn, its handedness, its scale, its range.
 
-Two criteria need no base colours. Observed colours divided by the shading of the right light are base colours, which
-spread less over the surface than under any other light. Changes of a point's colour from view to view are gloss:
-whatever the base colour, they must follow the light that the views see mirrored. Both are linear in the light, so that
-all turns of an environment cost two matrix products.
+Every verdict compares the light as stated with another one (`beam_warp.materials.light_fits`). It is given only where
+chance would hardly give it once in twenty captures, whichever of the other lights fits best. Otherwise the check is
+silent: an even light has no turn, a matt ball under a broad light says little.
 """
 
 from __future__ import annotations
@@ -16,15 +15,23 @@ from numpy.typing import NDArray
 from beam_warp.capture.findings import Finding, count_of
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import LUMINANCE, linear_to_srgb
+from beam_warp.image.color import linear_to_srgb
 from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.light_fits import (
+    EVEN,
+    LIGHT_COLUMNS,
+    LightEvidence,
+    LightFits,
+    cell_directions,
+    irradiance_over_pi,
+    mean_colors,
+    turned_lights,
+    well_shown,
+)
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
-from beam_warp.world.environment import EnvironmentMap, texel_directions
-
-LIGHT_ROWS, LIGHT_COLUMNS = 16, 32
-"""Cells that the light is averaged over; a turn by one column is 11.25 degrees, turns between are interpolated."""
+from beam_warp.world.environment import EnvironmentMap
 
 LEAST_POINTS = 64
 """Fewest Gaussians that say anything about light."""
@@ -40,42 +47,8 @@ AGREEMENT = 0.9
 UNCUT = 0.1
 """Pixels by blending weights, agreement of normals and largest saturated part of Gaussians that are asked."""
 
-GLOSS_ROUGHNESS = 0.5
-"""Roughness of the lobe that light is mirrored in. True ones of 0.3 to 0.9 correlate with it, only less."""
-
-LEAST_LIGHT = 0.01
-"""Part of the median irradiance that reaches every point at least, from other surfaces."""
-
-LARGEST_CHANGE = 0.5
-"""Changes from view to view are cut at this part of a point's own luminance: beyond are errors of matching."""
-
-CLEARLY_BETTER = 0.1
-"""Difference of misfit from which on another turn explains the capture better than the stated one.
-
-Measured on two captured figures, each under its own light and two others (6 in all): the true turn is behind the best
-by 0.023 at most. Turned away from it by 10 degrees it is behind by 0.06 to 0.28, by 15 by 0.10 to 0.74, by 30 by 0.21
-or more, by 90 or more by 0.67 or more. Mirrored, whatever the turn, by 0.35 or more but for turns that put a lone sun
-where it was, of which no capture could tell."""
-
-HANDEDNESS = 0.05
-"""Difference of misfit from which on a mirror image is preferred to a turn: twice the largest that chance made."""
-
-CONTRADICTED = 0.05
-"""Loss of correlation of gloss from which on it contradicts a turn that the spread of base colours prefers."""
-
-LEAST_GLOSS = 0.4
-"""Correlation of gloss below which no turn of the environment explains what views show.
-
-Measured as above: 0.49 to 0.76 with the true environment; with others, each at its best turn, below 0.34 in 20 cases of
-24, and 0.45 to 0.61 in the rest, whose lights resemble the true ones."""
-
-GLOSSY_PART = 0.01
-"""Change of luminance from view to view, of what is seen, above which gloss can be told from noise: 0.07 to 0.09 in
-captures."""
-
-UNREMOVED = 1.1
-"""Spread of base colours at the best turn, over that of what was seen, above which shading was put in, not removed:
-0.31 to 0.77 with the true environment."""
+NEAR = 1
+"""Turns, in columns, that count as none: neither lights nor normals are known better than by a cell."""
 
 WELL_LIT = 0.5
 BRIGHT, BRIGHTEST = 0.75, 0.95
@@ -100,25 +73,6 @@ from whole steps of 8 bits: a half float, rounded by 2^-12 of its value, is off 
 files are linear and 0.03 in sRGB."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LightEvidence:
-    """Evidence of some points on the light; cells are those of a lat-long grid, row-major.
-
-    Attributes:
-        normals: Unit, ``(M, 3)``.
-        openness: Visibility towards each of `LIGHT_ROWS` x `LIGHT_COLUMNS` cells, in [0, 1], ``(M, L)``.
-        colors: Scene-linear radiance towards each view, ``(V, M, 3)``.
-        weights: Of the same, 0 where a view does not see the point, ``(V, M)``.
-        directions: Unit, towards each view, ``(V, M, 3)``.
-    """
-
-    normals: NDArray[np.float32]
-    openness: NDArray[np.float32]
-    colors: NDArray[np.float32]
-    weights: NDArray[np.float32]
-    directions: NDArray[np.float32]
-
-
 @dataclass(frozen=True, kw_only=True)
 class LightCheck:
     """Fit of an environment to a capture.
@@ -127,12 +81,14 @@ class LightCheck:
         best_rotation_degrees: Turn by which it fits best, as `EnvironmentMap.rotated` takes it, in (-180, 180]; of
             the mirrored map if ``is_mirrored``.
         is_mirrored: Whether it fits best with its columns in reverse order.
-        spread_as_given: Mean absolute deviation of the logarithm of base colour from its median.
+        spread_as_given: Mean absolute difference of the logarithms of neighbours' base colours.
         spread_best: The same at the best turn.
-        spread_undivided: The same of what was seen, shading and all.
+        spread_even: The same under a light that is the same from all sides.
         gloss_as_given: Correlation of what changes from view to view with the gloss expected; 0 where nothing does.
         gloss_best: The same at the best turn.
         misfit_as_given: Logarithm of how much is left unexplained by either, above the best turn's.
+        certainty: Difference of misfit between the light as stated, or nearly so, and the best of all others, over the
+            difference that chance may make; above 1 the light is not the one that was stated.
         exposure_stops: Exposure that base colours as a whole ask for; 0 where they are plausible as they are.
         point_count: How many Gaussians were asked.
         findings: What is wrong; a check that could judge nothing says here why, and is 0 elsewhere.
@@ -142,10 +98,11 @@ class LightCheck:
     is_mirrored: bool = False
     spread_as_given: float = 0.0
     spread_best: float = 0.0
-    spread_undivided: float = 0.0
+    spread_even: float = 0.0
     gloss_as_given: float = 0.0
     gloss_best: float = 0.0
     misfit_as_given: float = 0.0
+    certainty: float = 0.0
     exposure_stops: float = 0.0
     point_count: int
     findings: tuple[Finding, ...] = ()
@@ -166,8 +123,6 @@ def check_light(
     Raises:
         InvalidArrayError: There are no images.
         InvalidOptionError: ``subset`` is out of range.
-
-    Source: shading removed by division, as in intrinsic images; the two terms are those of BEAM Eqs. 4 and 5.
     """
     require_count("subset", subset, LEAST_POINTS, 65_536)
     if not views.colors.shape[0]:
@@ -186,11 +141,12 @@ def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, sub
     seen = views.colors.numpy()[chosen][:, rows]
     normals = points.normals.numpy()[rows]
     origins = points.positions.numpy()[rows] + normals * points.offsets.numpy()[rows][:, None]
-    cells = _cell_directions()
+    cells = cell_directions()
     point, cell = np.nonzero(normals @ cells.T > 0.0)
     openness = np.zeros((len(rows), len(cells)), np.float32)
     openness[point, cell] = visibility(scene, origins[point].astype(np.float32), cells[cell])
     return LightEvidence(
+        positions=points.positions.numpy()[rows],
         normals=normals,
         openness=openness,
         colors=seen[..., :3],
@@ -200,70 +156,43 @@ def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, sub
 
 
 def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCheck:
-    """Compare an environment with its turns and mirror images.
-
-    The misfit is log(spread) + log(1 - gloss²) / 2: logarithms of what is left unexplained of either.
-    """
-    facing = np.einsum("vmk,mk->vm", evidence.directions, evidence.normals)
-    weights = evidence.weights * np.clip((facing - 0.2) / 0.3, 0.0, 1.0)
-    luminance = evidence.colors @ LUMINANCE.astype(np.float32)
-    total = weights.sum(axis=0)
-    observed = (weights * luminance).sum(axis=0) / np.maximum(total, 1e-12)
-    asked = (total > 0.0) & (observed > 0.0)
-    count = int(asked.sum())
+    """Compare an environment with its turns, its mirror images and an even light."""
+    shown = well_shown(evidence)
+    count, views = len(shown.normals), len(shown.weights)
     if not environment.radiance.any():
         remedy = "Check its exposure and the file; nothing can be measured without light."
         finding = Finding("error", "environment-black", "environment is black", remedy=remedy)
         return LightCheck(point_count=count, findings=(finding,))
-    if count < LEAST_POINTS or len(weights) < LEAST_VIEWS:
+    if count < LEAST_POINTS or views < LEAST_VIEWS:
         what = (
-            f"environment is not checked: {count} Gaussians are seen well in {count_of(len(weights), 'view')}, "
+            f"environment is not checked: {count} Gaussians are seen well in {count_of(views, 'view')}, "
             f"{LEAST_POINTS} and {LEAST_VIEWS} are needed"
         )
         remedy = "More views, or views from nearer, would allow it."
         return LightCheck(point_count=count, findings=(Finding("note", "light-unchecked", what, remedy=remedy),))
-    weights, total, observed, luminance = weights[:, asked], total[asked], observed[asked], luminance[:, asked]
-    normals, openness = evidence.normals[asked], evidence.openness[asked]
-    lights = _turns(environment)
-    # what each cell's radiance adds to the irradiance of each point
-    diffuse = np.maximum(normals @ _cell_directions().T, 0.0) * openness * _cell_angles()
-    irradiance = diffuse @ (lights @ LUMINANCE).T.astype(np.float32) / np.float32(np.pi)
-    spreads = _spreads(observed, irradiance)
-    # Relative to what a point shows on the whole: bright points must not decide alone.
-    relative = 1.0 / np.maximum(observed, 0.02 * np.median(observed))
-    changes = _cut(_centered(luminance, weights, total) * relative)
-    power = float((weights * changes**2).sum())
-    gloss = np.zeros(len(lights))
-    if power > GLOSSY_PART**2 * float(weights.sum()):
-        mirrored = _mirrored(normals, openness, evidence.directions[:, asked], lights)
-        for index in range(len(lights)):
-            expected = _cut(_centered(mirrored[..., index], weights, total) * relative)
-            norm = float((weights * expected**2).sum())
-            gloss[index] = float((weights * expected * changes).sum()) / np.sqrt(max(norm * power, 1e-30))
-    misfits = np.log(np.maximum(spreads, 1e-6)) + 0.5 * np.log1p(-(np.clip(gloss, 0.0, 0.999) ** 2))
-
-    unmirrored, mirror = misfits[:LIGHT_COLUMNS], misfits[LIGHT_COLUMNS:]
-    best = int(np.argmin(unmirrored))
-    if mirror.min() < unmirrored[best] - HANDEDNESS:
-        best = LIGHT_COLUMNS + int(np.argmin(mirror))
-    is_mirrored = best >= LIGHT_COLUMNS
-    stops = _exposure_stops(
-        (weights[..., None] * evidence.colors[:, asked]).sum(axis=0) / total[:, None],
-        diffuse @ lights[best].astype(np.float32) / np.float32(np.pi),
-    )
+    lights = turned_lights(environment)
+    fits = LightFits.of(shown, lights)
+    here, there = _best(fits, np.arange(LIGHT_COLUMNS)), _best(fits, np.arange(LIGHT_COLUMNS, EVEN))
+    best, other = (there, here) if fits.clearly(there, here) > 1.0 else (here, there)
+    near = np.arange(-NEAR, NEAR + 1) % LIGHT_COLUMNS
+    rival = _best(fits, np.setdiff1d(np.arange(EVEN), near))
     check = LightCheck(
-        best_rotation_degrees=_refined(misfits.reshape(2, -1)[int(is_mirrored)], best % LIGHT_COLUMNS),
-        is_mirrored=is_mirrored,
-        spread_as_given=float(spreads[0]),
-        spread_best=float(spreads[best]),
-        spread_undivided=float(_spreads(observed, np.ones((len(observed), 1), np.float32))[0]),
-        gloss_as_given=float(gloss[0]),
-        gloss_best=float(gloss[best]),
-        misfit_as_given=float(misfits[0] - misfits[best]),
-        exposure_stops=stops,
+        best_rotation_degrees=_refined(fits, best),
+        is_mirrored=best >= LIGHT_COLUMNS,
+        spread_as_given=float(fits.spreads[0]),
+        spread_best=float(fits.spreads[best]),
+        spread_even=float(fits.spreads[EVEN]),
+        gloss_as_given=float(fits.gloss[0]),
+        gloss_best=float(fits.gloss[best]),
+        misfit_as_given=float(fits.misfits[0] - fits.misfits[best]),
+        certainty=fits.clearly(rival, _best(fits, near)),
+        exposure_stops=_exposure_stops(mean_colors(shown), irradiance_over_pi(shown, lights[best])),
         point_count=count,
     )
-    return replace(check, findings=tuple(_findings(check, has_gloss=bool(gloss.any()))))
+    is_unlike = min(fits.clearly(EVEN, here), fits.clearly(EVEN, there)) > 1.0
+    ways = [best] if fits.clearly(best, other) > 1.0 else [best, other]
+    told = [f"{'mirrored and ' if way >= LIGHT_COLUMNS else ''}turned by {_refined(fits, way):+.0f}" for way in ways]
+    return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
 
 
 def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
@@ -295,83 +224,23 @@ def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
     )
 
 
-def _cell_directions() -> NDArray[np.float32]:
-    return texel_directions(LIGHT_ROWS, LIGHT_COLUMNS).reshape(-1, 3).astype(np.float32)
+def _best(fits: LightFits, turns: NDArray[np.integer]) -> int:
+    """Return which of some turns fits best."""
+    return int(turns[np.argmin(fits.misfits[turns])])
 
 
-def _cell_angles() -> NDArray[np.float32]:
-    """Return solid angles of the cells [sr]."""
-    rows = (2.0 * np.pi / LIGHT_COLUMNS) * -np.diff(np.cos(np.linspace(0.0, np.pi, LIGHT_ROWS + 1)))
-    return np.repeat(rows, LIGHT_COLUMNS).astype(np.float32)
-
-
-def _turns(environment: EnvironmentMap) -> NDArray[np.float64]:
-    """Return an environment under every turn by whole cells, then its mirror image, ``(2 LIGHT_COLUMNS, L, 3)``."""
-    cells = environment.resized(LIGHT_ROWS, LIGHT_COLUMNS).radiance.astype(np.float64)
-    return np.stack(
-        [
-            np.roll(hand, -turn, axis=1).reshape(-1, 3)
-            for hand in (cells, cells[:, ::-1])
-            for turn in range(LIGHT_COLUMNS)
-        ]
-    )
-
-
-def _mirrored(
-    normals: NDArray[np.float32],
-    openness: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    lights: NDArray[np.float64],
-) -> NDArray[np.float32]:
-    """Return the luminance that points mirror towards views, under each light, ``(V, M, lights)``; GGX, F0 = 0.04."""
-    cells = _cell_directions()
-    by_light = (lights @ LUMINANCE).T.astype(np.float32)
-    reach = np.maximum(normals @ cells.T, 0.0)
-    power = np.float32(GLOSS_ROUGHNESS**4)
-    result = np.empty((len(directions), len(normals), len(lights)), np.float32)
-    for view, toward in enumerate(directions):
-        # |v + l|² = 2 + 2 v.l, so that no half vector is formed
-        double = np.sqrt(np.maximum(2.0 + 2.0 * (toward @ cells.T), 1e-6))
-        cosine = np.maximum(np.einsum("mk,mk->m", normals, toward), 0.05)[:, None]
-        n_h = (cosine + reach) / double
-        fresnel = 0.04 + 0.96 * (1.0 - np.clip(0.5 * double, 0.0, 1.0)) ** 5
-        lobe = power / (np.pi * (n_h * n_h * (power - 1.0) + 1.0) ** 2)
-        masking = 0.5 / (
-            reach * np.sqrt(cosine**2 * (1.0 - power) + power) + cosine * np.sqrt(reach**2 * (1.0 - power) + power)
-        )
-        transfer = lobe * masking * fresnel * reach * openness * _cell_angles()
-        result[view] = transfer.astype(np.float32) @ by_light
-    return result
-
-
-def _centered(
-    values: NDArray[np.float32], weights: NDArray[np.float32], total: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return what changes of ``(V, M)`` values from view to view."""
-    return values - (weights * values).sum(axis=0) / total
-
-
-def _cut(changes: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.clip(changes, -LARGEST_CHANGE, LARGEST_CHANGE)
-
-
-def _spreads(observed: NDArray[np.float32], irradiance: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the spread of the logarithm of base colour under each light, ``(lights,)``."""
-    least = np.maximum(LEAST_LIGHT * np.median(irradiance, axis=0), 1e-12)
-    base = np.log(observed.astype(np.float64))[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
-    return np.abs(base - np.median(base, axis=0)).mean(axis=0)
-
-
-def _refined(misfits: NDArray[np.float64], best: int) -> float:
+def _refined(fits: LightFits, best: int) -> float:
     """Return the turn of the least misfit [degree], by a parabola through the best and its neighbours."""
-    before, here, after = (misfits[(best + step) % len(misfits)] for step in (-1, 0, 1))
+    hand, turn = divmod(best, LIGHT_COLUMNS)
+    misfits = fits.misfits[hand * LIGHT_COLUMNS :][:LIGHT_COLUMNS]
+    before, here, after = (misfits[(turn + step) % LIGHT_COLUMNS] for step in (-1, 0, 1))
     bend = before - 2.0 * here + after
-    turn = best + (0.5 * (before - after) / bend if bend > 0.0 else 0.0)
-    degrees = float(turn * 360.0 / LIGHT_COLUMNS)
+    finer = turn + (0.5 * (before - after) / bend if bend > 0.0 else 0.0)
+    degrees = float(finer * 360.0 / LIGHT_COLUMNS)
     return degrees - 360.0 if degrees > 180.0 else degrees
 
 
-def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]) -> float:
+def _exposure_stops(colors: NDArray[np.float64], irradiance: NDArray[np.float32]) -> float:
     """Return the exposure of the light that makes base colours plausible [stops]."""
     mean = irradiance.mean(axis=1)
     lit = mean > WELL_LIT * mean.mean()
@@ -384,33 +253,35 @@ def _exposure_stops(colors: NDArray[np.float32], irradiance: NDArray[np.float32]
     return float(np.log2(brightest / PLAUSIBLE)) if brightest < TOO_DARK else 0.0
 
 
-def _findings(check: LightCheck, has_gloss: bool) -> list[Finding]:
-    """Return findings about a light; if it does not fit at all, neither its turn nor its exposure mean anything."""
-    put_in = check.spread_best > UNREMOVED * check.spread_undivided
-    if (has_gloss and check.gloss_best < LEAST_GLOSS) or put_in:
+def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
+    """Return findings about a light; if it does not fit at all, neither its turn nor its exposure mean anything.
+
+    Args:
+        check: What was found.
+        is_unlike: Whether an even light explains the capture better than any turn.
+        told: The turns that explain it best, in words, without the unit of the last.
+    """
+    if is_unlike:
         return [
             Finding(
-                # Small images blur gloss away under the right light too: then it is worth knowing, no more.
-                "warning" if put_in else "note",
+                "warning",
                 "environment-unexplained",
-                "environment does not explain the capture under any turn: correlation of gloss "
-                f"{check.gloss_best:.2f}, {LEAST_GLOSS:g} or more with the right one; spread of base colours "
-                f"{check.spread_best:.2f}, of what was seen {check.spread_undivided:.2f}",
-                remedy="Check that it is the light of this capture. Surfaces without any gloss, and blurred images, "
-                "can look so too.",
+                "environment does not explain the capture under any turn: a light that is the same from all sides "
+                f"explains it better, with a spread of base colours of {check.spread_even:.2f}, not "
+                f"{check.spread_best:.2f}",
+                remedy="Check that it is the light of this capture.",
             )
         ]
     findings = []
-    if check.misfit_as_given > CLEARLY_BETTER and check.gloss_best > check.gloss_as_given - CONTRADICTED:
+    if check.certainty > 1.0:
         findings.append(
             Finding(
                 "warning",
                 "environment-turned",
                 f"environment explains the capture {np.exp(check.misfit_as_given):.2f} times better "
-                f"{'mirrored and ' if check.is_mirrored else ''}turned by {check.best_rotation_degrees:+.0f} degrees "
-                "about the up axis",
-                remedy="Check its convention: the centre of the image is +x, its left quarter +y. "
-                + ("Reverse its columns, then turn it." if check.is_mirrored else "Turn it by that."),
+                f"{told} degrees about the up axis",
+                remedy="Check its convention: the centre of the image is +x, its left quarter +y. Turn it by that; to "
+                "mirror it, reverse its columns first.",
             )
         )
     if check.exposure_stops:

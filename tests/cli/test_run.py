@@ -45,6 +45,7 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
     assert beam(*words) == 0  # what is there is kept; the words are the same
     said = capsys.readouterr()
     assert "asset.usda: 1 frame, 300 Gaussians" in said.out
+    assert f"fitted by {report['exposure_stops']:+.2f} stops, as captured colour has no scale of its own" in said.out
     assert "overview.png" in said.out
     assert "note: axes" in said.err or "note" not in said.err
     shown = tmp_path / "shown.png"

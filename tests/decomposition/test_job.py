@@ -18,7 +18,7 @@ from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
 from beam_warp.materials.direct import MaterialOptions
-from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
@@ -79,8 +79,29 @@ def test_everything_is_written_valid_and_readable(whole):
     assert np.allclose(cloud.roughness, 0.5)
     report = json.loads((whole.asset.parent / "report.json").read_text())
     assert report["materials"]["gaussians"] == 200
+    # Every point of a convex body is open: 8 rays each for occlusion and light, in three frames
+    rays = report["light_and_occlusion_rays_per_second"] * report["seconds"]["materials"]
+    assert rays == pytest.approx(3 * 200 * 8 * 2)
     assert report["device"]["kind"] == "cpu"
     assert read_image(whole.overview).width > 48
+    assert report["exposure_is_fitted"]
+    assert report["light"] == f"the given light, exposure fitted by {report['exposure_stops']:+.1f} stops"
+
+
+@pytest.mark.parametrize(
+    ("stops", "title"), [(0.0, "relit by the given light"), (1.5, "relit by the given light, exposed by +1.5 stops")]
+)
+def test_a_relighting_says_which_light_it_shows(tmp_path, light, monkeypatch, stops, title):
+    """Nobody knows the light of Gaussians without images: the overview does not claim it."""
+    titles = []
+
+    def sheet(cloud, camera, lights, **options):
+        titles.extend(shown.title for shown in lights)
+        return np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr("beam_warp.decomposition.result.contact_sheet", sheet)
+    job(frames(0.0), light, tmp_path / "out", replace(FAST, exposure=stops))
+    assert titles == [title, "relit by that light turned by 180°"]
 
 
 def test_it_is_drawn_as_its_metadata_say(tmp_path, light, whole):
@@ -167,6 +188,28 @@ def test_the_image_path_needs_images(tmp_path, light):
     with pytest.raises(InvalidOptionError, match="capture must be given for the image path, got none"):
         job(frames(0.0), light, tmp_path / "out", RunOptions(images=ImagePathOptions()))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("materials", "says"),
+    [
+        (MaterialOptions(sample_count=8, bounce=False), "got sample_count 8, bounce False. Drop them"),
+        (MaterialOptions(), "got defaults"),
+    ],
+)
+def test_one_path_alone_has_options(materials, says):
+    with pytest.raises(InvalidOptionError, match=f"materials .* must be left out on the image path.*{says}"):
+        RunOptions(materials=materials, images=ImagePathOptions())
+
+
+def test_only_options_of_the_path_are_stated():
+    direct = RunOptions().as_dict()
+    assert direct["materials"] == vars(MaterialOptions())
+    assert "images" not in direct
+    paper = RunOptions(images=ImagePathOptions(seed=3)).as_dict()
+    assert paper["images"] == vars(ImagePathOptions(seed=3))
+    assert "materials" not in paper
+    assert RunOptions(images=ImagePathOptions(seed=3)).gathering == MaterialOptions(seed=3)
 
 
 @pytest.mark.parametrize("stops", [np.nan, 100.0])
@@ -265,6 +308,8 @@ class TestWithACapture:
         assert back.metadata["roughness_source"] == "constant"
         assert back.metadata["radiance_meaning"] == "captured"
         assert result.report["exposure_stops"] == 0.0
+        assert not result.report["exposure_is_fitted"]
+        assert result.report["light"] == "the light of the capture"
         # discs of the true surface, some left out, cover less than the figure does
         assert all("silhouettes" in warning for warning in result.report["warnings"])
         cloud = result.sequence[0]
@@ -359,11 +404,26 @@ class TestWithACapture:
             job(sequence, light, tmp_path / "out", AUTO, capture=capture)
         assert not (tmp_path / "out" / "asset.usda").exists()
 
-    def test_the_image_path_follows_its_first_frame(self, discs, studio, capture, tmp_path):
+    def test_the_image_path_follows_its_first_frame(self, discs, studio, capture, tmp_path, monkeypatch):
         """Colours are drawn towards those of the frame before: when that frame changes, the next is done again."""
-        options = replace(FAST, images=ImagePathOptions(occlusion_samples=4, light_samples=4))
+        images = ImagePathOptions(occlusion_samples=4, light_samples=8)
+        options = replace(FAST, materials=None, images=images)
+        traced = []
+
+        def counted(*arguments, **more):
+            found = decompose_by_images(*arguments, **more)
+            traced.append(found.ray_count)
+            return found
+
+        monkeypatch.setattr("beam_warp.decomposition.measure.decompose_by_images", counted)
         darker = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
         changed = GaussianSequence.from_clouds([darker, discs[1]], metadata=discs.metadata)
         for sequence, resumed in ((discs, 0), (discs, 2), (changed, 0)):
             report = job(sequence, studio, tmp_path / "out", options, capture=capture).report
             assert report["resumed_frames"] == resumed
+            rate, seconds = report["light_and_occlusion_rays_per_second"], report["seconds"].get("materials")
+            assert rate == (None if resumed == 2 else pytest.approx(sum(traced[-2:]) / seconds))
+        # both frames show the subject to two cameras, and each of its pixels sends 4 + 8 rays
+        assert all(count > 0 and count % 12 == 0 for count in traced)
+        assert report["options"]["images"]["light_samples"] == 8
+        assert "materials" not in report["options"]
