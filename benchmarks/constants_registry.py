@@ -400,6 +400,7 @@ UNTUNED = {
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
+        ImagePathOptions: occlusion_samples light_samples offset steps
         beam_warp.kernels.render.cluster_bounces: MEAN_COSINE
         beam_warp.kernels.render.gaussian_light: TAU
         beam_warp.kernels.render.shadow_maps: ROUNDING
@@ -409,7 +410,7 @@ UNTUNED = {
         FitOptions: gaussian_count seed
         ReconstructOptions: segment_length
         MaterialOptions: seed
-        ImagePathOptions: occlusion_samples light_samples offset steps seed
+        ImagePathOptions: seed
         BakeOptions: seed steps
         DeferredOptions: samples
         PathOptions: samples seed""",
