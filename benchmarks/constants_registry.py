@@ -220,7 +220,7 @@ MESHING = (
 )
 
 MATERIALS = (
-    Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian."),
+    Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian.", more=2.0),
     Constant("beam_warp.materials.direct:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LIFT_IN_REACHES", BOTH, "Lift of rays, in reaches of the Gaussians above."),
