@@ -300,7 +300,7 @@ def run_tracking(subject: Subject, setup: Setup) -> Row:
         cameras=subject.cameras,
         device=subject.device,
     )
-    return {"psnr": report["psnr"], "drift": drift[1].vertices.mean_mm}
+    return {"photographs": report["psnr"], "drift": drift[1].vertices.mean_mm}
 
 
 def run_meshing(subject: Subject, setup: Setup) -> Row:

@@ -220,7 +220,7 @@ MESHING = (
 )
 
 MATERIALS = (
-    Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian."),
+    Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian.", more=2.0),
     Constant("beam_warp.materials.direct:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LIFT_IN_REACHES", BOTH, "Lift of rays, in reaches of the Gaussians above."),
@@ -400,6 +400,7 @@ UNTUNED = {
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
+        ImagePathOptions: occlusion_samples light_samples offset steps
         beam_warp.kernels.render.cluster_bounces: MEAN_COSINE
         beam_warp.kernels.render.gaussian_light: TAU
         beam_warp.kernels.render.shadow_maps: ROUNDING
@@ -409,7 +410,7 @@ UNTUNED = {
         FitOptions: gaussian_count seed
         ReconstructOptions: segment_length
         MaterialOptions: seed
-        ImagePathOptions: occlusion_samples light_samples offset steps seed
+        ImagePathOptions: seed
         BakeOptions: seed steps
         DeferredOptions: samples
         PathOptions: samples seed""",

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import statistics
 from functools import partial
 from typing import Any
 
+import numpy as np
 from constants_places import numbers_of, value_of
 from constants_registry import GROUPS, SIDES, UNTUNED, Constant
 from tables import Row, Rows, table
@@ -15,6 +15,7 @@ FILE = "constants_h200.json"
 
 SCORES = {
     "psnr": ("new views [dB]", ".2f"),
+    "photographs": ("photographs [dB]", ".2f"),
     "normals": ("normals [°]", ".2f"),
     "chamfer": ("surface [mm]", ".2f"),
     "drift": ("drift [mm]", ".2f"),
@@ -36,7 +37,7 @@ def noise(result: Row, group: str, capture: int, score: str) -> float:
     """Return the standard deviation of the difference of two runs that differ by seeds alone; NaN if unknown."""
     seeds = result["seeds"].get(FLOORS.get(group, group), {}).values()
     values = [row[score][capture] for row in seeds if score in row]
-    return math.sqrt(2.0) * statistics.stdev(values) if len(values) > 1 else math.nan
+    return math.sqrt(2.0) * float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
 
 def change(result: Row, group: str, capture: int, row: Row | None) -> str:

@@ -82,7 +82,7 @@ def test_every_number_of_the_options_is_known():
 
 @pytest.mark.parametrize("constant", CONSTANTS, ids=lambda constant: constant.name)
 def test_a_constant_is_there_and_can_be_varied(constant):
-    """Its value is a number of the code; what is tried differs from it, and options that cannot be do not exist."""
+    """The value of every constant is a number of the code, and what is tried instead differs from it."""
     for place in constant.places:
         value = value_of(place)
         assert numbers_of(value)
