@@ -328,7 +328,7 @@ def test_the_reference_is_that_of_commands_and_public_names(reference):
 
 
 @pytest.mark.slow
-def test_the_site_is_built_and_loads_nothing_from_elsewhere():
+def test_the_site_is_built_and_loads_nothing_from_elsewhere(reference):
     """What `make docs` does; strict: a link or anchor that leads nowhere fails."""
     pytest.importorskip("zensical")
     for command in (["docs/gather_pages.py"], ["-m", "zensical", "build", "--clean", "--strict"]):
@@ -336,6 +336,9 @@ def test_the_site_is_built_and_loads_nothing_from_elsewhere():
         assert done.returncode == 0, done.stdout + done.stderr
     pages = list((ROOT / "site").rglob("*.html"))
     assert len(pages) > len(PAGES)
+    for path, text in reference.items():
+        page = (ROOT / "site" / path).with_suffix(".html").read_text(encoding="utf-8")
+        assert [name for name in re.findall(r"^::: (\S+)", text, re.MULTILINE) if f'id="{name}"' not in page] == []
     loaded = r"<(?:script|img|iframe|source)[^>]+src=\"?(?:https?:)?//|<link[^>]+stylesheet[^>]+href=\"?(?:https?:)?//"
     assert [page.name for page in pages if re.search(loaded, page.read_text(encoding="utf-8"))] == []
 
