@@ -1,6 +1,6 @@
 """Is the check of the light right? Five subjects under their own light, turned, mirrored, too dim and too bright ones.
 
-    python benchmarks/light_check.py [--device cpu] [--out result.json]
+    python benchmarks/light_check.py [--device cpu] --out JSON
 
 Subjects: the captures walker, runner and robot of the data folder (`$BEAM_DATA`, or `--data`) at half their size, the
 demo's capture, and its figure again with roughness 1 everywhere. Of each, the Gaussians of one frame are reconstructed
@@ -15,17 +15,15 @@ about a light that is right is always wrong. Silence is no verdict; it is counte
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from timing import commit, machine
+import record
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
@@ -169,17 +167,15 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the sweep and print or write what came out."""
+    """Run the sweep and write what came out."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=SUBJECTS)
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    parser.add_argument("--out", type=Path, help="JSON file")
+    record.add_arguments(parser)
     given = parser.parse_args()
     device = str(resolve_device(given.device))
     cases = []
-    started = time.perf_counter()
     for subject in given.subjects:
         with tempfile.TemporaryDirectory() as folder:
             views, light = photographed(subject, Path(given.data), Path(folder), device)
@@ -192,19 +188,7 @@ def main() -> None:
                 f"certainty {case['certainty']:+.2f}  error left {case['error_left']:.2f}  {', '.join(case['said'])}",
                 flush=True,
             )
-    result = {
-        "benchmark": "light_check",
-        "commit": given.commit,
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "machine": machine(resolve_device(device)),
-        "options": {"subjects": list(given.subjects), "reduction": REDUCTION, "asked": ASKED},
-        "seconds": time.perf_counter() - started,
-        "summary": summary(cases),
-        "cases": cases,
-    }
-    print(json.dumps(result["summary"], indent=1))
-    if given.out is not None:
-        given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    record.write_result(given, resolve_device(device), {"summary": summary(cases), "cases": cases})
 
 
 if __name__ == "__main__":

@@ -109,18 +109,17 @@ def loaded_code() -> dict[str, str]:
         else:
             continue
         if not place.startswith(CANNOT_CHANGE_A_NUMBER):
-            found[place] = code_digest(path.read_text(encoding="utf-8"))
+            found[place] = _digest_of_file(path)
     return dict(sorted(found.items()))
 
 
 def changed_since(measured: Mapping[str, Any]) -> list[str]:
     """Return the files whose code is no longer what was measured; files that are gone are among them."""
-    return [place for place, digest in measured["code"].items() if _digest_now(place) != digest]
+    return [place for place, digest in measured["code"].items() if _digest_of_file(ROOT / place) != digest]
 
 
 @functools.cache
-def _digest_now(place: str) -> str | None:
-    path = ROOT / place
+def _digest_of_file(path: Path) -> str | None:
     return code_digest(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 

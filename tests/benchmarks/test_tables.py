@@ -89,10 +89,10 @@ class TestStaleness:
         path = record.ROOT / "kept.py"
         path.write_text("x = 1\n")
         code = {"kept.py": record.code_digest("x = 1\n"), "gone.py": "0" * 12}
-        record._digest_now.cache_clear()
+        record._digest_of_file.cache_clear()
         assert record.changed_since({"code": code}) == ["gone.py"]
         path.write_text("x = 2\n")
-        record._digest_now.cache_clear()
+        record._digest_of_file.cache_clear()
         assert record.changed_since({"code": code}) == ["kept.py", "gone.py"]
         assert record.changed_since({"code": {}}) == []
 
