@@ -139,7 +139,7 @@ class TestDiscs:
         direction, radiance, reach, pdf = self.draw(light, point, device)
         distance = np.linalg.norm(position - point)
         assert (reach < distance).all()  # on the side that faces the point
-        # a root of the distance from the sphere's edge: 1e-7 becomes its root there
+        # at the edge of the sphere the reach holds the root of a difference that float32 rounds to 1e-7
         ends = np.linalg.norm(point + reach[:, None] * direction - position, axis=1)
         np.testing.assert_allclose(ends, radius, atol=3e-4)
         middle = np.sqrt(1.0 - (radius / distance) ** 2)
