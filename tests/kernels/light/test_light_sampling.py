@@ -149,7 +149,7 @@ class TestDiscs:
 
     @pytest.mark.parametrize("diameter", [0.53, 40.0])
     def test_a_disc_in_the_sky(self, device, diameter):
-        """Its angle is that across all of it; together its directions shed its irradiance."""
+        """The stated angle is that across the whole disc; together its directions shed its irradiance."""
         light = DirectionalLight(direction=(0.6, 0.0, -0.8), irradiance=(3.0, 2.0, 1.0), angular_diameter=diameter)
         direction, radiance, _, pdf = self.draw(light, (1.0, 2.0, 3.0), device)
         np.testing.assert_allclose(pdf, 1.0 / (4.0 * np.pi * np.sin(np.radians(diameter) / 4.0) ** 2), rtol=1e-5)
