@@ -115,7 +115,7 @@ def test_a_point_light_falls_with_the_square(device):
 
 
 def test_a_spot_fades_from_its_inner_to_its_outer_angle(device):
-    """Light fades by 3 x^2 - 2 x^3, x the place of the cosine between those of both angles; the floor is white and rough."""
+    """Light fades by 3 x^2 - 2 x^3, x the place of the cosine between those of both angles, on a white, rough floor."""
     light = SpotLight(position=(0, 0, 2), direction=(0, 0, -1), intensity=(2, 2, 2), inner_angle=10.0, outer_angle=20.0)
     outer, inner = np.cos(np.radians([20.0, 10.0]))
     scattered = (1.0 - specular_albedo(1.0, 1.0)) / np.pi
