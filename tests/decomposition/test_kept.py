@@ -65,7 +65,7 @@ def test_exposure(tmp_path, monkeypatch, change):
     ids=["light", "first frame", "second frame", "images"],
 )
 def test_roughness(tmp_path, monkeypatch, persistent, change):
-    """Of persistent Gaussians every frame decides it, else the one that is asked for."""
+    """Every frame of persistent Gaussians decides it; of others, the frame that is asked for."""
     searches = count()
     monkeypatch.setattr(RoughnessFinder, "_profile", lambda *_: next(searches))
     monkeypatch.setattr(

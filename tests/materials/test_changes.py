@@ -58,7 +58,7 @@ def test_changes_are_found_and_followed(rng):
 
 @pytest.mark.parametrize(("chance", "found"), [(0.8, 200), (1.2, 0)])
 def test_chances_are_judged_by_their_rank(chance, found):
-    """Of 4,000 Gaussians 200 differ from frame to frame, all by as much, and the others not at all.
+    """200 Gaussians of 4,000 differ from frame to frame, all by as much, and the others not at all.
 
     Benjamini and Hochberg's limit of the 200th smallest chance is the level times 200 / 4,000. A single chance would
     pass below the level, and by Bonferroni's limit none would.

@@ -117,7 +117,7 @@ class TestOccluded:
     def test_one_bounce_takes_light_off_the_corner(self, device):
         """Radiosity of the corner, solved on the Gaussians themselves, is what a camera would have captured.
 
-        By channel: what bounces is red here, so that light is taken off by as much as each has of it.
+        Channel by channel, because what bounces is red here.
         """
         cloud, normals = self.corner()
         count = len(cloud)

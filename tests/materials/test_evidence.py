@@ -10,7 +10,7 @@ from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles,
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.evidence import RADII, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
@@ -60,6 +60,7 @@ class TestSurface:
         deviation = float(ball.scales.max())
         assert np.abs(np.median(radius) - 1.0) < 0.5 * deviation
         assert radius.min() > 1.0 - 1.5 * deviation
+        assert radius.max() < np.hypot(1.0, RADII * deviation)  # the rim of a tile that is drawn
         cosine = (found.normals.numpy()[seen] * ball.positions[seen]).sum(axis=1)
         assert np.degrees(np.arccos(np.median(cosine))) < 2.0
         assert found.agreement.numpy()[seen].min() > 0.8
@@ -107,7 +108,7 @@ class TestColors:
         np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=tolerance)
 
     def test_colours_are_those_that_each_camera_sees(self, ball, device, rng):
-        """Of harmonics of degree 3 along the way from the camera, which the other side does not show."""
+        """Harmonics of degree 3 are evaluated along the way from the camera: the other side shows other colours."""
         cameras = around(4)
         glossy = ball.with_arrays(radiance=rng.normal(0.0, 0.1, (3000, 16, 3)))
         colors, shown = shown_colors(glossy, cameras, captured(glossy, cameras, device=device), device=device)

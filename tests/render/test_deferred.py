@@ -115,7 +115,7 @@ def test_a_point_light_falls_with_the_square(device):
 
 
 def test_a_spot_fades_from_its_inner_to_its_outer_angle(device):
-    """By 3 x^2 - 2 x^3, x the place of the cosine between those of both angles; white and rough, seen from above."""
+    """Light fades by 3 x^2 - 2 x^3, x the place of the cosine between those of both angles, on a white, rough floor."""
     light = SpotLight(position=(0, 0, 2), direction=(0, 0, -1), intensity=(2, 2, 2), inner_angle=10.0, outer_angle=20.0)
     outer, inner = np.cos(np.radians([20.0, 10.0]))
     scattered = (1.0 - specular_albedo(1.0, 1.0)) / np.pi
@@ -127,7 +127,7 @@ def test_a_spot_fades_from_its_inner_to_its_outer_angle(device):
         x = np.clip((cosine - outer) / (inner - outer), 0.0, 1.0)
         shed = 2.0 * cosine / (away @ away) * (3.0 * x**2 - 2.0 * x**3)
         found = middle(render(shot, device))[1]
-        # a float32 cosine over the cone's width of cosines, 0.045
+        # E_spec from its table, as in the sun
         assert found == pytest.approx(shed * (scattered + brdf_twin(UP, UP, away, 1.0)), rel=1e-3, abs=1e-7)
 
 
@@ -281,7 +281,7 @@ def test_bounces_are_those_of_form_factors(device, rng):
     reflects = color * (1.0 - share) + share
     area = 2.0 * np.pi * cloud.opacities * sides.prod(axis=1)
     away = places[None] - places[:, None]
-    squared = (away**2).sum(axis=-1) + np.eye(count)  # none of which sees itself
+    squared = (away**2).sum(axis=-1) + np.eye(count)  # none sees itself
     here = np.maximum(np.einsum("ijk,ik->ij", away, normals), 0.0)
     there = np.maximum(-np.einsum("ijk,jk->ij", away, normals), 0.0)
     form = area * here * there / squared / (squared + area / np.pi)

@@ -136,7 +136,7 @@ def test_a_half_opaque_disc_takes_half_of_the_light(device):
 
 @pytest.mark.parametrize("diameter", [0.0, 60.0])
 def test_a_light_that_casts_no_shadows_passes_what_is_in_its_way(device, diameter):
-    """Found by chance too, which half of the samples of a smooth plane do."""
+    """Whether the light is drawn, or met by a ray that the surface scatters: only one of a size is."""
     sun = replace(SUN, angular_diameter=diameter, casts_shadows=False)
     ground = Shot(cloud=disc(roughness=0.3), camera=look((0.0, -1.0, 0.4)), lights=(sun,))
     roof = disc(height=0.8, size=0.5)

@@ -139,7 +139,7 @@ class TestDiscs:
         direction, radiance, reach, pdf = self.draw(light, point, device)
         distance = np.linalg.norm(position - point)
         assert (reach < distance).all()  # on the side that faces the point
-        # a root of the distance from the sphere's edge: 1e-7 becomes its root there
+        # at the edge of the sphere the reach holds the root of a difference that float32 rounds to 1e-7
         ends = np.linalg.norm(point + reach[:, None] * direction - position, axis=1)
         np.testing.assert_allclose(ends, radius, atol=3e-4)
         middle = np.sqrt(1.0 - (radius / distance) ** 2)
@@ -149,7 +149,7 @@ class TestDiscs:
 
     @pytest.mark.parametrize("diameter", [0.53, 40.0])
     def test_a_disc_in_the_sky(self, device, diameter):
-        """Its angle is that across all of it; together its directions shed its irradiance."""
+        """The stated angle is that across the whole disc; together its directions shed its irradiance."""
         light = DirectionalLight(direction=(0.6, 0.0, -0.8), irradiance=(3.0, 2.0, 1.0), angular_diameter=diameter)
         direction, radiance, _, pdf = self.draw(light, (1.0, 2.0, 3.0), device)
         np.testing.assert_allclose(pdf, 1.0 / (4.0 * np.pi * np.sin(np.radians(diameter) / 4.0) ** 2), rtol=1e-5)
