@@ -87,6 +87,7 @@ def help_page() -> str:
         ("beam-convert", convert.main, ["--help"]),
         ("beam-convert inspect", convert.main, ["inspect", "--help"]),
         ("beam-validate", validate.main, ["--help"]),
+        ("beam-validate --rules", validate.main, ["--rules"]),
     ]
     sections = []
     for name, command, arguments in calls:

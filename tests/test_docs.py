@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from beam_warp.cli.main import COMMANDS, main
 from beam_warp.demo import job
 from beam_warp.demo.from_images import FromImagesOptions
 from beam_warp.image.files import write_exr
+from beam_warp.mesh import extract
 from beam_warp.raster.records import RasterOptions
 from beam_warp.stage import files
 from beam_warp.stage.meshes import Ground
@@ -166,6 +168,7 @@ def of_interop(folder, monkeypatch):
 
 
 def of_meshing(folder, monkeypatch):
+    monkeypatch.setattr(extract, "surrounding_cameras", partial(extract.surrounding_cameras, side=32))
     ball = a_world()["cloud"]
     small = ball.with_arrays(positions=0.1 * ball.positions, scales=0.1 * ball.scales)
     views = [
@@ -183,7 +186,8 @@ def of_reconstruction(folder, monkeypatch):
 
 def of_rendering(folder, monkeypatch):
     world = a_world()
-    shot = Shot(cloud=world["cloud"], camera=world["camera"], environment=world["light"])
+    camera = Camera.orbit((0, 0, 0), 2.5, 0, 15, width=6, height=4, vertical_fov=40)
+    shot = Shot(cloud=world["cloud"], camera=camera, environment=world["light"])
     ground = Ground().mesh(world["cloud"].positions)
     names = {"raster": RasterOptions(), "ground": ground, "moved": world["cloud"].positions + 0.1, "shot": shot}
     return world | names | {"Path": Path}
@@ -231,7 +235,13 @@ PREPARED = {
 """What the examples of a page take for granted: a function of a folder for files, which gives names."""
 
 
-@pytest.mark.parametrize("page", PREPARED)
+LONG = ("README.md", "docs/charts.md", "docs/viewer.md")
+"""Pages whose examples take seconds."""
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=pytest.mark.slow if page in LONG else ()) for page in PREPARED]
+)
 def test_examples_run(page, tmp_path, monkeypatch, trusted_files):
     """Examples of a page run one after the other; that longer ones give what the page says is tested below."""
     monkeypatch.chdir(tmp_path)
