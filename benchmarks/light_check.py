@@ -31,6 +31,7 @@ from beam_warp.demo.capture import demo_figure_for, dome_cameras, write_capture
 from beam_warp.demo.from_images import FromImagesOptions, demo_steps
 from beam_warp.demo.lights import studio
 from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import LightCheck, judge_light, light_evidence
 from beam_warp.materials.light_fits import LightEvidence
@@ -137,7 +138,7 @@ def photographed(subject: str, data: Path, folder: Path, device: str) -> tuple[l
 def evidence_of(views: list[CapturedView], device: str) -> LightEvidence:
     """Reconstruct Gaussians from views, coarsely, and collect what they show."""
     steps = demo_steps(FromImagesOptions(), device=device, seed=0)
-    track, _ = steps.begin(views, lambda *_: None)
+    track, _ = steps.begin(views, no_progress)
     seen = view_evidence(track.cloud, [view.camera for view in views], views, options=steps.raster, device=device)
     scene = Scene.from_gaussians(track.cloud, device)
     return light_evidence(scene, SurfacePoints.seen_by(track.cloud, seen, scene), seen, ASKED)
@@ -147,14 +148,14 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
     """Return how many verdicts were given, how many are right, and which wrong lights were found."""
     given = [case for case in cases if case["verdict"] != "silent"]
     right_lights = [case for case in cases if case["light"] == "right"]
-    turned = [case for case in cases if case["light"] != "turned" and case["light"] != "mirrored"]
+    unturned = [case for case in cases if case["light"] in ("right", "exposed")]
     return {
         "cases": len(cases),
         "verdicts": len(given),
         "right_verdicts": sum(case["verdict"] == "right" for case in given),
         "right_lights": len(right_lights),
         "right_lights_accused": sum(case["verdict"] != "silent" for case in right_lights),
-        "largest_certainty_without_a_turn": max(case["certainty"] for case in turned),
+        "largest_certainty_without_a_turn": max(case["certainty"] for case in unturned),
         "found": {
             name: {"lights": len(some), "found": sum(case["verdict"] == "right" for case in some)}
             for name, some in (
