@@ -299,23 +299,25 @@ MATERIALS = (
     *(
         Constant(f"beam_warp.materials.light:{name}", BOTH, does, NO_SCORE)
         for name, does in (
-            ("CLEARLY_BETTER", "Misfit by which a turn explains the capture better."),
-            ("HANDEDNESS", "Misfit by which a mirror image does."),
-            ("CONTRADICTED", "Loss of gloss that contradicts a turn."),
-            ("LEAST_GLOSS", "Gloss below which no turn explains the capture."),
-            ("GLOSSY_PART", "Change that can be told from noise."),
-            ("UNREMOVED", "Spread that says that shading was put in."),
             ("TOO_BRIGHT", "Base colour that says that light is too dim."),
             ("TOO_DARK", "Base colour that says that light is too bright."),
             ("WELL_SEEN", "Pixels of Gaussians that are asked."),
             ("AGREEMENT", "Agreement of their normals."),
             ("UNCUT", "Largest part of them that was cut."),
-            ("GLOSS_ROUGHNESS", "Roughness that light is mirrored in."),
-            ("LARGEST_CHANGE", "Change of luminance that still counts."),
             ("WELL_LIT", "Light of those that are asked for exposure."),
             ("BRIGHT", "Quantile of the brighter base colours."),
             ("BRIGHTEST", "Quantile of the brightest."),
             ("PLAUSIBLE", "Base colour that a proposed exposure leads to."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.materials.light_fits:{name}", JUDGED, does, NO_SCORE)
+        for name, does in (
+            ("GLOSS_ROUGHNESS", "Roughness that light is mirrored in."),
+            ("LARGEST_CHANGE", "Change of luminance that still counts."),
+            ("NEIGHBORS", "Neighbours whose base colours are compared."),
+            ("LEAST_GAIN", "Difference of misfit that matters."),
+            ("GLOSSY_PART", "Change that can be told from noise."),
         )
     ),
     *(
@@ -398,6 +400,7 @@ UNTUNED = {
         beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK
+        beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
         ImagePathOptions: occlusion_samples light_samples offset steps
@@ -440,7 +443,8 @@ UNTUNED = {
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN
         beam_warp.materials.exposure: ASKED
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
-        beam_warp.materials.light: LIGHT_ROWS LIGHT_COLUMNS LEAST_POINTS LEAST_VIEWS MOST_VIEWS LEAST_LIGHT
+        beam_warp.materials.light: LEAST_POINTS LEAST_VIEWS MOST_VIEWS NEAR
+        beam_warp.materials.light_fits: LIGHT_ROWS LIGHT_COLUMNS EVEN LEAST_LIGHT BLOCKS LEAST_IN_BLOCK
         beam_warp.materials.residues: LEAST_ALPHA FEWEST_LIGHT_SAMPLES
         beam_warp.materials.roughness: MOST_ASKED TINY
         beam_warp.materials.roughness_source: MAX_TEXELS

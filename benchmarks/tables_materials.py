@@ -204,9 +204,3 @@ def draw_cost(result: Row, path: Path) -> None:
 def draw_runner(result: Row, path: Path) -> None:
     """Show the runner's materials beside the truth."""
     materials_plot.draw_sheet(PICTURES / "materials_runner.png", path)
-
-
-@figure("materials_robot.png", EVALUATION)
-def draw_robot(result: Row, path: Path) -> None:
-    """Show the robot's materials beside the truth."""
-    materials_plot.draw_sheet(PICTURES / "materials_robot.png", path)

@@ -13,7 +13,7 @@ SHADOWS = "environment with 16 shadow maps, 2 bounces"
     "tracing_h200.json",
     "raster_h200.json",
     "reconstruction_h200.json",
-    "materials_evaluation_h200.json",
+    "materials_ablation_h200.json",
     "relight_speed_h200.json",
 )
 def readme(tracing: Row, raster: Row, reconstruction: Row, materials: Row, relight: Row) -> Rows:
@@ -58,11 +58,11 @@ def _covered(case: Row) -> str:
 
 def _reconstructions(result: Row) -> Rows:
     rows = []
-    for name, part in result["captures"].items():
+    for part in result["captures"]["rows"]:
         first = part["frames"][0]
         rows.append(
             [
-                f"reconstruction of {name}, first frame",
+                f"reconstruction of {part['name']}, {first['gaussians']:,} Gaussians, first frame",
                 f"novel views {first['psnr']:.1f} dB, normals {first['normals_median_degrees']:.1f}°, "
                 f"mesh {first['surface']['chamfer_mm']:.1f} mm",
                 f"{cell(part['first_seconds'], '.1f')} s",
@@ -72,18 +72,15 @@ def _reconstructions(result: Row) -> Rows:
 
 
 def _materials(result: Row) -> Rows:
-    captures = {name: part["ways"] for name, part in result["evaluation"]["captures"].items()}
-    return [
-        [f"materials of {name}", _scores(ways["direct"]), f"the paper's recipe: {_scores(ways['paper'])}"]
-        for name, ways in captures.items()
-    ]
+    rows = []
+    for name, part in result["ablation"]["captures"].items():
+        ladder = [row for row in part["rows"] if row["group"] == "ladder"]
+        rows.append([f"materials of {name}", _scores(ladder[-1]), f"the paper's recipe: {_scores(ladder[0])}"])
+    return rows
 
 
-def _scores(way: Row) -> str:
-    if "mean" not in way:
-        return "not run"
-    mean = way["mean"]
-    return f"occlusion {mean['ambient_occlusion']['psnr']:.1f} dB, base colour {mean['base_color']['psnr']:.1f} dB"
+def _scores(row: Row) -> str:
+    return f"occlusion {row['ambient_occlusion']['psnr']:.1f} dB, base colour {row['base_color']['psnr']:.1f} dB"
 
 
 def _relighting(result: Row) -> list[str]:

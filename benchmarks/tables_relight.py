@@ -12,7 +12,6 @@ from tables import Row, Rows, cell, figure, table
 
 SPEED = "relight_speed_h200.json"
 ACCURACY = "relight_accuracy_h200.json"
-SHADOWS = "relight_shadows_h200.json"
 ENERGY = "relight_energy_h200.json"
 EVALUATION = "materials_evaluation_h200.json"
 
@@ -113,21 +112,6 @@ def samples(result: Row) -> Rows:
         for name, found in traced.items()
     ]
     return [["PSNR [dB]", *levels], *rows]
-
-
-@table("relight_shadows", SHADOWS)
-def shadows(result: Row) -> Rows:
-    """PSNR [dB] of decomposed reconstructions by shadow maps of the environment and bounces."""
-    columns = {
-        f"{name}, {light}": rows
-        for name, subject in result["shadows"]["subjects"].items()
-        for light, rows in subject["lights"].items()
-    }
-    rows: list[Sequence[Any]] = [("`environment_shadows`", "`bounces`", *columns)]
-    for place, setting in enumerate(next(iter(columns.values()))):
-        scores = [f"{found[place]['psnr']:.2f}" for found in columns.values()]
-        rows.append((str(setting["shadows"]), str(setting["bounces"]), *scores))
-    return rows
 
 
 @table("relight_furnace", ENERGY)
