@@ -125,6 +125,8 @@ DEFINED = (
     "3 to 5 dB below PSNR (10 log10 of two to three)",
     "doubling gains less than 0.15 dB",
     "tracked frames more than 3 dB below",
+    "if the last frame is more than 3 dB worse than the first",
+    "uncompressed, 64-byte aligned, below 4 GiB",
     "PSNR is more than 6 dB below that of the key frame, which counts as at most 44 dB",
 )
 """Thresholds and closed forms in such units: nothing was measured."""
