@@ -42,6 +42,9 @@ NUMBER = re.compile(
     r'\[[^\[\]]*\]\((?P<path>[^()\s]*benchmarks/results/(?P<file>[\w.-]+\.json))#(?P<key>[^\s"()]+)(?: "[^"]*")?\)'
 )
 
+PLACES = ("data", "assets", "keep", "pictures", "folder")
+"""Options that say where files are."""
+
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., Rows]]] = {}
 NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., Any]]] = {}
 FIGURES: dict[str, tuple[tuple[str, ...], Callable[..., None]]] = {}
@@ -99,6 +102,8 @@ def source(file: str) -> str:
     device = machine["device"] if machine["device"] != "cpu" else f"{machine['cores']} CPU cores"
     said = [device, f"commit {measured['commit']}", measured["date"]]
     for name, value in measured["options"].items():
+        if name in PLACES:
+            continue
         said.append(
             name if value is True else f"{name} {' '.join(map(str, value)) if isinstance(value, list) else value}"
         )

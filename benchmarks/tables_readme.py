@@ -89,8 +89,8 @@ def _relighting(result: Row) -> list[str]:
     return [
         f"relighting a ball of {part['gaussians']:,} Gaussians at {width} × {height}, one sample a pixel, "
         f"{_covered(case)}, default shadows",
-        f"{cell(case['whole']['fps'], '.0f')} frames/s with everything redrawn",
-        f"{cell(case['still_maps']['fps'], '.0f')} frames/s with the camera moved only",
+        f"{cell(case['whole']['fps'], ',.0f')} frames/s with everything redrawn",
+        f"{cell(case['still_maps']['fps'], ',.0f')} frames/s with the camera moved only",
     ]
 
 

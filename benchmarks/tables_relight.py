@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ USUAL = "N = 16"
 
 def rate(times: Row) -> str:
     """Return milliseconds and frames per second."""
-    return f"{cell(times['ms'], '.2f')} ms, {cell(times['fps']['median'], '.0f')} FPS"
+    return f"{cell(times['ms'], '.2f')} ms, {cell(times['fps']['median'], ',.0f')} FPS"
 
 
 def percent(share: float) -> str:
@@ -160,13 +160,15 @@ def results_accuracy(true: Row, evaluated: Row) -> Rows:
     """How near relit images come: PSNR [dB] with true materials, and of decomposed captures."""
     paths = evaluated["evaluation"]["paths"]
     rows: list[Sequence[Any]] = []
-    for name, capture in evaluated["evaluation"]["captures"].items():
-        direct = capture["ways"]["direct"]["mean"]["relit"]
-        lights: Mapping[str, Row] = true["accuracy"]["subjects"][name]["lights"]
-        for light, found in lights.items():
+    for name, subject in true["accuracy"]["subjects"].items():
+        capture = evaluated["evaluation"]["captures"].get(name)
+        for light, found in subject["lights"].items():
             usual, most = shown(found["rows"])[-2:]
-            scores = [usual["psnr"], most["psnr"], *(direct[way][light]["psnr"] for way in ("deferred", "path"))]
-            rows.append((name, light, *(f"{score:.1f}" for score in scores)))
+            scores = [usual["psnr"], most["psnr"]]
+            if capture is not None:
+                relit = capture["ways"]["direct"]["mean"]["relit"]
+                scores += [relit[way][light]["psnr"] for way in ("deferred", "path")]
+            rows.append([name, light, *(f"{score:.1f}" for score in scores), *("",) * (4 - len(scores))])
     true_ways = (f"true materials: {way['method']}, {way['setting']}" for way in (usual, most))
     return [
         ("PSNR [dB]", "light", *true_ways, f"decomposed: deferred, {USUAL}", f"path traced, {paths} samples"),
