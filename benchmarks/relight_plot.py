@@ -1,4 +1,4 @@
-"""The relighting benchmark as pictures: speed against accuracy, and deferred beside path traced beside the truth."""
+"""The relighting benchmark as a picture: deferred beside path traced beside the truth."""
 
 from __future__ import annotations
 
@@ -14,11 +14,6 @@ from beam_warp.image.color import linear_to_srgb
 
 Row = Mapping[str, Any]
 
-COLORS = {"deferred": "C0", "path traced": "C1"}
-MARKERS = ("o", "s", "^", "D", "v")
-LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (1, 4)))
-"""How each light is drawn."""
-
 SHOWN_LIGHT = "sunrise"
 """Light of the compared pictures, if it is there; else the last light is shown."""
 
@@ -30,50 +25,6 @@ LARGEST_FILE = 150_000
 
 RESOLUTIONS = (130, 115, 100, 90, 80, 70, 60, 50)
 """Dots per inch, tried one after the other."""
-
-
-def draw_speed(subjects: Mapping[str, Row], path: Path) -> None:
-    """Draw milliseconds of an image against how near it comes to the truth: a panel for each subject."""
-    plt = _pyplot()
-    columns = min(3, len(subjects) + 1)
-    lines = -(-(len(subjects) + 1) // columns)
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(3.6 * columns, 2.9 * lines), layout="constrained", squeeze=False, sharey=True
-    )
-    handles: dict[str, Any] = {}
-    names = dict.fromkeys(light for subject in subjects.values() for light in subject["lights"])
-    looks = dict(zip(names, zip(MARKERS, LINES, strict=True), strict=False))
-    for axis, (name, subject) in zip(axes.flat, subjects.items(), strict=False):
-        for number, (light, found) in enumerate(subject["lights"].items()):
-            for method, color in COLORS.items():
-                rows = [row for row in found["rows"] if row["method"] == method]
-                (handles[f"{method}, {light}"],) = axis.plot(
-                    [row["ms"]["median"] for row in rows],
-                    [row["psnr"] for row in rows],
-                    marker=looks[light][0],
-                    markersize=4,
-                    color=color,
-                    linestyle=looks[light][1],
-                    label=f"{method}, {light}",
-                )
-                for row in rows if number == 0 else ():
-                    axis.annotate(
-                        row["setting"].removesuffix(" samples"),
-                        (row["ms"]["median"], row["psnr"]),
-                        textcoords="offset points",
-                        xytext=(2, -9),
-                        fontsize=6,
-                    )
-        axis.set(xscale="log", xlabel="ms per image", title=name)
-        axis.title.set_fontsize(9)
-        axis.grid(alpha=0.3)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("PSNR in the box [dB]")
-    for axis in axes.flat[len(subjects) :]:
-        axis.set_axis_off()
-    axes.flat[-1].legend(handles=list(handles.values()), loc="center", fontsize=8, frameon=False)
-    save_small(figure, path)
-    plt.close(figure)
 
 
 def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> None:

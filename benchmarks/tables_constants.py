@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from constants_places import numbers_of, value_of
 from constants_registry import GROUPS, SIDES, UNTUNED, Constant
-from tables import Row, Rows, table
+from tables import Row, Rows, number, table
 
 FILE = "constants_h200.json"
 
@@ -31,6 +31,13 @@ FLOORS = {"meshing": "reconstruction", "relighting": "materials"}
 
 CLEAR = 3.0
 """How many times its noise a change must be to be printed bold."""
+
+
+@number("constants_measured", FILE)
+def measured(result: Row) -> str:
+    """Return how many of the constants that are varied were measured so far."""
+    found = result["constants"].values()
+    return f"{sum(bool(sides) for sides in found)} of {len(found)}"
 
 
 def noise(result: Row, group: str, capture: int, score: str) -> float:

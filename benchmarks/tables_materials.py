@@ -189,6 +189,17 @@ def roughness(result: Row) -> Rows:
     return rows
 
 
+@table("light_check", "light_check_cpu.json")
+def light_check(result: Row) -> Rows:
+    """How many of the subjects' wrong lights were told; the others were met by silence."""
+    rows = [["stated light", "told"]]
+    for name, found in result["summary"]["found"].items():
+        kind, _, amount = name.rpartition(" ")
+        unit = " stops" if kind == "exposed" else "°"
+        rows.append([f"{kind} by {amount.replace('-', '−')}{unit}", f"{found['found']} of {found['lights']}"])
+    return rows
+
+
 @figure("materials_perfect.png", PERFECT)
 def draw_perfect(result: Row, path: Path) -> None:
     """Draw `perfect` and `light`, with every way to sample."""

@@ -69,9 +69,7 @@ def path(result: Row) -> Rows:
 @table("relight_accuracy", ACCURACY)
 def accuracy(result: Row) -> Rows:
     """Scores and times of every way, where geometry and materials are true."""
-    rows: list[Sequence[Any]] = [
-        ("", "light", "way", "PSNR / SSIM", "true coverage [dB]", "against path traced [dB]", "ms")
-    ]
+    rows: list[Sequence[Any]] = [("", "light", "way", "PSNR / SSIM", "true coverage [dB]", "against path traced [dB]")]
     for name, subject in result["accuracy"]["subjects"].items():
         for light, found in subject["lights"].items():
             for row in shown(found["rows"]):
@@ -84,7 +82,6 @@ def accuracy(result: Row) -> Rows:
                         f"{row['psnr']:.2f} / {row['ssim']:.3f}",
                         f"{row['true_coverage_psnr']:.2f}",
                         None if other is None else f"{other['psnr']:.2f}",
-                        cell(row["ms"]),
                     )
                 )
     return rows
@@ -174,12 +171,6 @@ def results_accuracy(true: Row, evaluated: Row) -> Rows:
         ("PSNR [dB]", "light", *true_ways, f"decomposed: deferred, {USUAL}", f"path traced, {paths} samples"),
         *rows,
     ]
-
-
-@figure("relight_speed_accuracy.png", ACCURACY)
-def draw_speed(result: Row, path: Path) -> None:
-    """Draw milliseconds against PSNR, a panel a subject."""
-    relight_plot.draw_speed(result["accuracy"]["subjects"], path)
 
 
 @figure("relight_comparison.png", ACCURACY)

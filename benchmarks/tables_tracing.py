@@ -192,5 +192,4 @@ def results_demo(result: Row) -> Rows:
     rows.append(["factors that fit base colour best", *(" ".join(f"{x:.3f}" for x in each) for each in factors)])
     rows.append(["novel views of the last frame, PSNR in the box", "", f"{last['psnr']:.1f} dB"])
     rows.append(["its mesh and its tracked points off the truth, mean", "", f"{chamfer:.1f} / {drift:.1f} mm"])
-    rows.append([f"both, once, on the {device_of(result)}", f"{result['seconds']['total']:.0f} s", ""])
     return rows
