@@ -139,7 +139,7 @@ def light(result: Row) -> Rows:
     for name in next(iter(captures.values()))["irradiance"]:
         found = [capture["irradiance"][name]["ways"] for capture in captures.values()]
         errors = [ways[way][key] for ways in found for way, key in _LIGHT_ERRORS.values()]
-        rows.append((name, *(f"{100.0 * error:.2g} %" for error in errors)))
+        rows.append((name, *(f"{100.0 * error:.{0 if error > 0.1 else 1}f} %" for error in errors)))
     return rows
 
 

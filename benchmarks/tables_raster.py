@@ -85,7 +85,8 @@ def gradients(result: Row, on_cpu: Row) -> Rows:
     rows = [["scene", "error, H200", "error, CPU", "one rounding of the inputs"]]
     for scene in dict.fromkeys(row["scene"] for row in result["rows"]):
         found = [largest(each, scene, "error") for each in (result, on_cpu)]
-        rows.append([scene, *(f"{value:.1e}" for value in (*found, largest(on_cpu, scene, "one_rounding")))])
+        values = (*found, largest(on_cpu, scene, "one_rounding"))
+        rows.append([scene, *(f"{value:.1e}" if 0.0 < value < 1.0 else f"{value:.1f}" for value in values)])
     return rows
 
 
