@@ -210,9 +210,13 @@ def test_bands_change_no_image_and_hardly_a_gradient(device, made, values, monke
         assert np.linalg.norm(one - other) <= 1e-6 * np.linalg.norm(one)
 
 
-def test_redraw_follows_contents_and_cameras(device, rng, made, values):
+@pytest.mark.parametrize("limit", [2**24, 300])
+def test_redraw_follows_contents_and_cameras(device, rng, made, values, monkeypatch, limit):
+    """Also where there are bands."""
+    monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
     moved = cloud(rng)
     drawer, arrays = drawn(made, [around()], device, values)
+    assert (len(drawer._bands) > 1) == (limit == 300)
     room = drawer.pair_capacity
     for name in ("positions", "orientations", "scales", "opacities"):
         getattr(arrays, name).assign(getattr(moved, name))
