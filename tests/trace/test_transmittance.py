@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays
+from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays, unit
 
 from beam_warp import Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common import launching
-from beam_warp.trace.reference import RayPairs, ReferenceGaussians, visibility_reference
+from beam_warp.trace.reference import (
+    RayPairs,
+    ReferenceGaussians,
+    candidate_pairs,
+    visibility_enclosure,
+    visibility_reference,
+)
 from beam_warp.trace.transmittance import TraceOptions
 
 # V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
@@ -107,19 +113,48 @@ class TestEnclosure:
         t after division by |v| = 1 / thickness.
         """
         center, origin, beside = np.array([3.0, 0.0, 4.0]), np.array([-2.0, 0.125, 4.0]), 0.125
-        cloud = aligned([center], 0.9, (thickness, 0.25, 0.25))
+        cloud, u = aligned([center], 0.75, (thickness, 0.25, 0.25)), 2.0**-12
         gaussians = ReferenceGaussians.of(cloud, np.zeros(3), 2)
         ray = origin[None], np.array([[1.0, 0.0, 0.0]])
-        pair = RayPairs.of(gaussians, *ray, np.zeros(1, int), 1.0)
+        pair = RayPairs.of(gaussians, *ray, np.zeros(1, int), u)
         coordinates = np.linalg.norm(origin) + np.linalg.norm(center)
         p, t, whitened = np.hypot(5.0, beside), 5.0, beside / 0.25
         point = coordinates + p + t + 25.0 * beside  # one rounding of each, and 24 of M on what is across
         across = point * leverage + 2.0 * whitened + 4.0 * whitened  # the products of q x v, then norm and quotient
         assert (pair.distance, pair.t) == (whitened, t)
-        assert pair.distance_error == pytest.approx(across + 8.0 * pair.radius, rel=1e-12)
+        assert pair.distance_error == pytest.approx(u * (across + 8.0 * pair.radius), rel=1e-12)
         # o, c and p as they enter p . d; the peak's point; q's own roundings; M's error of v in q . v / |v|^2, thrice
         along = coordinates + 4.0 * p + point + 3.0 * whitened * thickness + 3.0 * whitened * 24.0 * thickness
-        assert pair.t_error == pytest.approx(along, rel=1e-12)
+        assert pair.t_error == pytest.approx(u * along, rel=1e-12)
+        low, high = (0.75 * np.exp(-0.5 * (whitened + sign * u * across) ** 2) for sign in (1.0, -1.0))
+        assert pair.alpha_low == pytest.approx(low * (1.0 - 24.0 * u), rel=1e-12)
+        assert pair.alpha_high == pytest.approx(high * (1.0 + 24.0 * u), rel=1e-12)
+
+    @pytest.mark.parametrize("degree", [2, 4])
+    @pytest.mark.parametrize(("front", "cull"), [("peak", False), ("entry", True)])
+    def test_without_roundoff_it_is_the_value_itself(self, rng, degree, front, cull):
+        cloud = random_cloud(rng, 300).with_arrays(normals=unit(rng.normal(size=(300, 3))))
+        options = {"front": front, "cull": cull, "response_degree": degree, "roundoff": 0.0}
+        found = visibility_enclosure(cloud, *random_rays(rng, 200), t_max=1.0, **options)
+        np.testing.assert_array_equal(found.low, found.exact)
+        np.testing.assert_array_equal(found.high, found.exact)
+        assert found.exact.min() < 0.5
+
+    def test_candidates_are_all_pairs_that_may_count(self, rng):
+        """Coarse rounding, ten metres off: no pair is left out that only rounding lets count."""
+        roundoff, middle = 2.0**-12, np.array([10.0, 0.0, 0.0])
+        gaussians = ReferenceGaussians.of(random_cloud(rng, 300, opacity=(0.1, 1.0)), middle, 2)
+        origins, directions = (rows.astype(np.float64) for rows in random_rays(rng, 100))
+        rays = origins - middle, directions
+        every_ray, every_index = (rows.ravel() for rows in np.mgrid[:100, :300])
+        pair = RayPairs.of(gaussians, *(rows[every_ray] for rows in rays), every_index, roundoff)
+        counting, possible, _ = pair.decide(np.full(len(every_ray), np.inf), "peak", roundoff)
+        found = np.zeros((100, 300), bool)
+        for ray, index in candidate_pairs(gaussians, *rays, roundoff):
+            found[ray, index] = True
+        assert found[every_ray[possible], every_index[possible]].all()
+        assert (possible & ~counting).any()
+        assert found.mean() < 0.5
 
 
 class TestProperties:
