@@ -18,7 +18,7 @@ from beam_warp.raster import forward, rasterizer
 from beam_warp.raster.gbuffer import rasterize_backward
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.sources import upload_gaussians
+from beam_warp.raster.sources import DrawnCloud, upload_gaussians
 
 GRADIENT_ERROR = 1e-5
 """Relative L2 of every gradient against float64 frozen-decision differences."""
@@ -337,6 +337,24 @@ def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         for name in one.channels:
             np.testing.assert_array_equal(one.channels[name], other.channels[name])
+
+
+@pytest.mark.parametrize(
+    ("limits", "groups"),
+    [
+        ({"GROUP_PIXELS": 365}, [[0, 1], [2]]),
+        ({"GROUP_PIXELS": 364}, [[0], [1], [2]]),
+        ({"GROUP_SPLATS": 400}, [[0, 1], [2]]),
+        ({"GROUP_SPLATS": 199}, [[0], [1], [2]]),
+    ],
+)
+def test_groups_hold_as_many_cameras_as_their_limits_allow(made, monkeypatch, limits, groups):
+    """200, 165 and 256 pixels, 200 splats each; a camera beyond the limit is a group of its own."""
+    for name, limit in limits.items():
+        monkeypatch.setattr(f"beam_warp.raster.sources.{name}", limit)
+    cameras = [around(10, 20), around(33, 5), around(16, 16)]
+    drawn_groups = DrawnCloud.of(made, (), "cpu").draw_groups(cameras, None)
+    assert [list(places) for _, places in drawn_groups] == groups
 
 
 def loss_of(made, cameras, adjoints, channels, device):
