@@ -18,7 +18,7 @@ from beam_warp.raster import forward, rasterizer
 from beam_warp.raster.gbuffer import rasterize_backward
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.sources import upload_gaussians
+from beam_warp.raster.sources import DrawnCloud, upload_gaussians
 
 GRADIENT_ERROR = 1e-5
 """Relative L2 of every gradient against float64 frozen-decision differences."""
@@ -210,9 +210,13 @@ def test_bands_change_no_image_and_hardly_a_gradient(device, made, values, monke
         assert np.linalg.norm(one - other) <= 1e-6 * np.linalg.norm(one)
 
 
-def test_redraw_follows_contents_and_cameras(device, rng, made, values):
+@pytest.mark.parametrize("limit", [2**24, 300])
+def test_redraw_follows_contents_and_cameras(device, rng, made, values, monkeypatch, limit):
+    """Also where there are bands."""
+    monkeypatch.setattr(forward, "MAX_BAND_PAIRS", limit)
     moved = cloud(rng)
     drawer, arrays = drawn(made, [around()], device, values)
+    assert (len(drawer._bands) > 1) == (limit == 300)
     room = drawer.pair_capacity
     for name in ("positions", "orientations", "scales", "opacities"):
         getattr(arrays, name).assign(getattr(moved, name))
@@ -333,6 +337,24 @@ def test_a_list_of_cameras_of_any_sizes(device, rng, monkeypatch):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         for name in one.channels:
             np.testing.assert_array_equal(one.channels[name], other.channels[name])
+
+
+@pytest.mark.parametrize(
+    ("limits", "groups"),
+    [
+        ({"GROUP_PIXELS": 365}, [[0, 1], [2]]),
+        ({"GROUP_PIXELS": 364}, [[0], [1], [2]]),
+        ({"GROUP_SPLATS": 400}, [[0, 1], [2]]),
+        ({"GROUP_SPLATS": 199}, [[0], [1], [2]]),
+    ],
+)
+def test_groups_hold_as_many_cameras_as_their_limits_allow(made, monkeypatch, limits, groups):
+    """200, 165 and 256 pixels, 200 splats each; a camera beyond the limit is a group of its own."""
+    for name, limit in limits.items():
+        monkeypatch.setattr(f"beam_warp.raster.sources.{name}", limit)
+    cameras = [around(10, 20), around(33, 5), around(16, 16)]
+    drawn_groups = DrawnCloud.of(made, (), "cpu").draw_groups(cameras, None)
+    assert [list(places) for _, places in drawn_groups] == groups
 
 
 def loss_of(made, cameras, adjoints, channels, device):

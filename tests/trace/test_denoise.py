@@ -1,5 +1,7 @@
 """Denoising: what is constant stays, edges of the surface stay, noise goes; and what is not installed is named."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -126,6 +128,28 @@ class TestFilters:
         assert [image.dtype for image in found] == [wp.float32, wp.vec3]
         again = denoise(images[:1], wall.guides, denoiser=denoiser)
         np.testing.assert_array_equal(found[0].numpy(), again[0].numpy())
+
+
+def test_oidn_sees_the_mean_of_the_surface_behind_it(device, rng, monkeypatch):
+    """A stand-in for the package, which need not be installed, gives back the image that it is handed."""
+    handed = {}
+
+    class StandIn:
+        DeviceType = SimpleNamespace(CPU="cpu")
+        Device = str
+
+        def denoise(self, image, **options):
+            handed.update(options, image=image)
+            return image
+
+    monkeypatch.setattr(denoising, "_open_image_denoise", StandIn)
+    wall = Wall(device, hole=20)
+    values = rng.uniform(0.0, 1.0, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    found = wall.denoised(values, 0.1, "oidn")
+    np.testing.assert_array_equal(found, np.where(wall.surface[..., None], values, 0.0))
+    mean = values[20:].mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
+    np.testing.assert_array_equal(handed["image"][:20], np.broadcast_to(mean, (20, WIDTH, 3)))
+    assert (handed["hdr"], handed["clean_aux"], handed["device"]) == (False, True, "cpu")
 
 
 class TestBilateral:

@@ -191,6 +191,20 @@ def test_floor_before_a_wall(device, density):
     assert abs(truth.mean() - result.value[:, 0].mean()) < 0.02
 
 
+@pytest.mark.parametrize(("density", "sample_count"), [("cosine", 31), ("environment", 31), ("mis", 62)])
+def test_one_column_of_strata_takes_most_of_the_error(device, density, sample_count):
+    """A prime count has strata along y alone, and light that grows along y varies little within one: both show."""
+    environment = EnvironmentMap.constant((1.0, 1.0, 1.0), height=64)
+    light = EnvironmentMap((1.0 + 0.9 * environment.directions()[..., 1:2]) * environment.radiance)
+    count = 200
+    errors = {}
+    for sampler in ("stratified", "iid"):
+        options = {"density": density, "sampler": sampler, "sample_count": sample_count, "ratio": False}
+        result = irradiance(empty(device), np.zeros((count, 3)), np.tile(UP, (count, 1)), light, **options)
+        errors[sampler] = result.value.std(), rms(result.standard_error)
+    assert (np.array(errors["stratified"]) < 0.5 * np.array(errors["iid"])).all()
+
+
 class TestMultipleImportance:
     def test_weights_sum_to_one(self, device, rng):
         cosine, environment = techniques("mis", "owen", 50)

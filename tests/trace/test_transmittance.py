@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 import warp as wp
-from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays
+from support.shapes import aligned, along_x, one_gaussian, random_cloud, random_rays, unit
 
 from beam_warp import Scene, visibility
 from beam_warp.errors import DeviceError, InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common import launching
-from beam_warp.trace.reference import visibility_reference
+from beam_warp.trace.reference import (
+    RayPairs,
+    ReferenceGaussians,
+    candidate_pairs,
+    visibility_enclosure,
+    visibility_reference,
+)
 from beam_warp.trace.transmittance import TraceOptions
 
 # V is over-estimated by less than the stop threshold, 1e-4; float32 rounding of the response adds up to 6e-8 times
@@ -28,12 +34,17 @@ class TestClosedForm:
         response = np.exp(-0.5 * ((y / 0.2) ** 2 + (z / 0.3) ** 2))
         assert visibility(scene, *along_x(y, z)) == pytest.approx(1.0 - 0.9 * response, abs=1e-6)
 
-    def test_cut_where_alpha_reaches_one_step_of_eight_bits(self, device):
-        scene = Scene.from_gaussians(one_gaussian(0.9), device)
-        radius = np.sqrt(2.0 * np.log(255.0 * 0.9))
+    @pytest.mark.parametrize(
+        ("degree", "radius"), [(2, (2.0 * np.log(255.0 * 0.9)) ** 0.5), (4, (18.0 * np.log(255.0 * 0.9)) ** 0.25)]
+    )
+    def test_cut_where_alpha_reaches_one_step_of_eight_bits(self, device, degree, radius):
+        cloud = one_gaussian(0.9)
+        scene = Scene.from_gaussians(cloud, device, response_degree=degree)
         inside, outside = along_x(z=0.3 * (radius - 1e-3)), along_x(z=0.3 * (radius + 1e-3))
         assert visibility(scene, *inside)[0] < 1.0 - 1.0 / 255.0 + 1e-6
         assert visibility(scene, *outside)[0] == 1.0
+        assert visibility_reference(cloud, *inside, response_degree=degree)[0] < 1.0 - 1.0 / 255.0
+        assert visibility_reference(cloud, *outside, response_degree=degree)[0] == 1.0
 
     def test_only_peaks_in_front_and_before_t_max_count(self, device):
         scene = Scene.from_gaussians(one_gaussian(0.5), device)
@@ -91,6 +102,59 @@ class TestAgainstBruteForce:
         scene = Scene.from_gaussians(cloud, device)
         assert visibility(scene, *along_x())[0] < 1e-4  # 0.996^10000 = 4e-18
         assert visibility(scene, *along_x(z=1.0))[0] == 1.0
+
+
+class TestEnclosure:
+    @pytest.mark.parametrize(("thickness", "leverage"), [(0.25, 4.0), (2.0**-7, 4.0 * np.sqrt(2.0))])
+    def test_errors_are_the_roundings_counted_by_hand(self, thickness, leverage):
+        """A ray along x passes a sphere of radius 1/4, or crosses a disc of it, 1/8 beside the centre.
+
+        The nearest point to the centre is the peak, so t is that point's own. An error in whitened space is an error of
+        t after division by |v| = 1 / thickness.
+        """
+        center, origin, beside = np.array([3.0, 0.0, 4.0]), np.array([-2.0, 0.125, 4.0]), 0.125
+        cloud, u = aligned([center], 0.75, (thickness, 0.25, 0.25)), 2.0**-12
+        gaussians = ReferenceGaussians.of(cloud, np.zeros(3), 2)
+        ray = origin[None], np.array([[1.0, 0.0, 0.0]])
+        pair = RayPairs.of(gaussians, *ray, np.zeros(1, int), u)
+        coordinates = np.linalg.norm(origin) + np.linalg.norm(center)
+        p, t, whitened = np.hypot(5.0, beside), 5.0, beside / 0.25
+        point = coordinates + p + t + 25.0 * beside  # one rounding of each, and 24 of M on what is across
+        across = point * leverage + 2.0 * whitened + 4.0 * whitened  # the products of q x v, then norm and quotient
+        assert (pair.distance, pair.t) == (whitened, t)
+        assert pair.distance_error == pytest.approx(u * (across + 8.0 * pair.radius), rel=1e-12)
+        # o, c and p as they enter p . d; the peak's point; q's own roundings; M's error of v in q . v / |v|^2, thrice
+        along = coordinates + 4.0 * p + point + 3.0 * whitened * thickness + 3.0 * whitened * 24.0 * thickness
+        assert pair.t_error == pytest.approx(u * along, rel=1e-12)
+        low, high = (0.75 * np.exp(-0.5 * (whitened + sign * u * across) ** 2) for sign in (1.0, -1.0))
+        assert pair.alpha_low == pytest.approx(low * (1.0 - 24.0 * u), rel=1e-12)
+        assert pair.alpha_high == pytest.approx(high * (1.0 + 24.0 * u), rel=1e-12)
+
+    @pytest.mark.parametrize("degree", [2, 4])
+    @pytest.mark.parametrize(("front", "cull"), [("peak", False), ("entry", True)])
+    def test_without_roundoff_it_is_the_value_itself(self, rng, degree, front, cull):
+        cloud = random_cloud(rng, 300).with_arrays(normals=unit(rng.normal(size=(300, 3))))
+        options = {"front": front, "cull": cull, "response_degree": degree, "roundoff": 0.0}
+        found = visibility_enclosure(cloud, *random_rays(rng, 200), t_max=1.0, **options)
+        np.testing.assert_array_equal(found.low, found.exact)
+        np.testing.assert_array_equal(found.high, found.exact)
+        assert found.exact.min() < 0.5
+
+    def test_candidates_are_all_pairs_that_may_count(self, rng):
+        """Coarse rounding, ten metres off: no pair is left out that only rounding lets count."""
+        roundoff, middle = 2.0**-12, np.array([10.0, 0.0, 0.0])
+        gaussians = ReferenceGaussians.of(random_cloud(rng, 300, opacity=(0.1, 1.0)), middle, 2)
+        origins, directions = (rows.astype(np.float64) for rows in random_rays(rng, 100))
+        rays = origins - middle, directions
+        every_ray, every_index = (rows.ravel() for rows in np.mgrid[:100, :300])
+        pair = RayPairs.of(gaussians, *(rows[every_ray] for rows in rays), every_index, roundoff)
+        counting, possible, _ = pair.decide(np.full(len(every_ray), np.inf), "peak", roundoff)
+        found = np.zeros((100, 300), bool)
+        for ray, index in candidate_pairs(gaussians, *rays, roundoff):
+            found[ray, index] = True
+        assert found[every_ray[possible], every_index[possible]].all()
+        assert (possible & ~counting).any()
+        assert found.mean() < 0.5
 
 
 class TestProperties:

@@ -91,6 +91,10 @@ def require_sound(built, packed):
             loosest = (1.001 + 255.0 * 2.0**-23) * tree.step[node]
             assert (low - tree.lower[node, :count] <= loosest).all()
             assert (tree.upper[node, :count] - high <= loosest).all()
+    # A step is the smallest power of two of which 254 reach across: less than twice what they need. Extent and quotient
+    # are rounded; the smallest step is float32's smallest normal number.
+    needed = np.where(tree.count[:, None] > 0, upper - lower, 0.0) / 254.0
+    assert (tree.step <= np.maximum(2.0 * (1.0 + 4.0 * FLOAT32_ROUNDOFF) * needed, 2.0**-126)).all()
     assert parents_of_nodes[0] == 0
     assert (parents_of_nodes[1:] == 1).all()
     assert (parents_of_leaves == 1).all()
