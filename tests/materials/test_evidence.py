@@ -77,6 +77,7 @@ class TestSurface:
         assert len(hidden) > 50
         np.testing.assert_array_equal(found.positions.numpy()[hidden], both.positions[hidden])
         assert (found.normals.numpy()[hidden] == 0.0).all()
+        assert (found.agreement.numpy()[hidden] == 0.0).all()
 
     def test_a_layer_behind_a_plane_is_moved_onto_what_is_seen(self, device):
         flat = disc_points(1.0, 0.05)
