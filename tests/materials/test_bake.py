@@ -1,6 +1,7 @@
 """Baking: the bounded least-squares problem against a dense solver, what it recovers, its pulls, Adam beside it."""
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -186,6 +187,17 @@ class TestRecovery:
 
 
 class TestPulls:
+    def test_a_mean_beyond_the_bounds_pulls_no_further_than_the_bound(self, device):
+        """Pixels alone take such a value to the bound: only a frame before that pulls the other way tells."""
+        made = Problem(device)
+        pulls, bounds = {"ridge": 1.0, "temporal": 20.0}, {"low": 0.3, "high": 0.7}
+        found = made.bake(previous=made.previous, passes=200, tolerance=1e-6, **pulls, **bounds)
+        for column in range(4):
+            a, b = made.dense(column)
+            made.prior[:, column] = np.clip((a.T @ b) / (a.T @ (a @ np.ones(60))), 0.3, 0.7)
+            np.testing.assert_allclose(found.values[:, column], made.best(column, 0.3, 0.7, **pulls), atol=2e-5)
+        assert np.isin(made.prior, np.float32([0.3, 0.7])).mean() > 0.2
+
     def test_a_strong_temporal_term_repeats_the_frame_before(self, device):
         made = problem(device)
         found = made.bake(previous=made.previous[:, :3], temporal=1e7, tolerance=1e-7)
@@ -266,6 +278,9 @@ class TestRefusals:
         made = problem(device)
         with pytest.raises(InvalidOptionError, match=r"^views must hold at least one view"):
             bake(upload_gaussians(made.cloud, made.device), [], device=made.device)
+        flat = [replace(view, targets=view.targets[..., 0]) for view in made.views]
+        with pytest.raises(InvalidOptionError, match=r"^columns of targets must"):
+            bake(upload_gaussians(made.cloud, made.device), flat, device=made.device)
         with pytest.raises(InvalidArrayError, match=r"^prior must"):
             made.bake(prior=made.prior[:, :3])
         with pytest.raises(InvalidArrayError, match=r"^previous must be given"):

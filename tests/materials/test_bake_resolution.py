@@ -30,12 +30,18 @@ class TestFactor:
     CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
     POINTS = np.array([(x, y, 5.0) for x in range(-2, 3) for y in range(-2, 3)])
 
-    @pytest.mark.parametrize(("pixels", "wanted"), [(0.4, 1), (3.99, 1), (4.01, 2), (5.99, 2), (6.01, 3), (15.0, 7)])
+    @pytest.mark.parametrize(
+        ("pixels", "wanted"), [(0.4, 1), (3.99, 1), (4.01, 2), (5.99, 2), (6.01, 3), (15.0, 7), (5000.0, 640)]
+    )
     def test_a_pixel_is_at_most_half_as_wide_as_a_splat(self, pixels, wanted):
-        """Tiles of one size in a plane that faces the camera: all deviations are ``pixels``."""
+        """Tiles of one size in a plane that faces the camera: all deviations are ``pixels``.
+
+        At most, the largest image becomes one pixel.
+        """
         flat = tiles(self.POINTS, np.tile((0.0, 0.0, -1.0), (25, 1)), 1.0)
         flat["scales"] = np.tile([0.01 * pixels, 0.02 * pixels, 1e-4], (25, 1))  # the middle one is 5 / 500 a pixel
-        assert reduction_factor(cloud_of(flat), [self.CAMERA], near=NEAR) == wanted
+        smaller = replace(self.CAMERA, width=32, height=24)
+        assert reduction_factor(cloud_of(flat), [self.CAMERA, smaller], near=NEAR) == wanted
 
     def test_the_view_that_sees_splats_smallest_decides(self):
         near, far = around(0.0, 400, 400, 3.0), around(90.0, 400, 400, 9.0)

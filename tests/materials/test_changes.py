@@ -83,6 +83,16 @@ def test_frames_that_do_not_see_a_gaussian_do_not_count(rng):
     np.testing.assert_allclose(found.frame_color(frames[3])[0][:500], found.mean[:500])
 
 
+def test_what_no_surface_is_counts_as_black_or_white(rng):
+    """Light that is stated too dim takes least squares beyond white: by how much is no change of colour."""
+    colors = rng.uniform(-0.2, 1.2, (FRAMES, COUNT, 3))
+    found, cut = (
+        outcome([evidence(frame, 0.03) for frame in frames]) for frames in (colors, np.clip(colors, 0.0, 1.0))
+    )
+    np.testing.assert_allclose(found.mean, cut.mean, rtol=1e-3)
+    np.testing.assert_allclose(found.dispersion, cut.dispersion, rtol=1e-3)
+
+
 def test_a_single_frame_says_nothing(rng):
     found = outcome(frames_of(rng, rng.uniform(0.3, 0.7, (1, 50, 3)), 0.03))
     assert not found.changing.any()

@@ -203,7 +203,7 @@ def views_of(normals, cosines, rng):
 
 
 class TestResidues:
-    COSINES = (0.05, 0.3, 0.6, 0.9, 0.999)
+    COSINES = (0.03, 0.3, 0.6, 0.9, 0.999)
 
     @pytest.mark.parametrize("roughness", [0.3, 0.7])
     def test_open_points_show_the_blurred_sky_times_the_albedo(self, device, rng, sky, roughness):

@@ -189,6 +189,9 @@ def test_scale_of_the_light(shown):
     assert codes(dim) == ["environment-exposure"]
     assert abs(dim.exposure_stops - 3.0) < 1.0
     assert "too dim" in str(dim.findings[0])
+    slight = judge_light(evidence, light.exposed(dim.exposure_stops - 3.8))
+    assert slight.exposure_stops == pytest.approx(0.8, abs=1e-3)
+    assert "too dim" in str(slight.findings[0])
     bright = judge_light(evidence, light.exposed(5.0))
     assert codes(bright) == ["environment-exposure"]
     assert abs(bright.exposure_stops + 5.0) < 1.0
@@ -220,7 +223,7 @@ def photographed(device, images=True):
     return scene, SurfacePoints.seen_by(stress.cloud, views, scene), views, stress.environment
 
 
-def test_gaussians_and_photographs_tell(device):
+def test_gaussians_and_photographs_tell(device, monkeypatch):
     """Visibility is traced, colours are those of images with noise; the light is the path tracer's."""
     scene, points, views, light = photographed(device)
     right = check_light(scene, points, views, light, subset=256)
@@ -229,6 +232,8 @@ def test_gaussians_and_photographs_tell(device):
     assert abs(right.best_rotation_degrees) <= CELL / 2
     assert codes(check_light(scene, points, views, light.rotated(90.0), subset=256)) == ["environment-turned"]
     assert check_light(scene, points, views, light, subset=256) == right
+    monkeypatch.setattr("beam_warp.materials.light.MOST_VIEWS", 4)
+    assert len(light_evidence(scene, points, views, 256).weights) == 4 < len(views.colors)
 
 
 @pytest.fixture(scope="module")
@@ -273,6 +278,7 @@ def test_what_cannot_be_judged_is_said(shown):
     points = judge_light(Ball.of(LEAST_POINTS // 2).evidence(LIGHTS["studio"]), LIGHTS["studio"])
     assert codes(points) == ["light-unchecked"]
     assert points.point_count < LEAST_POINTS
+    assert not any(value for name, value in vars(points).items() if name not in ("point_count", "findings"))
     few = replace(whole, colors=whole.colors[:3], weights=whole.weights[:3], directions=whole.directions[:3])
     views = judge_light(few, LIGHTS["studio"].rotated(90.0))
     assert codes(views) == ["light-unchecked"]

@@ -164,6 +164,18 @@ class TestWeights:
         assert abs(found.prior.mean - truth.mean()) < 2 * 0.02 + 0.025
         assert 0.15 / 1.3 < found.prior.spread < 0.15 * 1.3
 
+    @pytest.mark.parametrize("truth", [0.3, 0.7])
+    def test_the_start_of_the_prior_counts_as_much_as_one_place(self, rng, truth):
+        """One place, 256 Gaussians, leaves the mean between the start's and its own; four outvote the start."""
+        certain = np.tile(np.square((np.array(CANDIDATES) - truth) / 0.05), (3, 1024, 1))
+        certain[0] *= 2.0
+        means = [
+            solve_roughness(self.sheet(rng, n), RoughnessProfile(certain[:, :n], np.ones(n))).prior.mean
+            for n in (256, 1024)
+        ]
+        assert 0.0 < (means[0] - 0.5) / (truth - 0.5) < 0.9
+        assert means[1] == pytest.approx(truth)
+
     def test_more_frames_smaller_error(self, rng):
         positions = self.sheet(rng)
         truth = np.full(len(positions), 0.5)

@@ -34,6 +34,18 @@ def test_surface_is_kept():
     assert len(flat.vertices) > len(mesh.vertices)
 
 
+def test_texels_of_a_square_are_at_their_centres():
+    """Two triangles in the right half of 8 x 12 texels: each texel there is once or, on the diagonal, twice."""
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    square = trimesh.Trimesh(np.insert(corners, 2, 7.0, axis=1), [[0, 1, 2], [0, 2, 3]], process=False)
+    square.visual = trimesh.visual.TextureVisuals(uv=0.5 * corners * [1.0, 2.0] + [[0.5, 0.0]])
+    positions, texels = texel_positions(square, 12, 8)
+    assert np.array_equal(np.unique(texels), np.arange(96).reshape(12, 8)[:, 4:].ravel())
+    row, column = np.divmod(texels, 8)
+    expected = np.stack([(column - 3.5) / 4, 1.0 - (row + 0.5) / 12, np.full(len(texels), 7.0)], axis=1)
+    np.testing.assert_allclose(positions, expected, atol=1e-12)
+
+
 def test_charts_do_not_overlap():
     """No texel's centre is in two triangles, but for those on edges, which neighbours share."""
     flat = unwrapped(ball(), resolution=RESOLUTION)

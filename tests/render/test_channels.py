@@ -124,6 +124,26 @@ def test_three_errors_are_their_root_mean_square():
     assert channel_range(one, "base_color_error") == (0.0, 0.2)
 
 
+def test_the_legend_is_the_colour_map_between_the_numbers_at_its_ends():
+    seen = see_channel(ball(), camera(), "roughness_error", device="cpu")
+    numbers = []
+    for value_range in ((0.25, 0.75), (0.75, 0.25)):
+        line = seen.legend(300, value_range)[:26]
+        middle = line[16].astype(int)
+        first, last = (int(np.flatnonzero((middle == rgb(VIRIDIS[end])).all(axis=1))[end]) for end in (0, -1))
+        places = np.linspace(0.0, len(VIRIDIS) - 1, last + 1 - first)
+        expected = [np.interp(places, range(len(VIRIDIS)), column) for column in zip(*map(rgb, VIRIDIS), strict=True)]
+        np.testing.assert_allclose(middle[first : last + 1].T, expected, atol=0.5)
+        for part in (line[:, :first, 0], line[:, last + 1 :, 0]):
+            drawn = np.flatnonzero(part.max(axis=0) > part.min())
+            numbers.append(part[:, drawn[0] : drawn[-1] + 1])
+    low, high, other_low, other_high = numbers
+    assert np.array_equal(low, other_high)
+    assert np.array_equal(high, other_low)
+    assert not np.array_equal(low, high)
+    np.testing.assert_array_equal(seen.picture()[30:], seen.legend(40))
+
+
 @pytest.mark.parametrize(
     ("largest", "end"), [(0.0, 1.0), (1e-6, 1e-6), (0.011, 0.02), (0.02, 0.02), (0.3, 0.5), (0.7, 1.0), (7.0, 10.0)]
 )

@@ -314,14 +314,14 @@ def test_a_mesh_is_shaded_like_gaussians(device, flip):
 def test_the_nearer_one_is_in_front(device, z):
     """A red plate of Gaussians before a white one of triangles, and behind it."""
     cloud = discs([0.0, 0.0, 0.0], UP, 5.0, color=(0.8, 0.0, 0.0), opacity=0.6)
-    rest = {"camera": camera((0.0, -0.01, 3.0)), "environment": WHITE}
+    rest = {"camera": camera((0.0, -0.01, 1.2)), "environment": WHITE}
     alone = render(Shot(cloud=cloud, **rest), device)
     mesh = render(Shot(cloud=nothing(), mesh=mesh_of(plate(z)), **rest), device)
     both = render(Shot(cloud=cloud, mesh=mesh_of(plate(z)), **rest), device)
     expected = mesh.rgb if z > 0 else alone.rgb + (1.0 - alone.alpha[..., None]) * mesh.rgb
     np.testing.assert_allclose(both.rgb, expected, rtol=1e-5)
     np.testing.assert_allclose(both.alpha, 1.0, rtol=1e-6)
-    depth = 3.0 - z if z > 0 else 0.6 * 3.0 + 0.4 * 3.5
+    depth = 1.2 - z if z > 0 else 0.6 * 1.2 + 0.4 * 1.7
     assert both.layers["depth"][4, 4] == pytest.approx(depth, rel=1e-3)
 
 
