@@ -99,6 +99,13 @@ def test_the_file_obeys_the_rules_of_importers(make_cloud, tmp_path):
         assert ("comment beam_base_color_space lin_rec709_scene" in lines) == (name == "beam")
 
 
+def test_full_and_no_opacity_stay_finite_in_a_file(make_cloud, tmp_path):
+    write(make_cloud(3, opacities=[0.0, 0.5, 1.0]), tmp_path / "a.ply")
+    stored = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]["opacity"]
+    assert np.array_equal(stored, [-20.0, 0.0, 20.0])
+    assert np.allclose(converters.read(tmp_path / "a.ply")[0].opacities, [2.0611536e-9, 0.5, 1.0], rtol=EPSILON, atol=0)
+
+
 def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
     cloud = make_cloud(materials=True, radiance_color_space=LINEAR_REC709)
     write(cloud, tmp_path / "a.ply", profile="beam")

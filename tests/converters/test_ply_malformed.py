@@ -52,6 +52,8 @@ def test_truncated_within_the_data(columns, ply_bytes, tmp_path):
         held = (size - start) // 56
         message = f"element vertex must have the 3 rows that the header counts, got bytes for {held}"
         refused(tmp_path, content[:size], message)
+    bytes_first = content[:start].replace(b"element vertex", b"element mask 2\nproperty uchar m\nelement vertex")
+    refused(tmp_path, bytes_first, "element mask must have the 2 rows that the header counts, got bytes for 0")
 
 
 @pytest.mark.parametrize(
@@ -205,8 +207,8 @@ def test_rows_without_columns_cost_no_time(tmp_path):
 
 
 def test_control_characters_do_not_reach_the_terminal(columns, ply_bytes, tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["red \x1b[31m and \x9b"]))
-    assert converters.inspect(tmp_path / "a.ply").comments == ("red ?[31m and ?",)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["red \x1b[31m and \x7f\x9b"]))
+    assert converters.inspect(tmp_path / "a.ply").comments == ("red ?[31m and ??",)
 
 
 def test_what_is_not_a_file(tmp_path):

@@ -158,7 +158,7 @@ BREAKERS = {
     "BEAM-RASTER-001": no_low_pass,
     "BEAM-TOKEN-001": lambda asset: asset.splats.RemoveProperty("beam:brdf"),
     "BEAM-TOKEN-002": lambda asset: asset.set("beam:brdf", "lambert"),
-    "BEAM-VERSION-001": lambda asset: asset.set("beam:schemaVersion", "one"),
+    "BEAM-VERSION-001": lambda asset: asset.set("beam:schemaVersion", "1.x"),
     "BEAM-VERSION-002": lambda asset: asset.set("beam:schemaVersion", "2.0"),
     "BEAM-VERSION-003": lambda asset: asset.set("beam:schemaVersion", "1.9"),
     "BEAM-SEQ-001": lambda asset: asset.root.RemoveAppliedSchema(SEQUENCE_API),
@@ -267,4 +267,4 @@ def test_an_asset_without_our_schema_is_only_warned_about(asset):
     drop_material(asset)
     report = check_rules(asset.stage)
     assert report.is_valid
-    assert [finding.severity for finding in report.findings] == ["warning"]
+    assert [(finding.severity, finding.time, finding.frames) for finding in report.findings] == [("warning", None, 0)]
