@@ -215,6 +215,13 @@ def test_capture_frames_must_not_be_negative(asset):
     assert asset.rules() == []
 
 
+def test_another_color_space_is_named(asset):
+    asset.splats.GetAttribute("beam:baseColorh").SetColorSpace("srgb_rec709_scene")
+    (finding,) = check_rules(asset.stage).findings
+    assert finding.rule == "BEAM-COLOR-001"
+    assert finding.message == "colorSpace must be lin_rec709_scene, got srgb_rec709_scene. Author it."
+
+
 def test_what_version_1_1_added_is_checked(asset):
     asset.change("beam:observability", 2, 63)  # grazing is a known flag
     assert asset.rules() == []
