@@ -15,6 +15,7 @@ from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, 
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.axes import axes_matrix
 from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 
 EPSILON = np.finfo(np.float32).eps
 
@@ -111,6 +112,7 @@ def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
     write(cloud, tmp_path / "a.ply", profile="beam")
     sequence = converters.read(tmp_path / "a.ply")
     back = sequence[0]
+    assert (sequence.topology, sequence.constant) == ("constant", back.arrays().keys())
     assert not notes_of(sequence)
     exact = ("positions", "orientations", "radiance", "normals", "base_color", "roughness", "ambient_occlusion")
     for name in exact:
@@ -236,12 +238,13 @@ def test_bands_are_padded_and_cut(make_cloud, tmp_path):
     assert np.array_equal(none, cloud.radiance[:, :1])
 
 
-def test_without_radiance_a_standard_file_shows_the_base_colour(make_cloud, tmp_path):
-    cloud = make_cloud(materials=True, radiance=None, radiance_color_space=None)
+@pytest.mark.parametrize("without", [{}, {"ambient_occlusion": None}])
+def test_without_radiance_a_standard_file_shows_the_base_colour(make_cloud, tmp_path, without):
+    cloud = make_cloud(materials=True, radiance=None, radiance_color_space=None, **without)
     write(cloud, tmp_path / "a.ply")
     sequence = converters.read(tmp_path / "a.ply")
     shown = sh_color(sequence[0].radiance, [0.0, 0.0, 1.0])
-    light = (cloud.base_color * cloud.ambient_occlusion[:, None]).astype(np.float64)
+    light = (cloud.base_color * (1.0 if without else cloud.ambient_occlusion[:, None])).astype(np.float64)
     # IEC 61966-2-1; the standard's own two branches meet only to 1e-7, and colour is rounded twice.
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     assert np.abs(shown - encoded).max() <= 4 * EPSILON + 1e-7
@@ -265,6 +268,16 @@ def test_linear_radiance_is_encoded_in_a_standard_file(make_cloud, tmp_path):
     bright = light > 0.2
     assert bright.any()
     assert np.abs(sh_color(back.radiance, direction) - encoded)[bright].max() <= 0.5 * 0.4 / 0.2**1.6 * 3e-3**2
+
+
+def test_bands_of_linear_radiance_follow_the_slope_of_the_encoding(make_cloud, tmp_path):
+    radiance = np.ones((5, 4, 3), np.float32)
+    radiance[:, 0] = (np.float64([-0.1, 0.002, 0.0031, 0.0032, 0.2])[:, None] - 0.5) / SH_C0
+    write(make_cloud(5, radiance=radiance, radiance_color_space=LINEAR_REC709), tmp_path / "a.ply")
+    mean = 0.5 + SH_C0 * radiance[:, :1].astype(np.float64)
+    slope = np.where(mean <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(mean, 0.0031308) ** (1 / 2.4 - 1.0))
+    bands = converters.read(tmp_path / "a.ply")[0].radiance[:, 1:]
+    assert np.allclose(bands, np.broadcast_to(slope, bands.shape), rtol=2 * EPSILON, atol=0.0)
 
 
 @pytest.mark.parametrize(("antialiased", "frames"), [("true", 1), ("false", 2)])

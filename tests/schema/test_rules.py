@@ -215,6 +215,11 @@ def test_capture_frames_must_not_be_negative(asset):
     assert asset.rules() == []
 
 
+def test_a_rate_of_zero_is_none(asset):
+    asset.stage.SetTimeCodesPerSecond(0.0)
+    assert asset.rules() == ["BEAM-STAGE-005", "BEAM-SEQ-002"]  # nor is it that of the sequence
+
+
 def test_another_color_space_is_named(asset):
     asset.splats.GetAttribute("beam:baseColorh").SetColorSpace("srgb_rec709_scene")
     (finding,) = check_rules(asset.stage).findings
