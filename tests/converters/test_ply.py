@@ -217,12 +217,14 @@ def test_no_gaussians(columns, ply_file, tmp_path):
 def test_axes_and_units_of_the_file_and_of_the_caller(make_cloud, tmp_path):
     cloud = make_cloud(axes="rub")
     write(cloud, tmp_path / "unreal.ply", target="unreal")
-    back = converters.read(tmp_path / "unreal.ply")[0]  # the header says fru and 0.01 m
-    assert back.axes == "fru"
+    sequence = converters.read(tmp_path / "unreal.ply")  # the header says fru and 0.01 m
+    back = sequence[0]
+    assert (back.axes, sequence.metadata["source_units"]) == ("fru", "0.01 m")
     expected = cloud.positions @ axes_matrix("rub", "fru").T
     assert np.allclose(back.positions, expected, rtol=3 * EPSILON, atol=0)
-    raw = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)[0]
-    assert raw.axes == "rdf"
+    sequence = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)
+    raw = sequence[0]
+    assert (raw.axes, sequence.metadata["source_units"]) == ("rdf", "m")
     assert np.allclose(raw.positions, 100.0 * expected, rtol=3 * EPSILON, atol=0)
     assert np.allclose(raw.scales, 100.0 * cloud.scales, rtol=12 * EPSILON, atol=0)
 

@@ -78,6 +78,7 @@ HEADER_LINES = [
     (b"element vertex 3\n", b"", "in that order, got 'property float x'"),
     (b"element vertex 3\n", b"element vertex\n", "in that order, got 'element vertex'"),
     (b"property float x\n", b"property float32x x\n", "a property must be a type word and a name, got"),
+    (b"property float x\n", b"property list uchar vec3 x\n", "a property must be a type word and a name, got"),
     (b"property float x\n", b"garbage\n", "in that order, got 'garbage'"),
     (b"property float x\n", b"property float y\n", "each property of vertex must be named once, got y"),
     (b"property float x\n", b"property list uchar float x\n", "x must be float or double, got list"),

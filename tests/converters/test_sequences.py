@@ -152,6 +152,9 @@ def test_inspection_of_our_own_sequence(make_cloud, tmp_path):
     assert found.format == "PLY, one file per frame, binary, one property per value"
     assert "\nframes      2 at 30 per second\nGaussians   50 in the first frame\n" in found.as_text()
     assert found.notes == ()
+    assert found.scales is not None
+    seen = converters.read(tmp_path)[0].scales
+    assert (found.scales.least, found.scales.median, found.scales.greatest) == (seen.min(), np.median(seen), seen.max())
 
 
 def test_inspection_names_what_is_odd(columns, ply_bytes, tmp_path):
