@@ -201,6 +201,11 @@ def test_malformed_text(tmp_path, rows, message):
     assert message in str(caught.value)
 
 
+def test_an_element_that_is_not_there(columns, ply_file):
+    with pytest.raises(AssetFormatError, match=r"a\.ply: the file must have an element face, got vertex\. Check"):
+        read_table(read_header(ply_file(columns)), "face")
+
+
 def test_rows_without_columns_cost_no_time(tmp_path):
     for kind in ("ascii", "binary_little_endian"):
         text = f"ply\nformat {kind} 1.0\nelement junk 2147483647\nelement vertex 1\nproperty float x\nend_header\n0000"
