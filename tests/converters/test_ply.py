@@ -15,6 +15,7 @@ from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, 
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.axes import axes_matrix
 from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 
 EPSILON = np.finfo(np.float32).eps
 
@@ -99,11 +100,19 @@ def test_the_file_obeys_the_rules_of_importers(make_cloud, tmp_path):
         assert ("comment beam_base_color_space lin_rec709_scene" in lines) == (name == "beam")
 
 
+def test_full_and_no_opacity_stay_finite_in_a_file(make_cloud, tmp_path):
+    write(make_cloud(3, opacities=[0.0, 0.5, 1.0]), tmp_path / "a.ply")
+    stored = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]["opacity"]
+    assert np.array_equal(stored, [-20.0, 0.0, 20.0])
+    assert np.allclose(converters.read(tmp_path / "a.ply")[0].opacities, [2.0611536e-9, 0.5, 1.0], rtol=EPSILON, atol=0)
+
+
 def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
     cloud = make_cloud(materials=True, radiance_color_space=LINEAR_REC709)
     write(cloud, tmp_path / "a.ply", profile="beam")
     sequence = converters.read(tmp_path / "a.ply")
     back = sequence[0]
+    assert (sequence.topology, sequence.constant) == ("constant", back.arrays().keys())
     assert not notes_of(sequence)
     exact = ("positions", "orientations", "radiance", "normals", "base_color", "roughness", "ambient_occlusion")
     for name in exact:
@@ -208,33 +217,36 @@ def test_no_gaussians(columns, ply_file, tmp_path):
 def test_axes_and_units_of_the_file_and_of_the_caller(make_cloud, tmp_path):
     cloud = make_cloud(axes="rub")
     write(cloud, tmp_path / "unreal.ply", target="unreal")
-    back = converters.read(tmp_path / "unreal.ply")[0]  # the header says fru and 0.01 m
-    assert back.axes == "fru"
+    sequence = converters.read(tmp_path / "unreal.ply")  # the header says fru and 0.01 m
+    back = sequence[0]
+    assert (back.axes, sequence.metadata["source_units"]) == ("fru", "0.01 m")
     expected = cloud.positions @ axes_matrix("rub", "fru").T
     assert np.allclose(back.positions, expected, rtol=3 * EPSILON, atol=0)
-    raw = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)[0]
-    assert raw.axes == "rdf"
+    sequence = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)
+    raw = sequence[0]
+    assert (raw.axes, sequence.metadata["source_units"]) == ("rdf", "m")
     assert np.allclose(raw.positions, 100.0 * expected, rtol=3 * EPSILON, atol=0)
     assert np.allclose(raw.scales, 100.0 * cloud.scales, rtol=12 * EPSILON, atol=0)
 
 
 def test_bands_are_padded_and_cut(make_cloud, tmp_path):
-    cloud = make_cloud(degree=2)
+    cloud = make_cloud(16, degree=2)  # as many as a third degree has coefficients
     write(cloud, tmp_path / "three.ply", sh_degree=3)
     write(cloud, tmp_path / "none.ply", sh_degree=0)
     three, none = (converters.read(tmp_path / f"{name}.ply")[0].radiance for name in ("three", "none"))
-    assert three.shape == (50, 16, 3)
+    assert three.shape == (16, 16, 3)
     assert np.array_equal(three[:, :9], cloud.radiance)
     assert not three[:, 9:].any()
     assert np.array_equal(none, cloud.radiance[:, :1])
 
 
-def test_without_radiance_a_standard_file_shows_the_base_colour(make_cloud, tmp_path):
-    cloud = make_cloud(materials=True, radiance=None, radiance_color_space=None)
+@pytest.mark.parametrize("without", [{}, {"ambient_occlusion": None}])
+def test_without_radiance_a_standard_file_shows_the_base_colour(make_cloud, tmp_path, without):
+    cloud = make_cloud(materials=True, radiance=None, radiance_color_space=None, **without)
     write(cloud, tmp_path / "a.ply")
     sequence = converters.read(tmp_path / "a.ply")
     shown = sh_color(sequence[0].radiance, [0.0, 0.0, 1.0])
-    light = (cloud.base_color * cloud.ambient_occlusion[:, None]).astype(np.float64)
+    light = (cloud.base_color * (1.0 if without else cloud.ambient_occlusion[:, None])).astype(np.float64)
     # IEC 61966-2-1; the standard's own two branches meet only to 1e-7, and colour is rounded twice.
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     assert np.abs(shown - encoded).max() <= 4 * EPSILON + 1e-7
@@ -258,6 +270,16 @@ def test_linear_radiance_is_encoded_in_a_standard_file(make_cloud, tmp_path):
     bright = light > 0.2
     assert bright.any()
     assert np.abs(sh_color(back.radiance, direction) - encoded)[bright].max() <= 0.5 * 0.4 / 0.2**1.6 * 3e-3**2
+
+
+def test_bands_of_linear_radiance_follow_the_slope_of_the_encoding(make_cloud, tmp_path):
+    radiance = np.ones((5, 4, 3), np.float32)
+    radiance[:, 0] = (np.float64([-0.1, 0.002, 0.0031, 0.0032, 0.2])[:, None] - 0.5) / SH_C0
+    write(make_cloud(5, radiance=radiance, radiance_color_space=LINEAR_REC709), tmp_path / "a.ply")
+    mean = 0.5 + SH_C0 * radiance[:, :1].astype(np.float64)
+    slope = np.where(mean <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(mean, 0.0031308) ** (1 / 2.4 - 1.0))
+    bands = converters.read(tmp_path / "a.ply")[0].radiance[:, 1:]
+    assert np.allclose(bands, np.broadcast_to(slope, bands.shape), rtol=2 * EPSILON, atol=0.0)
 
 
 @pytest.mark.parametrize(("antialiased", "frames"), [("true", 1), ("false", 2)])

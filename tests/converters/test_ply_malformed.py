@@ -52,6 +52,8 @@ def test_truncated_within_the_data(columns, ply_bytes, tmp_path):
         held = (size - start) // 56
         message = f"element vertex must have the 3 rows that the header counts, got bytes for {held}"
         refused(tmp_path, content[:size], message)
+    bytes_first = content[:start].replace(b"element vertex", b"element mask 2\nproperty uchar m\nelement vertex")
+    refused(tmp_path, bytes_first, "element mask must have the 2 rows that the header counts, got bytes for 0")
 
 
 @pytest.mark.parametrize(
@@ -76,6 +78,7 @@ HEADER_LINES = [
     (b"element vertex 3\n", b"", "in that order, got 'property float x'"),
     (b"element vertex 3\n", b"element vertex\n", "in that order, got 'element vertex'"),
     (b"property float x\n", b"property float32x x\n", "a property must be a type word and a name, got"),
+    (b"property float x\n", b"property list uchar vec3 x\n", "a property must be a type word and a name, got"),
     (b"property float x\n", b"garbage\n", "in that order, got 'garbage'"),
     (b"property float x\n", b"property float y\n", "each property of vertex must be named once, got y"),
     (b"property float x\n", b"property list uchar float x\n", "x must be float or double, got list"),
@@ -170,6 +173,7 @@ def test_files_that_look_linear(columns, ply_bytes, tmp_path):
         ("beam_base_color_space acescg", "comment beam_base_color_space must be lin_rec709_scene, got acescg"),
         ("beam_radiance_meaning shaded?", "comment beam_radiance_meaning must be captured, baseColorOnly, none"),
         ("beam_meters_per_unit nan", "beam_meters_per_unit must be a number in [1e-06, 1e+06], got 'nan'"),
+        ("beam_frame fast", "beam_frame's rate must be a number in [0.001, 1e+06], got 'fast'"),
         ("beam_frame 0 fast", "beam_frame's rate must be a number in [0.001, 1e+06], got 'fast'"),
         ("beam_schema 9.1", "beam_schema must be 1.x, got 9.1"),
     ],
@@ -197,6 +201,11 @@ def test_malformed_text(tmp_path, rows, message):
     assert message in str(caught.value)
 
 
+def test_an_element_that_is_not_there(columns, ply_file):
+    with pytest.raises(AssetFormatError, match=r"a\.ply: the file must have an element face, got vertex\. Check"):
+        read_table(read_header(ply_file(columns)), "face")
+
+
 def test_rows_without_columns_cost_no_time(tmp_path):
     for kind in ("ascii", "binary_little_endian"):
         text = f"ply\nformat {kind} 1.0\nelement junk 2147483647\nelement vertex 1\nproperty float x\nend_header\n0000"
@@ -205,8 +214,8 @@ def test_rows_without_columns_cost_no_time(tmp_path):
 
 
 def test_control_characters_do_not_reach_the_terminal(columns, ply_bytes, tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["red \x1b[31m and \x9b"]))
-    assert converters.inspect(tmp_path / "a.ply").comments == ("red ?[31m and ?",)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, comments=["red \x1b[31m and \x7f\x9b"]))
+    assert converters.inspect(tmp_path / "a.ply").comments == ("red ?[31m and ??",)
 
 
 def test_what_is_not_a_file(tmp_path):

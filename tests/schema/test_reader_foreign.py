@@ -1,5 +1,7 @@
 """Assets of other makers, written by hand here: other units, axes, places, precisions, and faults."""
 
+import re
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
@@ -207,9 +209,10 @@ def test_faults_of_files(tmp_path):
         read_asset(tmp_path / "none.usda")
     with broken(r"must end in .usd, .usda, .usdc, .usdz, got .ply\. Convert it with beam-convert"):
         read_asset(tmp_path / "a.ply")
-    (tmp_path / "a.usdc").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
-    with broken(r"a.usdc must be a .usdc file, got the first bytes b'ply\\nform'"):
-        read_asset(tmp_path / "a.usdc", trusted=True)
+    for name, content in (("a.usdc", b"ply\nformat"), ("a.usda", b"ply\nformat"), ("b.usdc", b"#usda 1.0\n")):
+        (tmp_path / name).write_bytes(content)
+        with broken(re.escape(f"{name} must be a {name[1:]} file, got the first bytes {content[:8]!r}")):
+            read_asset(tmp_path / name, trusted=True)
     with broken(r"must hold a ParticleField3DGaussianSplat, got none\. Convert the splats"):
         saved(Usd.Stage.CreateNew(str(tmp_path / "empty.usda")))
 

@@ -158,7 +158,7 @@ BREAKERS = {
     "BEAM-RASTER-001": no_low_pass,
     "BEAM-TOKEN-001": lambda asset: asset.splats.RemoveProperty("beam:brdf"),
     "BEAM-TOKEN-002": lambda asset: asset.set("beam:brdf", "lambert"),
-    "BEAM-VERSION-001": lambda asset: asset.set("beam:schemaVersion", "one"),
+    "BEAM-VERSION-001": lambda asset: asset.set("beam:schemaVersion", "1.x"),
     "BEAM-VERSION-002": lambda asset: asset.set("beam:schemaVersion", "2.0"),
     "BEAM-VERSION-003": lambda asset: asset.set("beam:schemaVersion", "1.9"),
     "BEAM-SEQ-001": lambda asset: asset.root.RemoveAppliedSchema(SEQUENCE_API),
@@ -215,6 +215,18 @@ def test_capture_frames_must_not_be_negative(asset):
     assert asset.rules() == []
 
 
+def test_a_rate_of_zero_is_none(asset):
+    asset.stage.SetTimeCodesPerSecond(0.0)
+    assert asset.rules() == ["BEAM-STAGE-005", "BEAM-SEQ-002"]  # nor is it that of the sequence
+
+
+def test_another_color_space_is_named(asset):
+    asset.splats.GetAttribute("beam:baseColorh").SetColorSpace("srgb_rec709_scene")
+    (finding,) = check_rules(asset.stage).findings
+    assert finding.rule == "BEAM-COLOR-001"
+    assert finding.message == "colorSpace must be lin_rec709_scene, got srgb_rec709_scene. Author it."
+
+
 def test_what_version_1_1_added_is_checked(asset):
     asset.change("beam:observability", 2, 63)  # grazing is a known flag
     assert asset.rules() == []
@@ -267,4 +279,4 @@ def test_an_asset_without_our_schema_is_only_warned_about(asset):
     drop_material(asset)
     report = check_rules(asset.stage)
     assert report.is_valid
-    assert [finding.severity for finding in report.findings] == ["warning"]
+    assert [(finding.severity, finding.time, finding.frames) for finding in report.findings] == [("warning", None, 0)]

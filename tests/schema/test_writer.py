@@ -119,6 +119,20 @@ def test_stand_in_radiance_is_encoded_base_colour_times_occlusion(cloud, written
     assert prim.GetAttribute("colorSpace:name").Get() == "srgb_rec709_display"
 
 
+@pytest.mark.parametrize(
+    ("words", "tokens"),
+    [
+        (("shortestAxis", "texture", "shaded"), ("shortestAxis", "texture", "shaded")),
+        (("guess", "guess", "guess"), ("authored", "unknown", "captured")),  # of no meaning to other programs
+    ],
+)
+def test_a_word_that_is_no_token_of_ours_is_written_as_the_fallback(sequence, written, words, tokens):
+    stated = dict(zip(("normal_source", "roughness_source", "radiance_meaning"), words, strict=True))
+    prim = written(sequence(1, metadata=stated))
+    attributes = ("beam:normalSource", "beam:roughnessSource", "beam:radianceMeaning")
+    assert tuple(prim.GetAttribute(name).Get() for name in attributes) == tokens
+
+
 def test_harmonics_are_contiguous_triplets_padded_to_one_degree(cloud, written):
     low, high = cloud(0, 2, degree=0), cloud(1, 2, degree=1)
     attribute = written([low, high], full_float=True).GetAttribute("radiance:sphericalHarmonicsCoefficients")
