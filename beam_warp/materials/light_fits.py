@@ -204,7 +204,7 @@ def mean_colors(shown: LightEvidence) -> NDArray[np.float64]:
 def irradiance_over_pi(shown: LightEvidence, light: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return what a white diffuser at each point reflects of a light of ``(L, K)`` radiance, ``(M, K)``."""
     diffuse = np.maximum(shown.normals @ cell_directions().T, 0.0) * shown.openness * _cell_angles()
-    return diffuse @ light.astype(np.float32) / np.float32(np.pi)
+    return diffuse @ light.astype(np.float32) / np.float32(np.pi)  # pyright: ignore[reportReturnType]  # float32: NumPy says float64 of a division
 
 
 def turned_lights(environment: EnvironmentMap) -> NDArray[np.float64]:
