@@ -25,10 +25,8 @@ def meshing(result: Row) -> Rows:
         pairs = zip(found, keys, strict=True)
         return [title, *("" if not key else cell(entry[group][key], form) for (*_, entry), (group, key) in pairs)]
 
-    device = result["measured"]["machine"]["device"]
     return [
         ["", *(f"{scene}: {way}" for scene, way, _ in found)],
-        row(f"fusion [s], {device}", "seconds", ".2g"),
         row("triangles", "faces"),
         row("parts", "parts"),
         row("boundary edges", "boundary_edges"),
