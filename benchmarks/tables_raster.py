@@ -102,12 +102,6 @@ def largest(result: Row, scene: str, what: str) -> float:
     return max(stable, default=0.0)
 
 
-@number("raster_gradients_of_ordinary_scenes", "raster_gradients_h200.json", "raster_gradients_cpu.json")
-def ordinary_gradients(*results: Row) -> str:
-    """Return the largest error of random splats, on either device."""
-    return f"{max(largest(result, f'{count} random splats', 'error') for result in results for count in (60, 300)):.1e}"
-
-
 @number("raster_compositing_share", H200)
 def compositing_share(result: Row) -> str:
     """Return the share of compositing in a forward and a backward pass of RGB [%]."""
