@@ -1,15 +1,13 @@
-"""Files in and out: one table of formats.
-
-A format is a module with ``read(path, options)`` and ``write(sequence, path, options)``, imported when its suffix is
-met, so that PLY costs no USD; nothing here imports Warp.
-"""
+"""Files in and out, by the table of formats in `beam_warp.converters.formats`; nothing here imports Warp."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from beam_warp.converters.formats import FORMATS, format_of
+from beam_warp.converters.frame_files import write_frames
+from beam_warp.converters.frames import sequence_of
 from beam_warp.converters.numbering import numbered_files, require_no_stale_frames
 from beam_warp.converters.numbering import numbered_path as numbered_path
 from beam_warp.converters.options import Activation, MaterialActivation, ReadOptions
@@ -20,23 +18,6 @@ from beam_warp.world.gaussians import GaussianSequence
 
 if TYPE_CHECKING:
     from beam_warp.converters.inspection import Inspection
-
-
-FORMATS = {".ply": ("ply", "ply_writer"), **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("usd", "usd"))}
-"""Suffix → the modules of this package that read and write files of that format."""
-
-
-def _modules_of(path: Path) -> tuple[str, str]:
-    if path.suffix.lower() not in FORMATS:
-        raise InvalidOptionError(
-            f"file name must end in one of {', '.join(FORMATS)}, got {path.name}. Rename it or convert it elsewhere."
-        )
-    return FORMATS[path.suffix.lower()]
-
-
-def _module(name: str) -> Any:
-    """Import a format's module, now that it is needed."""
-    return import_module(f"beam_warp.converters.{name}")
 
 
 def read(
@@ -77,12 +58,14 @@ def read(
         material_activation=material_activation,
         drop_invalid=drop_invalid,
     )
-    if source.is_dir():
-        return _module("ply").read_numbered(numbered_files(source), options)
-    reader, _ = _modules_of(source)
-    if not source.is_file():
+    paths = numbered_files(source) if source.is_dir() else [source]
+    form = format_of(paths[0])
+    if not paths[0].is_file():
         raise MissingFileError(f"input must be an existing file or folder, got {source}. Check the path.")
-    return _module(reader).read(source, options)
+    form.require_meaningful(options, source)
+    if form.holds_sequences:
+        return form.of_reader("read")(source, options)
+    return sequence_of(paths, form.of_reader("decode"), form.of_reader("probe"), options)
 
 
 def require_output(path: Path) -> None:
@@ -92,10 +75,11 @@ def require_output(path: Path) -> None:
         InvalidOptionError: The suffix is none that we write.
         OutputError: The folder is missing or closed.
     """
-    _modules_of(path)
-    if path.name.lower().endswith(".compressed.ply"):
+    form = format_of(path)
+    if form.writer is None:
+        written = ", ".join(suffix for suffix, other in FORMATS.items() if other.writer)
         raise InvalidOptionError(
-            f"output must be a plain .ply, got {path.name}: the compressed form is only read. Drop .compressed."
+            f"output's name must end in one of {written}, got {path.name}: {form.name} is only read. Choose another."
         )
     require_writable(path)
 
@@ -117,10 +101,12 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
     """
     final = Path(path)
     require_output(final)
-    if final.suffix.lower() == ".ply" and len(sequence) > 1:
+    form = format_of(final)
+    if form.holds_sequences:
+        return form.of_writer("write")(sequence, final, options)
+    if len(sequence) > 1:
         require_no_stale_frames(final, len(sequence))
-    _, writer = _modules_of(final)
-    return _module(writer).write(sequence, final, options)
+    return write_frames(sequence, final, options, form.of_writer("encode"), form.axes)
 
 
 def inspect(path: str | Path) -> Inspection:
@@ -129,4 +115,6 @@ def inspect(path: str | Path) -> Inspection:
     Raises:
         MissingFileError, AssetFormatError, InvalidOptionError: As `read`.
     """
-    return _module("inspection").inspect(read(path), Path(path))
+    from beam_warp.converters import inspection
+
+    return inspection.inspect(read(path), Path(path))

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beam_warp.converters.compressed_ply import is_compressed
+from beam_warp.converters.formats import format_of
+from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.numbering import numbered_files
-from beam_warp.converters.ply_container import PlyHeader, read_header
+from beam_warp.converters.options import ReadOptions
 from beam_warp.world.axes import handedness
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud, GaussianSequence
 
@@ -110,40 +111,35 @@ def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
     Raises:
         AssetFormatError: The first frame is malformed.
     """
+    first = numbered_files(path)[0] if path.is_dir() else path
+    form = format_of(first)
+    decoded = None if form.holds_sequences else form.of_reader("decode")(first, ReadOptions())
     cloud = sequence[0]
-    ply = numbered_files(path)[0] if path.is_dir() else path if path.suffix.lower() == ".ply" else None
-    header = read_header(ply) if ply else None
-    stated = header is None or "beam_axes" in header.statements
     notes = [line for line in sequence.metadata.get("notes", "").splitlines() if not line.startswith("axes are")]
-    if header is not None and "beam_schema" not in header.statements:
+    unstated = decoded is not None and decoded.axes is None
+    if unstated:
         notes.append("one unit is taken as 1 m; pass --meters-per-unit when converting if it is another")
+    kind = f"{form.name} ({path.suffix.lower()})" if decoded is None else decoded.format
     return Inspection(
         name=path.name,
-        format=_format_of(header, path),
+        format=f"{kind}, one file per frame" if path.is_dir() else kind,
         producer=sequence.metadata.get("producer", "unknown"),
         frame_count=len(sequence),
         frames_per_second=sequence.frames_per_second,
         gaussian_count=len(cloud),
         axes=cloud.axes,
-        axes_evidence=("stated by the file",) if stated else _axes_evidence(cloud),
+        axes_evidence=_axes_evidence(cloud)
+        if decoded is not None and decoded.axes is None
+        else ("stated by the file",),
         bounds=_bounds(cloud),
         scales=_value_range(cloud.scales),
         opacities=_value_range(cloud.opacities),
         sh_degree=cloud.sh_degree,
-        color_state=_color_state(cloud, header),
+        color_state=_color_state(cloud, decoded),
         materials=tuple(name for name in MATERIAL_CHANNELS if getattr(cloud, name) is not None),
-        comments=() if header is None else header.comments,
+        comments=() if decoded is None else decoded.comments,
         notes=(*notes, *_oddities(cloud)),
     )
-
-
-def _format_of(header: PlyHeader | None, path: Path) -> str:
-    if header is None:
-        return f"USD ({path.suffix.lower()})"
-    encoding = {"ascii": "text", "binary_little_endian": "binary", "binary_big_endian": "big-endian binary"}
-    layout = "packed in chunks of 256" if is_compressed(header) else "one property per value"
-    kind = "PLY, one file per frame" if path.is_dir() else "PLY"
-    return f"{kind}, {encoding[header.encoding]}, {layout}"
 
 
 def _value_range(values: np.ndarray) -> ValueRange | None:
@@ -158,10 +154,10 @@ def _bounds(cloud: GaussianCloud) -> tuple[tuple[float, ...], tuple[float, ...]]
     return tuple(cloud.positions.min(axis=0).tolist()), tuple(cloud.positions.max(axis=0).tolist())
 
 
-def _color_state(cloud: GaussianCloud, header: PlyHeader | None) -> str:
+def _color_state(cloud: GaussianCloud, decoded: DecodedFrame | None) -> str:
     if cloud.radiance is None:
         return "none"
-    stated = header is None or "beam_radiance_color_space" in header.statements
+    stated = decoded is None or decoded.color_space_is_stated
     return f"captured radiance, {cloud.radiance_color_space}" + ("" if stated else " (the usual; not stated)")
 
 

@@ -6,17 +6,32 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
+from beam_warp.converters.formats import FORMATS, suffix_of
 from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 
 DIGITS = 6
 """Digits of the frame numbers that are written: prefix000000.ply."""
 
-_NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)(?:\.compressed)?\.ply", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)")
 
 
 def numbered_path(path: Path, frame: int) -> Path:
     """Return the name of a frame's file: ``out/walk.ply`` → ``out/walk000012.ply``."""
-    return path.with_name(f"{path.stem}{frame:0{DIGITS}d}{path.suffix}")
+    stem, suffix = _split(path.name)
+    return path.with_name(f"{stem}{frame:0{DIGITS}d}{suffix}")
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Split a file name before the suffix that tells its format."""
+    place = len(name) - len(suffix_of(name))
+    return name[:place], name[place:]
+
+
+def _frame_of(path: Path) -> re.Match[str] | None:
+    """Return prefix and number of a file that holds one frame; None if it is no such file."""
+    stem, suffix = _split(path.name)
+    holds_a_frame = bool(suffix) and not FORMATS[suffix.lower()].holds_sequences
+    return _NUMBERED.fullmatch(stem) if holds_a_frame else None
 
 
 def numbered_files(folder: Path) -> list[Path]:
@@ -27,7 +42,7 @@ def numbered_files(folder: Path) -> list[Path]:
         AssetFormatError: There is no frame, several sequences share the folder, or a number is missing or occurs twice.
     """
     try:
-        found = [(match, path) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))]
+        found = [(match, path) for path in folder.iterdir() if (match := _frame_of(path))]
     except OSError as error:
         raise MissingFileError(f"input folder must be readable, got {error.strerror} at {folder}. Check it.") from error
     if not found:
@@ -62,9 +77,8 @@ def require_no_stale_frames(path: Path, frame_count: int) -> None:
     Raises:
         OutputError: There are such frames.
     """
-    written = re.compile(
-        rf"{re.escape(path.stem)}(\d{{{DIGITS},}}){re.escape(path.suffix)}"
-    )  # a stem may end in digits
+    stem, suffix = _split(path.name)
+    written = re.compile(rf"{re.escape(stem)}(\d{{{DIGITS},}}){re.escape(suffix)}")  # a stem may end in digits
     stale = [
         other.name
         for other in path.parent.iterdir()

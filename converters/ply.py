@@ -18,6 +18,7 @@ from beam_warp.checks import require_choice, require_number, rows_at
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
+from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.options import ReadOptions
 from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types
 from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, PlyTable, malformed, read_header, read_table
@@ -29,14 +30,10 @@ from beam_warp.converters.producers import (
     material_producer,
     material_properties,
 )
-from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, SchemaVersionError
+from beam_warp.errors import AssetFormatError, BeamError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-from beam_warp.world.metadata import LOW_PASS_RANGE, raster_metadata
-
-DEFAULT_AXES = "rdf"
-"""Axes of a PLY that does not state any: those of COLMAP, in which 3DGS is trained."""
+from beam_warp.world.metadata import LOW_PASS_RANGE
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -47,81 +44,44 @@ _UNIT_ROUNDING = 1e-6
 """Largest difference of a length from 1 that is float32 rounding; such vectors are kept bit for bit."""
 
 
-@dataclass(frozen=True)
-class PlyFrame:
-    """One file as read: the Gaussians, the rate and provenance that it states, and notes for the user."""
-
-    cloud: GaussianCloud
-    frames_per_second: float
-    provenance: dict[str, str]
-    notes: tuple[str, ...]
+def probe(path: Path) -> PlyHeader:
+    """Read the header and check that the file is as long as it says."""
+    return read_header(path)
 
 
-def read(path: Path, options: ReadOptions) -> GaussianSequence:
-    """Read one file as a sequence of one frame."""
-    return read_numbered([path], options)
-
-
-def read_numbered(paths: Sequence[Path], options: ReadOptions) -> GaussianSequence:
-    """Make a sequence of files, each of which is read when its frame is asked for.
-
-    All headers are checked at once, so that a truncated file is found before any work is done.
-
-    Raises:
-        AssetFormatError, MissingFileError: A header or the first frame is refused.
-    """
-    headers = [read_header(path) for path in paths]
-    first = read_frame(headers[0], options)
-    return GaussianSequence(
-        frame_count=len(paths),
-        read_frame=lambda frame: first.cloud if frame == 0 else read_frame(read_header(paths[frame]), options).cloud,
-        frames_per_second=first.frames_per_second,
-        constant=frozenset(first.cloud.arrays()) if len(paths) == 1 else frozenset(),
-        topology="constant" if len(paths) == 1 else "perFrame",  # rows of separate files have no identity
-        metadata={
-            "source": paths[0].name,
-            "producer": guess_producer(headers[0]),
-            **first.provenance,
-            **({"notes": "\n".join(first.notes)} if first.notes else {}),
-        },
-    )
-
-
-def read_frame(header: PlyHeader, options: ReadOptions) -> PlyFrame:
-    """Read the Gaussians of a file whose header has been read.
+def decode(path: Path, options: ReadOptions) -> DecodedFrame:
+    """Read the Gaussians of a file.
 
     Raises:
         AssetFormatError: It holds no Gaussians, or values outside their contract; the message names file and row.
     """
+    header = read_header(path)
     statements = _Statements.of(header)
     notes: list[str] = []
-    units = statements.meters_per_unit if options.meters_per_unit is None else options.meters_per_unit
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is infinite or NaN, which a cloud refuses
         if compressed_ply.is_compressed(header):
             fields = compressed_ply.decode(header)
         else:
             fields = _decode(header, options, statements, notes)
-        if units != 1.0:
-            for name in ("positions", "scales"):
-                fields[name] = fields[name] * units
-    axes = options.source_axes or statements.axes
-    if axes is None:
-        axes = DEFAULT_AXES
-        notes.append(f"axes are not stated: taken as {axes} (3DGS training); pass --source-axes if they are others")
-    try:
-        cloud = GaussianCloud(**fields, axes=axes)
-    except InvalidArrayError as error:
-        raise AssetFormatError(f"{header.path.name}: {error}") from error
-    if not len(cloud):
-        notes.append("holds no Gaussians")
-    provenance = {
-        "source_axes": axes,
-        "source_units": "m" if units == 1.0 else f"{units:g} m",
-        **({} if statements.raster is None else raster_metadata(*statements.raster)),
-    }
-    if cloud.radiance is not None:
-        provenance["radiance_meaning"] = statements.radiance_meaning or CAPTURED
-    return PlyFrame(cloud, statements.frames_per_second, provenance, tuple(notes))
+    return DecodedFrame(
+        fields=fields,
+        format=_format(header),
+        producer=guess_producer(header),
+        axes=statements.axes,
+        meters_per_unit=statements.meters_per_unit,
+        frames_per_second=statements.frames_per_second,
+        color_space_is_stated="beam_radiance_color_space" in header.statements,
+        radiance_meaning=statements.radiance_meaning,
+        raster=statements.raster,
+        comments=header.comments,
+        notes=tuple(notes),
+    )
+
+
+def _format(header: PlyHeader) -> str:
+    encoding = {"ascii": "text", "binary_little_endian": "binary", "binary_big_endian": "big-endian binary"}
+    layout = "packed in chunks of 256" if compressed_ply.is_compressed(header) else "one property per value"
+    return f"PLY, {encoding[header.encoding]}, {layout}"
 
 
 @dataclass(frozen=True)
@@ -156,7 +116,7 @@ class _Statements:
                 raise malformed(header.path, f"comment {key} must be {choices}", said[key], "Correct that line.")
         try:
             units = require_number("beam_meters_per_unit", said.get("beam_meters_per_unit", 1.0), 1e-6, 1e6)  # type: ignore[arg-type]
-            rate = said.get("beam_frame", "0 30").split()[-1]
+            rate = said.get("beam_frame", "0 30").rpartition(" ")[2]
             frames_per_second = require_number("beam_frame's rate", rate, 1e-3, 1e6)  # type: ignore[arg-type]
             raster = _raster(said["beam_raster"]) if "beam_raster" in said else None
         except BeamError as error:

@@ -8,7 +8,6 @@ finite values; LF line ends; less than 2 GB per file.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,13 @@ from numpy.typing import NDArray
 from beam_warp._version import __version__
 from beam_warp.converters.activations import log_scale, logit
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, display_radiance, resize_bands
-from beam_warp.converters.numbering import numbered_path
+from beam_warp.converters.frame_files import FrameToWrite
 from beam_warp.converters.options import WriteOptions
 from beam_warp.converters.ply_container import RASTER_WORDS
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
-from beam_warp.image.files import replacing
 from beam_warp.schema import SCHEMA_VERSION
-from beam_warp.world.axes import TARGETS, change_axes
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-from beam_warp.world.metadata import stated_raster
+from beam_warp.world.gaussians import GaussianCloud
 
 MAX_FILE_BYTES = 2**31 - 1
 """Largest file [byte]: importers index with signed 32-bit integers."""
@@ -42,32 +38,20 @@ _MEANINGS = {
 }
 
 
-def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list[Path]:
-    """Write one file, or one for each frame numbered from the given name.
+def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
+    """Write one frame.
 
     Raises:
-        InvalidOptionError: The beam profile is requested without materials, or the metadata that state how the
-            Gaussians are to be drawn break the contract of `beam_warp.world.metadata`.
-        OutputError: A file would be too large or cannot be written; nothing of the call is left behind.
+        InvalidOptionError: The beam profile is requested without materials.
+        OutputError: The file would be too large.
     """
-    count = len(sequence)
-    paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
-    raster = stated_raster(sequence.metadata)
-    with ExitStack() as outputs:
-        for frame, final in enumerate(paths):
-            cloud = sequence[frame]
-            comments = [f"beam_frame {frame} {sequence.frames_per_second:g}"]
-            if options.target is not None:
-                axes, units_per_meter = TARGETS[options.target]
-                cloud = change_axes(cloud, axes, scale=units_per_meter)
-                comments.append(f"beam_meters_per_unit {1.0 / units_per_meter:g}")
-            if raster is not None:
-                comments.append(f"beam_raster {RASTER_WORDS[raster[0]]} {np.float32(raster[1])!s}")
-            _write_cloud(cloud, outputs.enter_context(replacing(final)), options, comments)
-    return paths
-
-
-def _write_cloud(cloud: GaussianCloud, path: Path, options: WriteOptions, frame_comments: list[str]) -> None:
+    cloud = frame.cloud
+    frame_comments = [f"beam_frame {frame.number} {frame.frames_per_second:g}"]
+    if options.target is not None:
+        frame_comments.append(f"beam_meters_per_unit {1.0 / frame.units_per_meter:g}")
+    if frame.raster is not None:
+        antialiased, low_pass = frame.raster
+        frame_comments.append(f"beam_raster {RASTER_WORDS[antialiased]} {np.float32(low_pass)!s}")
     extras = [name for name in _MATERIALS if getattr(cloud, name) is not None] if options.profile == "beam" else []
     if options.profile == "beam" and not extras:
         raise InvalidOptionError(

@@ -15,16 +15,8 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 def read(path: Path, options: ReadOptions) -> GaussianSequence:
-    """Read an asset; a stage states its own axes, units and activations.
-
-    Raises:
-        InvalidOptionError: An option is given, although the stage states its value itself.
-    """
-    given = [field.name for field in dataclasses.fields(options) if getattr(options, field.name)]
-    if given:
-        raise InvalidOptionError(
-            f"{', '.join(given)} must be left out for USD, which states it, got {path.name}. Drop the option."
-        )
+    """Read an asset; a stage states its own axes, units and activations."""
+    del options  # none means anything here
     return read_asset(path)
 
 

@@ -95,9 +95,9 @@ def test_the_input_is_never_written_over(person, capsys):
     [
         ("gone.ply out/a.ply", "error: input must be an existing file or folder, got "),
         ("person.ply nowhere/a.ply", "error: output folder must exist, got "),
-        ("person.ply out/a.obj", "error: file name must end in one of .ply, .usd, "),
-        ("person.ply out/a.compressed.ply", "error: output must be a plain .ply, got a.compressed.ply"),
-        ("person.ply out", "error: file name must end in one of .ply, .usd, "),
+        ("person.ply out/a.obj", "error: file name must end in one of .ply, "),
+        ("person.ply out/a.compressed.ply", "error: output's name must end in one of"),
+        ("person.ply out", "error: file name must end in one of .ply, "),
         ("out out/a.ply", "error: folder out must hold numbered files"),
         ("person.ply out/a.ply --sh-degree 4", "error: sh_degree must be "),
         ("person.ply out/a.ply --source-axes xyz", "error: source_axes must be "),

@@ -173,6 +173,7 @@ def test_files_that_look_linear(columns, ply_bytes, tmp_path):
         ("beam_base_color_space acescg", "comment beam_base_color_space must be lin_rec709_scene, got acescg"),
         ("beam_radiance_meaning shaded?", "comment beam_radiance_meaning must be captured, baseColorOnly, none"),
         ("beam_meters_per_unit nan", "beam_meters_per_unit must be a number in [1e-06, 1e+06], got 'nan'"),
+        ("beam_frame", "beam_frame's rate must be a number in [0.001, 1e+06], got ''"),
         ("beam_frame fast", "beam_frame's rate must be a number in [0.001, 1e+06], got 'fast'"),
         ("beam_frame 0 fast", "beam_frame's rate must be a number in [0.001, 1e+06], got 'fast'"),
         ("beam_schema 9.1", "beam_schema must be 1.x, got 9.1"),

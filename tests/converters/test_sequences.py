@@ -100,7 +100,7 @@ def test_output_folders(walk, tmp_path):
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(OutputError, match="output must be a file, got the folder"):
         converters.write(walk, tmp_path / "folder.ply")
-    with pytest.raises(InvalidOptionError, match=r"output must be a plain \.ply, got a\.compressed\.ply"):
+    with pytest.raises(InvalidOptionError, match=r"must end in one of .*, got a\.compressed\.ply: compressed PLY is only read"):
         converters.write(walk, tmp_path / "a.compressed.ply")
 
 
@@ -149,7 +149,7 @@ def test_inspection_of_our_own_sequence(make_cloud, tmp_path):
     assert found.axes_evidence == ("stated by the file",)
     assert found.materials == ("base_color", "roughness", "ambient_occlusion", "normals")
     assert found.color_state == "captured radiance, srgb_rec709_display"
-    assert found.format == "PLY, one file per frame, binary, one property per value"
+    assert found.format == "PLY, binary, one property per value, one file per frame"
     assert "\nframes      2 at 30 per second\nGaussians   50 in the first frame\n" in found.as_text()
     assert found.notes == ()
     assert found.scales is not None

@@ -1,0 +1,98 @@
+"""The table of formats: which suffix is read and written by which module.
+
+A module that reads has ``decode(path, options)`` and ``probe(path)`` (see `beam_warp.converters.frames`), or, if its
+files hold sequences, ``read(path, options)``. A module that writes has ``encode(frame, path, options)`` (see
+`beam_warp.converters.frame_files`), or, if its files hold sequences, ``write(sequence, path, options)``. Modules are
+imported when their suffix is met, so that PLY costs no USD.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from beam_warp.converters.options import ReadOptions
+from beam_warp.errors import InvalidOptionError
+
+OF_ANY_FORMAT = frozenset({"source_axes", "meters_per_unit", "drop_invalid"})
+"""Options of `beam_warp.converters.options.ReadOptions` that say something of every format."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """One format.
+
+    Attributes:
+        name: What people call it.
+        reader: Module of this package that reads it; None if it is only written.
+        writer: Module of this package that writes it; None if it is only read.
+        holds_sequences: True if one file holds all frames.
+        axes: Axes that the format fixes, for the writer; None if a file may have any.
+        read_options: Options of `ReadOptions` that mean something for it.
+    """
+
+    name: str
+    reader: str | None = None
+    writer: str | None = None
+    holds_sequences: bool = False
+    axes: str | None = None
+    read_options: frozenset[str] = OF_ANY_FORMAT
+
+    def of_reader(self, function: str) -> Callable[..., Any]:
+        """Return a function of the reading module."""
+        return getattr(import_module(f"beam_warp.converters.{self.reader}"), function)
+
+    def of_writer(self, function: str) -> Callable[..., Any]:
+        """Return a function of the writing module."""
+        return getattr(import_module(f"beam_warp.converters.{self.writer}"), function)
+
+    def require_meaningful(self, options: ReadOptions, path: Path) -> None:
+        """Refuse options that say nothing of this format.
+
+        Raises:
+            InvalidOptionError: One is given.
+        """
+        defaults = ReadOptions()
+        given = [f.name for f in dataclasses.fields(options) if getattr(options, f.name) != getattr(defaults, f.name)]
+        if without := [name for name in given if name not in self.read_options]:
+            raise InvalidOptionError(
+                f"{', '.join(without)} must be left out for {self.name}, which states it, got {path.name}. "
+                "Drop the option."
+            )
+
+
+_USD = Format(name="USD", reader="usd", writer="usd", holds_sequences=True, axes="rub", read_options=frozenset())
+
+FORMATS: dict[str, Format] = {
+    ".ply": Format(
+        name="PLY",
+        reader="ply",
+        writer="ply_writer",
+        read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
+    ),
+    ".compressed.ply": Format(name="compressed PLY", reader="ply"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
+}
+"""Suffix → format. Of two suffixes that fit a name, the longer one counts."""
+
+
+def suffix_of(name: str) -> str:
+    """Return the suffix of `FORMATS` in which a file's name ends, or an empty string."""
+    return max((suffix for suffix in FORMATS if name.lower().endswith(suffix)), key=len, default="")
+
+
+def format_of(path: Path) -> Format:
+    """Return the format that a file's name tells.
+
+    Raises:
+        InvalidOptionError: No format has such names.
+    """
+    if suffix := suffix_of(path.name):
+        return FORMATS[suffix]
+    raise InvalidOptionError(
+        f"file name must end in one of {', '.join(FORMATS)}, got {path.name}. Rename it or convert it elsewhere."
+    )

@@ -1,0 +1,70 @@
+"""Writing of sequences in formats that keep one frame a file: axes, units, numbers, and files that appear together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from beam_warp.converters.numbering import numbered_path
+from beam_warp.converters.options import WriteOptions
+from beam_warp.image.files import replacing
+from beam_warp.world.axes import TARGETS, change_axes
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.metadata import stated_raster
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameToWrite:
+    """One frame as a file is to hold it.
+
+    Attributes:
+        cloud: Gaussians in the axes and the units of the file.
+        number: Number of the frame, from 0.
+        frames_per_second: Playback rate.
+        units_per_meter: Units of the file in a metre.
+        raster: How splats are to be drawn: antialiased or not, and the low-pass [px²]; None if that is not stated.
+    """
+
+    cloud: GaussianCloud
+    number: int
+    frames_per_second: float
+    units_per_meter: float
+    raster: tuple[bool, float] | None
+
+
+Encode = Callable[[FrameToWrite, Path, WriteOptions], None]
+"""Writes one frame to a file, whose place is temporary."""
+
+
+def write_frames(
+    sequence: GaussianSequence, path: Path, options: WriteOptions, encode: Encode, fixed_axes: str | None
+) -> list[Path]:
+    """Write one file, or one for each frame numbered from the given name.
+
+    Raises:
+        InvalidOptionError: The metadata that state how the Gaussians are to be drawn break the contract of
+            `beam_warp.world.metadata`, or what ``encode`` refuses.
+        OutputError: A file cannot be written; nothing of the call is left behind.
+    """
+    count = len(sequence)
+    paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
+    raster = stated_raster(sequence.metadata)
+    with ExitStack() as outputs:
+        for number, final in enumerate(paths):
+            cloud, units_per_meter = sequence[number], 1.0
+            if fixed_axes is not None:
+                cloud = change_axes(cloud, fixed_axes)
+            elif options.target is not None:
+                axes, units_per_meter = TARGETS[options.target]
+                cloud = change_axes(cloud, axes, scale=units_per_meter)
+            frame = FrameToWrite(
+                cloud=cloud,
+                number=number,
+                frames_per_second=sequence.frames_per_second,
+                units_per_meter=units_per_meter,
+                raster=raster,
+            )
+            encode(frame, outputs.enter_context(replacing(final)), options)
+    return paths
