@@ -1,0 +1,57 @@
+"""Scenes of schema/samples as shots: the asset, the camera, the size and the lights that a scene.usda states."""
+
+from pathlib import Path
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdLux, UsdRender
+
+from beam_warp.schema import register
+from beam_warp.schema.cameras import read_usd_camera
+from beam_warp.schema.reader import read_asset
+from beam_warp.schema.stage_queries import stage_axes
+from beam_warp.world.axes import axes_matrix, change_axes
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import WORLD_AXES
+from beam_warp.world.lights import DirectionalLight
+from beam_warp.world.shot import Shot
+
+SAMPLES = Path(__file__).parents[2] / "schema" / "samples"
+
+NAMES = ("furnace", "roughness", "still_life", "tripod", "rolling")
+
+GOLDEN_SAMPLES = 512
+"""Paths of a pixel of a golden image."""
+
+
+def scene_path(name):
+    return SAMPLES / name / "scene.usda"
+
+
+def shot_of(name, frame=0):
+    """What a scene shows in one frame, in the world's axes."""
+    register()
+    path = scene_path(name)
+    stage = Usd.Stage.Open(str(path))
+    cloud = change_axes(read_asset(path, trusted=True)[frame], WORLD_AXES)
+    width, height = UsdRender.Settings(stage.GetPrimAtPath("/Render/Settings")).GetResolutionAttr().Get()
+    lights = [_distant(prim) for prim in stage.Traverse() if prim.IsA(UsdLux.DistantLight)]
+    (dome,) = (_power(UsdLux.DomeLight(prim)) for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight))
+    camera = read_usd_camera(path, trusted=True).camera_at(0.0, width, height)
+    return Shot(cloud=cloud, camera=camera, environment=EnvironmentMap.constant(dome), lights=tuple(lights))
+
+
+def _power(light):
+    return np.array(light.GetColorAttr().Get()) * light.GetIntensityAttr().Get()
+
+
+def _distant(prim):
+    """A normalised distant light: its intensity is the irradiance on a plane that faces it."""
+    light = UsdLux.DistantLight(prim)
+    assert light.GetNormalizeAttr().Get()
+    to_world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
+    axes = axes_matrix(stage_axes(prim.GetStage(), SAMPLES), WORLD_AXES)
+    return DirectionalLight(
+        direction=tuple(axes @ -to_world[2, :3]),
+        irradiance=tuple(_power(light)),
+        angular_diameter=light.GetAngleAttr().Get(),
+    )
