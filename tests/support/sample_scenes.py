@@ -23,15 +23,17 @@ GOLDEN_SAMPLES = 512
 """Paths of a pixel of a golden image."""
 
 
-def scene_path(name):
-    return SAMPLES / name / "scene.usda"
-
-
-def shot_of(name, frame=0):
-    """What a scene shows in one frame, in the world's axes."""
+def opened(name, file="scene.usda"):
+    """A file of a sample as a stage of a USD that knows our schema."""
     register()
-    path = scene_path(name)
-    stage = Usd.Stage.Open(str(path))
+    return Usd.Stage.Open(str(SAMPLES / name / file))
+
+
+def shot_of(name):
+    """What the golden image of a scene shows, in the world's axes."""
+    path = SAMPLES / name / "scene.usda"
+    stage = opened(name)
+    frame = stage.GetPrimAtPath("/World").GetCustomDataByKey("beam:shownFrame")
     cloud = change_axes(read_asset(path, trusted=True)[frame], WORLD_AXES)
     width, height = UsdRender.Settings(stage.GetPrimAtPath("/Render/Settings")).GetResolutionAttr().Get()
     lights = [_distant(prim) for prim in stage.Traverse() if prim.IsA(UsdLux.DistantLight)]

@@ -153,9 +153,10 @@ def rolling() -> Sample:
         moved = [
             TiledSurface(half.points @ rotation.T + shift, half.normals @ rotation.T, half.spacing) for half in halves
         ]
-        frames.append(
-            surface((floor, (0.5, 0.5, 0.45), 0.7), (moved[0], (0.7, 0.1, 0.1), 0.5), (moved[1], (0.8, 0.75, 0.6), 0.5))
+        cloud = surface(
+            (floor, (0.5, 0.5, 0.45), 0.7), (moved[0], (0.7, 0.1, 0.1), 0.5), (moved[1], (0.8, 0.75, 0.6), 0.5)
         )
+        frames.append(cloud.with_arrays(ids=np.arange(len(cloud))))
     eye, target = np.array([0.0, -1.7, 0.75]), np.array([0.0, 0.0, 0.1])
     return Sample(frames, eye, target, dome=0.4, sun=(0.5 * X + 0.5 * Y - Z, 1.0), shown=2)
 
@@ -216,7 +217,7 @@ def _place(prim: UsdGeom.Xformable, rotation: NDArray[np.float64], position: NDA
 
 def write_golden(name: str, sample: Sample) -> None:
     """Path trace what the scene on disk shows, over black."""
-    image = PathRenderer(PathOptions(samples=GOLDEN_SAMPLES)).draw(shot_of(name, sample.shown))
+    image = PathRenderer(PathOptions(samples=GOLDEN_SAMPLES)).draw(shot_of(name))
     write_png(SAMPLES / name / "golden.png", display_image(image.rgb))
 
 
