@@ -73,7 +73,9 @@ def test_a_base_colour_that_is_off_by_a_twentieth_is_noticed():
     assert excess(images, golden("still_life")) > CONFIDENCE
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [name if name == "tripod" else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
 def test_the_real_time_renderer_is_within_the_tolerance_and_mistakes_are_not(name):
     shot = shot_of(name)
     truth = golden(name)
