@@ -57,6 +57,7 @@ class WriteOptions:
         profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
         full_float: USD only. Single precision throughout instead of half where half suffices.
+        lighting_variants: USD only. Adds a variant whose radiance is the base colour, for renderers that light it.
 
     Raises:
         InvalidOptionError: A value is outside its contract.
@@ -66,6 +67,7 @@ class WriteOptions:
     profile: Profile = "standard"
     sh_degree: int | None = None
     full_float: bool = False
+    lighting_variants: bool = False
 
     def __post_init__(self) -> None:
         """Check each option."""

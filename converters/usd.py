@@ -41,4 +41,6 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     # Notes tell of the reading of another file; in this asset they would be told again of a file that is sound.
     provenance = {key: value for key, value in sequence.metadata.items() if key != "notes"}
     prepared_sequence = dataclasses.replace(sequence, read_frame=prepared, metadata=provenance)
-    return write_asset(prepared_sequence, path, full_float=options.full_float)
+    return write_asset(
+        prepared_sequence, path, full_float=options.full_float, lighting_variants=options.lighting_variants
+    )

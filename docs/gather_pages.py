@@ -30,6 +30,9 @@ SOURCES = ROOT / "build" / "docs_sources"
 ELSEWHERE = {
     "schema/SPEC.md": "spec.md",
     "schema/CHANGES.md": "spec_changes.md",
+    "schema/samples/README.md": "samples.md",
+    "schema/PROPOSAL.md": "proposal.md",
+    "schema/GLTF_EXTENSION.md": "gltf_extension.md",
     "benchmarks/README.md": "benchmarks.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",

@@ -22,13 +22,15 @@ from beam_warp.schema.layout import (
     ASSET_PATH,
     CHANNELS,
     HALF_EPSILON,
+    MATERIAL_PATH,
     SH_DEGREE,
     SPLAT_TYPE,
     SPLATS_PATH,
     UP_AXES,
     to_vt,
 )
-from beam_warp.schema.survey import Survey, display_color, stored_arrays
+from beam_warp.schema.shading import author_material
+from beam_warp.schema.survey import Survey, albedo_radiance, display_color, stored_arrays
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import stated_capture_frames, stated_raster
 from beam_warp.world.quaternions import matrix_of
@@ -59,14 +61,15 @@ class AssetContents:
     half: frozenset[str]
     segment_length: int = 0
 
-    def attribute(self, name: str) -> tuple[str, str]:
-        """Return name and USD type of the attribute that holds an array, or the extent."""
+    def attributes(self, name: str) -> tuple[str, tuple[str, ...]]:
+        """Return USD type and names of the attributes that hold an array, its primvar included, or the extent."""
         if name == "extent":
-            return "extent", "float3[]"
+            return "float3[]", ("extent",)
         channel = CHANNELS[name]
+        primvars = (channel.primvar,) if channel.primvar else ()
         if name in self.half and channel.half_type_name is not None:
-            return channel.usd_name + "h", channel.half_type_name
-        return channel.usd_name, channel.type_name
+            return channel.half_type_name, (channel.usd_name + "h", *primvars)
+        return channel.type_name, (channel.usd_name, *primvars)
 
     @property
     def varying(self) -> frozenset[str]:
@@ -135,6 +138,8 @@ def static_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
     author_stage(layer, contents)
     _author_asset_prim(layer, contents)
     _author_splats_prim(layer, contents)
+    if "base_color" in contents.survey.names:
+        author_material(layer, contents.sequence[0])
     return layer
 
 
@@ -167,7 +172,12 @@ def _author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     Varying attributes are declared without a value, so that a host that does not know our schema sees their types.
     """
     survey, metadata = contents.survey, contents.sequence.metadata
-    prim = define(layer, SPLATS_PATH, SPLAT_TYPE, MATERIAL_API, "ColorSpaceAPI")
+    bound = "base_color" in survey.names
+    schemas = (MATERIAL_API, "ColorSpaceAPI", *(["MaterialBindingAPI"] if bound else []))
+    prim = define(layer, SPLATS_PATH, SPLAT_TYPE, *schemas)
+    if bound:
+        binding = Sdf.RelationshipSpec(prim, "material:binding", custom=False)
+        binding.targetPathList.explicitItems = [MATERIAL_PATH]
     normals = "normals" in survey.names
     meaning = _choice(metadata, "radiance_meaning", RADIANCE_MEANINGS) if survey.captured else "baseColorOnly"
     for name, type_name, value in (
@@ -197,24 +207,31 @@ def _author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     arrays = contents.stored(first)
     for name in (*survey.names, "extent"):
         if name not in contents.varying:
-            usd_name, type_name = contents.attribute(name)
-            prim.attributes[usd_name].default = to_vt(type_name, arrays[name])
+            type_name, usd_names = contents.attributes(name)
+            value = to_vt(type_name, arrays[name])
+            for usd_name in usd_names:
+                prim.attributes[usd_name].default = value
 
 
 def author_declarations(prim: Sdf.PrimSpec, contents: AssetContents, names: tuple[str, ...]) -> None:
-    """Declare array attributes with their types and colour spaces, without values."""
+    """Declare array attributes and their primvars with types and colour spaces, without values."""
     for name in names:
-        usd_name, type_name = contents.attribute(name)
-        spec = Sdf.AttributeSpec(prim, usd_name, Sdf.ValueTypeNames.Find(type_name))
-        if type_name in _BASE_COLOR_SPACE:
-            spec.colorSpace = _BASE_COLOR_SPACE[type_name]
+        type_name, usd_names = contents.attributes(name)
+        for usd_name in usd_names:
+            spec = Sdf.AttributeSpec(prim, usd_name, Sdf.ValueTypeNames.Find(type_name))
+            if type_name in _BASE_COLOR_SPACE:
+                spec.colorSpace = _BASE_COLOR_SPACE[type_name]
+            if usd_name.startswith("primvars:"):
+                spec.SetInfo("interpolation", "vertex")
 
 
 def author_frame(layer: Sdf.Layer, contents: AssetContents, frame: int, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Add one frame's time samples of the arrays that vary."""
     for name in sorted(contents.varying):
-        usd_name, type_name = contents.attribute(name)
-        layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), to_vt(type_name, arrays[name]))
+        type_name, usd_names = contents.attributes(name)
+        value = to_vt(type_name, arrays[name])
+        for usd_name in usd_names:
+            layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), value)
 
 
 def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, str]], last_frame: int) -> None:
@@ -231,6 +248,50 @@ def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, st
         "times": Vt.Vec2dArray([(0.0, 0.0), (float(last_frame), float(last_frame))]),
     }
     prim.SetInfo("clips", {"default": clips})
+
+
+def albedo_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
+    """Create a layer whose radiance is the base colour alone, linear and of degree 0, for renderers that light it."""
+    layer = Sdf.Layer.CreateNew(str(path))
+    author_stage(layer, contents)
+    prim = Sdf.CreatePrimInLayer(layer, SPLATS_PATH)
+    for name, type_name, value in (
+        (SH_DEGREE, "int", 0),
+        ("colorSpace:name", "token", LINEAR_REC709),
+        ("beam:radianceMeaning", "token", "baseColorOnly"),
+        ("beam:radianceColorSpace", "token", LINEAR_REC709),
+    ):
+        _uniform(prim, name, type_name, value)
+    author_declarations(prim, contents, ("radiance",))
+    if "base_color" not in contents.varying:
+        usd_name, value = _albedo(contents, 0)
+        prim.attributes[usd_name].default = value
+    return layer
+
+
+def author_albedo(layer: Sdf.Layer, contents: AssetContents, frame: int) -> None:
+    """Add one frame's time sample of a base colour that varies, as radiance."""
+    usd_name, value = _albedo(contents, frame)
+    layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), value)
+
+
+def _albedo(contents: AssetContents, frame: int) -> tuple[str, Any]:
+    """Return a frame's base colour as radiance, in the precision of the asset's radiance, and its attribute's name."""
+    type_name, (usd_name,) = contents.attributes("radiance")
+    coefficients = albedo_radiance(contents.sequence[frame])
+    return usd_name, to_vt(type_name, coefficients.astype(np.float16 if "radiance" in contents.half else np.float32))
+
+
+def author_variants(layer: Sdf.Layer, plain: str, albedo: str) -> None:
+    """Define /Asset as a reference to the plain asset, with a variant that puts the albedo's layer over it."""
+    prim = define(layer, ASSET_PATH, "Xform")
+    prim.referenceList.prependedItems = [Sdf.Reference(plain, ASSET_PATH)]
+    prim.variantSetNameList.prependedItems = ["lighting"]
+    variants = Sdf.VariantSetSpec(prim, "lighting")
+    Sdf.VariantSpec(variants, "captured")
+    over = Sdf.VariantSpec(variants, "albedo").primSpec
+    over.referenceList.prependedItems = [Sdf.Reference(albedo, ASSET_PATH)]
+    prim.variantSelections["lighting"] = "captured"
 
 
 def define(layer: Sdf.Layer, path: str, type_name: str, *schemas: str) -> Sdf.PrimSpec:

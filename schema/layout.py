@@ -16,6 +16,7 @@ from pxr import Vt
 
 ASSET_PATH = "/Asset"
 SPLATS_PATH = "/Asset/Splats"
+MATERIAL_PATH = "/Asset/Material"
 SPLAT_TYPE = "ParticleField3DGaussianSplat"
 
 SH_DEGREE = "radiance:sphericalHarmonicsDegree"
@@ -46,6 +47,8 @@ class Channel:
         relative: True if small values must keep their relative precision. Half is then safe only if no value other
             than 0 is below `HALF_MIN_NORMAL`.
         position_like: True if the array is always written in float, since half would move centres by a millimetre.
+        primvar: Primvar that shows the array to shading networks under a common name; empty if there is none. It has
+            the same type and values: a binary layer stores equal arrays once, so it takes no space.
     """
 
     name: str
@@ -55,6 +58,7 @@ class Channel:
     columns: int = 1
     relative: bool = False
     position_like: bool = False
+    primvar: str = ""
 
     @property
     def usd_names(self) -> tuple[str, ...]:
@@ -81,11 +85,11 @@ CHANNELS: Mapping[str, Channel] = {
         Channel("scales", "scales", "float3[]", "half3[]", 3, relative=True),
         Channel("opacities", "opacities", "float[]", "half[]"),
         Channel("radiance", "radiance:sphericalHarmonicsCoefficients", "float3[]", "half3[]", 3),
-        Channel("base_color", "beam:baseColor", "color3f[]", "color3h[]", 3),
-        Channel("roughness", "beam:roughness", "float[]", "half[]"),
+        Channel("base_color", "beam:baseColor", "color3f[]", "color3h[]", 3, primvar="primvars:baseColor"),
+        Channel("roughness", "beam:roughness", "float[]", "half[]", primvar="primvars:roughness"),
         Channel("metallic", "beam:metallic", "float[]", "half[]"),
-        Channel("ambient_occlusion", "beam:ambientOcclusion", "float[]", "half[]"),
-        Channel("normals", "beam:normals", "normal3f[]", "normal3h[]", 3),
+        Channel("ambient_occlusion", "beam:ambientOcclusion", "float[]", "half[]", primvar="primvars:ambientOcclusion"),
+        Channel("normals", "beam:normals", "normal3f[]", "normal3h[]", 3, primvar="primvars:normals"),
         Channel("normal_confidence", "beam:normalConfidence", "float[]", "half[]"),
         Channel("ambient_occlusion_error", "beam:ambientOcclusionError", "float[]", "half[]"),
         Channel("base_color_error", "beam:baseColorError", "float3[]", "half3[]", 3),

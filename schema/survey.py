@@ -109,6 +109,13 @@ def display_color(cloud: GaussianCloud) -> NDArray[np.float32]:
     return np.average(color, axis=0, weights=cloud.opacities).astype(np.float32)
 
 
+def albedo_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return coefficients of degree 0, ``(N, 3)``, that show a cloud's base colour without occlusion, scene-linear."""
+    if cloud.base_color is None:
+        raise InvalidArrayError("base_color must be given, got none. Decompose the asset first.")
+    return ((cloud.base_color.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
+
+
 def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
     """Return radiance of degree 0 that shows base colour times ambient occlusion, or mid grey without base colour."""
     if cloud.base_color is None:

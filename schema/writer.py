@@ -16,10 +16,13 @@ from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.schema import register
 from beam_warp.schema.authoring import (
     AssetContents,
+    albedo_layer,
+    author_albedo,
     author_clips,
     author_declarations,
     author_frame,
     author_stage,
+    author_variants,
     define,
     static_layer,
 )
@@ -38,7 +41,12 @@ USDZ_LIMIT = 2**32
 
 
 def write_asset(
-    sequence: GaussianSequence, path: str | Path, *, full_float: bool = False, segment_length: int = 30
+    sequence: GaussianSequence,
+    path: str | Path,
+    *,
+    full_float: bool = False,
+    lighting_variants: bool = False,
+    segment_length: int = 30,
 ) -> list[Path]:
     """Write a relightable 4D Gaussian asset.
 
@@ -55,6 +63,9 @@ def write_asset(
         path: ``x.usda``: a small text layer with binary layers beside it (value clips above 60 frames).
             ``x.usdc``: one binary file. ``x.usdz``: one package, below 4 GiB.
         full_float: Write every array in float.
+        lighting_variants: Add the variant set ``lighting`` to ``/Asset``. Its variant ``captured``, the one that is
+            selected, is the asset as it is without the set. In the variant ``albedo``, the radiance is the base colour,
+            for renderers that light Gaussians and take their radiance for albedo. Not for ``.usdc``.
         segment_length: Frames in one value clip, and held in memory at once.
 
     Returns:
@@ -63,10 +74,14 @@ def write_asset(
     Raises:
         InvalidOptionError: Axes, file name or options break their contract, or the metadata that of
             `beam_warp.world.metadata`.
-        InvalidArrayError: The frames do not hold the same arrays.
+        InvalidArrayError: The frames do not hold the same arrays, or there is no base colour for an albedo.
         OutputError: The files cannot be written, or a package would reach 4 GiB. Nothing is left behind.
     """
     target = _require_target(path)
+    if lighting_variants and target.suffix == ".usdc":
+        raise InvalidOptionError(
+            f"path must end in .usda or .usdz for lighting variants, got {target.name!r}. Choose another suffix."
+        )
     require_count("segment_length", segment_length)
     register()
     survey = survey_sequence(sequence)
@@ -76,12 +91,15 @@ def write_asset(
     if target.suffix == ".usdz":
         _require_below_limit(target, contents.byte_count)
     with staged_folder(target) as folder:
+        root = f"{target.stem}.plain.usda" if lighting_variants else f"{target.stem}.usda"
         if clipped:
-            names = _write_clips(contents, folder, target.stem)
-        elif target.suffix == ".usda":
-            names = _write_text_and_data(contents, folder, target.stem, segment_length)
+            names = _write_clips(contents, folder, target.stem, root)
+        elif target.suffix == ".usda" or lighting_variants:
+            names = _write_text_and_data(contents, folder, target.stem, root, segment_length)
         else:
             names = _write_single(contents, folder, f"{target.stem}.usdc", segment_length)
+        if lighting_variants:
+            names += _write_variants(contents, folder, target.stem, root, segment_length)
         if target.suffix == ".usdz":
             names = [_pack(folder, names, target)]
         return publish(folder, names, target.parent)
@@ -99,14 +117,14 @@ def _write_single(contents: AssetContents, folder: Path, name: str, save_every: 
     return [name]
 
 
-def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, save_every: int) -> list[str]:
+def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, root: str, save_every: int) -> list[str]:
     """Write a text root layer and one binary layer with all frames."""
     data = f"{stem}.static.usdc" if not contents.varying else f"{stem}.frames.usdc"
     names = _write_single(contents, folder, data, save_every)
-    return [*names, _write_root(contents, folder, stem, data, [])]
+    return [*names, _write_root(contents, folder, stem, root, data, [])]
 
 
-def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
+def _write_clips(contents: AssetContents, folder: Path, stem: str, root: str) -> list[str]:
     """Write a text root layer, a binary layer of constant arrays, a manifest, and a binary layer for each segment."""
     _save(static_layer(contents, folder / f"{stem}.static.usdc"))
     _save(_clip_layer(contents, folder / f"{stem}.manifest.usda"))
@@ -121,8 +139,24 @@ def _write_clips(contents: AssetContents, folder: Path, stem: str) -> list[str]:
         del layer  # frees the segment: a layer lives as long as somebody holds it
         segments.append((start, name))
     data = [name for _, name in segments]
-    root = _write_root(contents, folder, stem, f"{stem}.static.usdc", segments)
+    _write_root(contents, folder, stem, root, f"{stem}.static.usdc", segments)
     return [f"{stem}.static.usdc", f"{stem}.manifest.usda", *data, root]
+
+
+def _write_variants(contents: AssetContents, folder: Path, stem: str, plain: str, save_every: int) -> list[str]:
+    """Write a binary layer of the albedo, and a text root layer that puts it over the plain asset in a variant."""
+    names = [f"{stem}.albedo.usdc", f"{stem}.usda"]
+    layer = albedo_layer(contents, folder / names[0])
+    for frame in range(len(contents.sequence) if "base_color" in contents.varying else 0):
+        author_albedo(layer, contents, frame)
+        if (frame + 1) % save_every == 0:
+            _save(layer)
+    _save(layer)
+    root = Sdf.Layer.CreateNew(str(folder / names[1]))
+    author_stage(root, contents)
+    author_variants(root, f"./{plain}", f"./{names[0]}")
+    _save(root)
+    return names
 
 
 def _clip_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
@@ -133,9 +167,10 @@ def _clip_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
     return layer
 
 
-def _write_root(contents: AssetContents, folder: Path, stem: str, data: str, segments: list[tuple[int, str]]) -> str:
+def _write_root(
+    contents: AssetContents, folder: Path, stem: str, name: str, data: str, segments: list[tuple[int, str]]
+) -> str:
     """Write the text layer to open: stage metadata, a reference to the data, and clips if there are any."""
-    name = f"{stem}.usda"
     layer = Sdf.Layer.CreateNew(str(folder / name))
     author_stage(layer, contents)
     prim = define(layer, ASSET_PATH, "Xform")

@@ -52,6 +52,9 @@ class ConvertCommand:
     ] = None
     drop_invalid: Annotated[bool, arg(help="Drop rows with NaN or zero quaternions instead of refusing them.")] = False
     full_float: Annotated[bool, arg(help="USD: single precision throughout.")] = False
+    lighting_variants: Annotated[
+        bool, arg(help="USD: add a variant whose radiance is the base colour, for renderers that light it.")
+    ] = False
     quiet: Quiet = False
     json: Json = False
 
@@ -82,7 +85,11 @@ def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
     options = converters.WriteOptions(
-        target=command.target, profile=command.profile, sh_degree=command.sh_degree, full_float=command.full_float
+        target=command.target,
+        profile=command.profile,
+        sh_degree=command.sh_degree,
+        full_float=command.full_float,
+        lighting_variants=command.lighting_variants,
     )
     converters.require_output(command.output)
     sequence = converters.read(

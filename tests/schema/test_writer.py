@@ -71,7 +71,11 @@ def test_one_precision_and_constants_once(sequence, written):
         "opacitiesh": 0,
         "orientationsh": 3,
         "positions": 3,
+        "primvars:ambientOcclusion": 3,
+        "primvars:baseColor": 0,
         "primvars:displayColor": 0,
+        "primvars:normals": 0,
+        "primvars:roughness": 0,
         "radiance:sphericalHarmonicsCoefficientsh": 0,
         "scalesh": 0,
     }
