@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from beam_warp.blocks import for_each_block
 from beam_warp.converters.activations import dc_from_color, exp_scale
 from beam_warp.converters.ply_checks import require_types, settle_log_scales
-from beam_warp.converters.ply_container import Element, PlyHeader, malformed, read_columns
+from beam_warp.converters.ply_container import Element, PlyHeader, malformed, open_columns, read_columns
 from beam_warp.image.color import DISPLAY_SRGB
 
 CHUNK_ROWS = 256
@@ -29,12 +29,11 @@ _COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 PLACES = np.array([[0 if i == largest else 1 + i - (i > largest) for i in (1, 2, 3, 0)] for largest in range(4)])
-"""For each place of the largest component in w, x, y, z: where x, y, z, w are in (largest, the other three in order)."""
+"""Where x, y, z, w are among the largest component and the other three in order, by its place in w, x, y, z."""
 
-_BAND_VALUES = ((np.arange(256) + 0.5) / 256.0 - 0.5) * 8.0
-_BAND_VALUES[[0, 255]] = -4.0, 4.0
-_BAND_VALUES = _BAND_VALUES.astype(np.float32)
-"""Coefficient that each byte means: the middle of its interval, except that the ends mean the ends."""
+_BITS_11_10_11 = ((21, 11), (11, 10), (0, 11))
+_BITS_8_8_8 = ((24, 8), (16, 8), (8, 8))
+"""Place from the lowest bit, and width, of the three fields of a word that lie between bounds [bit]."""
 
 
 def is_compressed(header: PlyHeader) -> bool:
@@ -59,37 +58,34 @@ def decode(header: PlyHeader, drop_invalid: bool = False) -> dict[str, Any]:
     vertex, sh = header.element("vertex"), header.element("sh")
     assert vertex is not None  # is_compressed has seen it
     bounds, count = _require_layout(header, vertex), vertex.count
-    (words,) = read_columns(header, "vertex", [_WORDS], np.uint32)
-    bytes_ = np.empty((count, 0), np.uint8) if sh is None else read_columns(header, "sh", [_band_names(sh)], np.uint8)[0]
-    fields = {name: np.empty((count, width), np.float32) for name, width in (("positions", 3), ("orientations", 4))}
-    fields |= {"scales": np.empty((count, 3), np.float32), "opacities": np.empty(count, np.float32)}
-    fields["radiance"] = np.empty((count, 1 + bytes_.shape[1] // 3, 3), np.float32)
-    log_scales = np.empty((count, 3))
+    settle_log_scales(header.path, bounds[:, 6:12], drop_invalid)
+    bands = 0 if sh is None else len(sh.names) // 3
+    shapes = {"positions": (3,), "orientations": (4,), "scales": (3,), "opacities": (), "radiance": (1 + bands, 3)}
+    fields = {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
+    _, read_words = open_columns(header, "vertex")
+    _, read_bands = (None, None) if sh is None else open_columns(header, "sh")
 
     def unpack(part: slice) -> None:
-        position, rotation, scale, color = words[part].T
-        bounds_of_row = bounds[np.arange(part.start, part.stop) // CHUNK_ROWS]
-        fields["positions"][part] = _between(bounds_of_row[:, 0:6], _unpack_11_10_11(position))
+        words = np.empty((part.stop - part.start, 4), np.uint32)
+        read_words(part, [(_WORDS, words)])
+        position, rotation, scale, color = words.T
+        chunks = bounds[part.start // CHUNK_ROWS : -(-part.stop // CHUNK_ROWS)]
+        fields["positions"][part] = _between(chunks[:, 0:6], position, _BITS_11_10_11)
         fields["orientations"][part] = _unpack_rotation(rotation)
-        log_scales[part] = _between(bounds_of_row[:, 6:12], _unpack_11_10_11(scale))
-        shown = _unpack_8888(color)
-        fields["opacities"][part] = shown[:, 3]
-        within = _between(bounds_of_row[:, 12:18], shown[:, :3]) if bounds.shape[1] == 18 else shown[:, :3]
-        fields["radiance"][part, 0] = dc_from_color(within)
-        fields["radiance"][part, 1:] = _BAND_VALUES[bytes_[part]].reshape(len(shown), bytes_.shape[1] // 3, 3)
-
-    def activate(part: slice) -> None:
-        fields["scales"][part] = exp_scale(log_scales[part])
+        fields["scales"][part] = exp_scale(_between(chunks[:, 6:12], scale, _BITS_11_10_11))
+        fields["opacities"][part] = _unorm(color, 0, 8)
+        fields["radiance"][part, 0] = dc_from_color(_between(chunks[:, 12:18], color, _BITS_8_8_8))
+        if read_bands is not None:
+            bytes_ = np.empty((len(words), 3 * bands), np.uint8)
+            read_bands(part, [(_band_names(bands), bytes_)])
+            fields["radiance"][part, 1:] = _band_values(bytes_).reshape(-1, bands, 3)
 
     for_each_block(unpack, count)
-    settle_log_scales(header.path, log_scales, drop_invalid)
-    for_each_block(activate, count)
     return {**fields, "radiance_color_space": DISPLAY_SRGB}
 
 
-def _band_names(sh: Element) -> list[str]:
-    """Return the names of the higher bands' columns, coefficient after coefficient."""
-    bands = len(sh.names) // 3  # of a channel: the file has channel after channel
+def _band_names(bands: int) -> list[str]:
+    """Return the columns of the higher bands, coefficient after coefficient; the file has channel after channel."""
     return [f"f_rest_{channel * bands + k}" for k in range(bands) for channel in range(3)]
 
 
@@ -99,7 +95,8 @@ def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
     if chunk is None:
         raise malformed(header.path, "packed vertices must come with an element chunk", "none", "Export it again.")
     require_types(header.path, vertex, _WORDS, ("u4",))
-    names = _BOUNDS + _SCALE_BOUNDS + (_COLOR_BOUNDS if "min_r" in chunk.names else ())
+    colors = _COLOR_BOUNDS if "min_r" in chunk.names else ()
+    names = _BOUNDS + _SCALE_BOUNDS + colors
     require_types(header.path, chunk, names, ("f4",))
     wanted = -(-vertex.count // CHUNK_ROWS)
     if chunk.count != wanted:
@@ -118,7 +115,8 @@ def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
                 "Export it again.",
             )
         require_types(header.path, sh, tuple(f"f_rest_{i}" for i in range(len(sh.names))), ("u1",))
-    return read_columns(header, "chunk", [names], np.float64)[0]
+    (bounds,) = read_columns(header, "chunk", [names], np.float64)
+    return bounds if colors else np.hstack([bounds, np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 1.0], (len(bounds), 1))])
 
 
 def _unorm(words: NDArray[np.uint32], shift: int, bits: int) -> NDArray[np.float64]:
@@ -127,16 +125,26 @@ def _unorm(words: NDArray[np.uint32], shift: int, bits: int) -> NDArray[np.float
     return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask
 
 
-def _unpack_11_10_11(words: NDArray[np.uint32]) -> NDArray[np.float64]:
-    return np.column_stack([_unorm(words, 21, 11), _unorm(words, 11, 10), _unorm(words, 0, 11)])
+def _between(
+    bounds: NDArray[np.float64], words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]
+) -> NDArray[np.float64]:
+    """Return three fields of each word, between the bounds of its chunk."""
+    values = np.empty((len(words), 3))
+    for column, (shift, bits) in enumerate(fields):
+        fraction = _unorm(words, shift, bits)
+        low, high = (np.repeat(bounds[:, place], CHUNK_ROWS)[: len(words)] for place in (column, column + 3))
+        values[:, column] = low * (1.0 - fraction) + high * fraction
+    return values
 
 
-def _unpack_8888(words: NDArray[np.uint32]) -> NDArray[np.float64]:
-    return np.column_stack([_unorm(words, shift, 8) for shift in (24, 16, 8, 0)])
-
-
-def _between(bounds: NDArray[np.float64], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
-    return bounds[:, :3] * (1.0 - fraction) + bounds[:, 3:] * fraction
+def _band_values(bytes_: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the coefficient that a byte means: the middle of its interval in ± 4, but of the ends the ends."""
+    values = bytes_.astype(np.float32)
+    values += np.float32(0.5)
+    values *= np.float32(8.0 / 256.0)
+    values -= np.float32(4.0)  # exact so far: sums of a few powers of two
+    values[bytes_ == 0], values[bytes_ == 255] = -4.0, 4.0
+    return values
 
 
 def _unpack_rotation(words: NDArray[np.uint32]) -> NDArray[np.float64]:

@@ -22,13 +22,7 @@ from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.options import MaterialActivation, ReadOptions
 from beam_warp.converters.ply_checks import require_not_linear, require_rotations, require_types, settle_log_scales
 from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, malformed, read_columns, read_header
-from beam_warp.converters.producers import (
-    LAYOUTS,
-    NORMAL_NAMES,
-    guess_producer,
-    material_producer,
-    material_properties,
-)
+from beam_warp.converters.producers import LAYOUTS, NORMAL_NAMES, guess_producer, material_producer, material_properties
 from beam_warp.errors import AssetFormatError, BeamError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
@@ -157,7 +151,7 @@ def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:
 
 
 _Groups = dict[str, tuple[str, ...]]
-"""For each field of a cloud, the names of the columns that it is made of."""
+"""Names of the columns that each field of a cloud is made of."""
 
 
 def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, notes: list[str]) -> dict[str, Any]:
@@ -271,9 +265,10 @@ def _material_groups(
     channels = LAYOUTS[activation].channels
     groups = {name: columns for name, (columns, _) in channels.items() if set(columns) <= set(names)}
     if options.material_activation is not None and not groups:
+        wanted = ", ".join(name for columns, _ in channels.values() for name in columns)
         raise malformed(
             header.path,
-            f"materials of {activation} must have {', '.join(name for columns, _ in channels.values() for name in columns)}",
+            f"materials of {activation} must have {wanted}",
             ", ".join(found) or "no material channels",
             "Choose another --material-activation, or leave it out.",
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -250,19 +250,37 @@ def read_columns(
     Raises:
         AssetFormatError: The element is absent, has list properties, follows lists of unknown length, or is cut short.
     """
-    element, offset = _require_plain_rows(header, name)
+    element, read = open_columns(header, name)
     matrices = [np.empty((element.count, len(group)), dtype) for group in groups]
+
+    def fill(part: slice) -> None:
+        read(part, [(group, matrix[part]) for group, matrix in zip(groups, matrices, strict=True)])
+
+    for_each_block(fill, element.count)
+    return matrices
+
+
+ReadBlock = Callable[[slice, Sequence[tuple[Sequence[str], NDArray[Any]]]], None]
+"""Reads some rows: copies columns, named in their order, into each matrix."""
+
+
+def open_columns(header: PlyHeader, name: str) -> tuple[Element, ReadBlock]:
+    """Return an element and a function that reads blocks of its rows, on any thread.
+
+    Raises:
+        AssetFormatError: As `read_columns`; if the file has been cut since, the function raises it.
+    """
+    element, offset = _require_plain_rows(header, name)
     is_text, order = header.encoding == "ascii", ENCODINGS[header.encoding]
     kind = np.dtype([(column.name, "f4" if is_text else order + column.code) for column in element.properties])
     text = _ascii_rows(header, element, offset).view(kind)[:, 0] if is_text else None
 
-    def fill(part: slice) -> None:
+    def read(part: slice, matrices: Sequence[tuple[Sequence[str], NDArray[Any]]]) -> None:
         rows = _binary_rows(header, kind, offset, part) if text is None else text[part]
-        for matrix, group in zip(matrices, groups, strict=True):
-            _pick(rows, group, matrix[part])
+        for names, matrix in matrices:
+            _pick(rows, names, matrix)
 
-    for_each_block(fill, element.count)
-    return matrices
+    return element, read
 
 
 def _require_plain_rows(header: PlyHeader, name: str) -> tuple[Element, int]:
