@@ -23,16 +23,16 @@ from beam_warp.image.color import DISPLAY_SRGB
 
 CHUNK_ROWS = 256
 
-_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
-_SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
-_COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
-_WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
+SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
+COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
+WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 PLACES = np.array([[0 if i == largest else 1 + i - (i > largest) for i in (1, 2, 3, 0)] for largest in range(4)])
 """Where x, y, z, w are among the largest component and the other three in order, by its place in w, x, y, z."""
 
-_BITS_11_10_11 = ((21, 11), (11, 10), (0, 11))
-_BITS_8_8_8 = ((24, 8), (16, 8), (8, 8))
+BITS_11_10_11 = ((21, 11), (11, 10), (0, 11))
+BITS_8_8_8 = ((24, 8), (16, 8), (8, 8))
 """Place from the lowest bit, and width, of the three fields of a word that lie between bounds [bit]."""
 
 
@@ -67,14 +67,14 @@ def decode(header: PlyHeader, drop_invalid: bool = False) -> dict[str, Any]:
 
     def unpack(part: slice) -> None:
         words = np.empty((part.stop - part.start, 4), np.uint32)
-        read_words(part, [(_WORDS, words)])
+        read_words(part, [(WORDS, words)])
         position, rotation, scale, color = words.T
         chunks = bounds[part.start // CHUNK_ROWS : -(-part.stop // CHUNK_ROWS)]
-        fields["positions"][part] = _between(chunks[:, 0:6], position, _BITS_11_10_11)
+        fields["positions"][part] = _between(chunks[:, 0:6], position, BITS_11_10_11)
         fields["orientations"][part] = _unpack_rotation(rotation)
-        fields["scales"][part] = exp_scale(_between(chunks[:, 6:12], scale, _BITS_11_10_11))
+        fields["scales"][part] = exp_scale(_between(chunks[:, 6:12], scale, BITS_11_10_11))
         fields["opacities"][part] = _unorm(color, 0, 8)
-        fields["radiance"][part, 0] = dc_from_color(_between(chunks[:, 12:18], color, _BITS_8_8_8))
+        fields["radiance"][part, 0] = dc_from_color(_between(chunks[:, 12:18], color, BITS_8_8_8))
         if read_bands is not None:
             bytes_ = np.empty((len(words), 3 * bands), np.uint8)
             read_bands(part, [(_band_names(bands), bytes_)])
@@ -94,9 +94,9 @@ def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
     chunk, sh = header.element("chunk"), header.element("sh")
     if chunk is None:
         raise malformed(header.path, "packed vertices must come with an element chunk", "none", "Export it again.")
-    require_types(header.path, vertex, _WORDS, ("u4",))
-    colors = _COLOR_BOUNDS if "min_r" in chunk.names else ()
-    names = _BOUNDS + _SCALE_BOUNDS + colors
+    require_types(header.path, vertex, WORDS, ("u4",))
+    colors = COLOR_BOUNDS if "min_r" in chunk.names else ()
+    names = BOUNDS + SCALE_BOUNDS + colors
     require_types(header.path, chunk, names, ("f4",))
     wanted = -(-vertex.count // CHUNK_ROWS)
     if chunk.count != wanted:

@@ -53,6 +53,8 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     notes: list[str] = []
     if compressed_ply.is_compressed(header):
         fields = compressed_ply.decode(header, options.drop_invalid)
+        if statements.radiance_meaning == NO_COLOR:  # the layout has a place for colour that is not there
+            del fields["radiance"], fields["radiance_color_space"]
     else:
         fields = _decode(header, options, statements, notes)
     return DecodedFrame(
