@@ -305,9 +305,9 @@ def _require_plain_rows(header: PlyHeader, name: str) -> tuple[Element, int]:
 
 def _pick(rows: NDArray[Any], names: Sequence[str], out: NDArray[Any]) -> None:
     """Copy columns of a structured array into a matrix."""
-    fields = rows.dtype.fields or {}
-    if {field[0] for field in fields.values()} == {out.dtype}:  # a matrix: one call that copies all columns is faster
-        places = [list(fields).index(name) for name in names]
+    known: list[str] = list(rows.dtype.names or ())
+    if {rows.dtype[name] for name in known} == {out.dtype}:  # a matrix: one call that copies all columns is faster
+        places = [known.index(name) for name in names]
         np.take(rows.view(out.dtype).reshape(len(rows), -1), places, axis=1, out=out, mode="clip")
         return
     for column, name in enumerate(names):
