@@ -111,7 +111,7 @@ def _rotation_words(orientations: NDArray[np.float32]) -> NDArray[np.uint32]:
     smaller, largest_at = to_smaller(orientations[:, [3, 0, 1, 2]])
     fraction = np.clip(smaller / (2.0 * SMALLER_LIMIT) + 0.5, 0.0, 1.0)
     codes = np.rint(fraction * 1023.0).astype(np.uint32)
-    return largest_at.astype(np.uint32) << np.uint32(30) | codes @ np.uint32([1 << 20, 1 << 10, 1])
+    return largest_at.astype(np.uint32) << np.uint32(30) | codes @ np.array([1 << 20, 1 << 10, 1], np.uint32)
 
 
 def _band_bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -133,7 +133,7 @@ def _morton_order(positions: NDArray[np.float32]) -> NDArray[np.intp]:
         spread = ((positions[part] - low) / np.where(extent > 0.0, extent, 1.0) * (2**21 - 1)).astype(np.uint64)
         for shift, mask in _SPREADING:
             spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-        keys[part] = spread @ np.uint64([1, 2, 4])
+        keys[part] = spread @ np.array([1, 2, 4], np.uint64)
 
     for_each_block(interleave, len(positions))
     return np.argsort(keys, kind="stable")
