@@ -273,8 +273,9 @@ def test_blocks_write_what_whole_arrays_say(tmp_path, monkeypatch, cores):
     monkeypatch.setattr("beam_warp.blocks._core_count", lambda: cores)
     cloud = radiant_cloud(BLOCK_ROWS + 1, degree=1, materials=True, axes="rub")
     write_asset(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usdc")
-    prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath("/Asset/Splats")
-    stored = {name: np.asarray(prim.GetAttribute(name).Get()) for name in ("opacitiesh", "orientationsh", "extent")}
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    read = stage.GetPrimAtPath("/Asset/Splats").GetAttribute
+    stored = {name: np.asarray(read(name).Get()) for name in ("opacitiesh", "orientationsh", "extent")}
     assert np.array_equal(stored["opacitiesh"].reshape(-1), cloud.opacities.astype(np.float16))
     wide = cloud.orientations.astype(np.float64)  # unit to float32 rounding, so that nothing is normalised
     assert np.array_equal(stored["orientationsh"], wide.astype(np.float16))
