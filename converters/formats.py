@@ -74,7 +74,7 @@ FORMATS: dict[str, Format] = {
         writer="ply_writer",
         read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
     ),
-    ".compressed.ply": Format(name="compressed PLY", reader="ply"),
+    ".compressed.ply": Format(name="compressed PLY", reader="ply", writer="compressed_ply_writer"),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""

@@ -8,6 +8,7 @@ import pytest
 
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
+from beam_warp.converters.formats import FORMATS, Format
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -94,14 +95,15 @@ def test_frames_of_an_older_longer_take_are_in_the_way(walk, tmp_path, make_clou
     assert len(converters.read(tmp_path)) == 12
 
 
-def test_output_folders(walk, tmp_path):
+def test_output_folders(walk, tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"output folder must exist, got .*nowhere for a\.ply. Create it first"):
         converters.write(walk, tmp_path / "nowhere" / "a.ply")
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(OutputError, match="output must be a file, got the folder"):
         converters.write(walk, tmp_path / "folder.ply")
-    with pytest.raises(InvalidOptionError, match=r"must end in one of .*, got a\.compressed\.ply: compressed PLY is only read"):
-        converters.write(walk, tmp_path / "a.compressed.ply")
+    monkeypatch.setitem(FORMATS, ".scan", Format(name="a scan", reader="ply"))
+    with pytest.raises(InvalidOptionError, match=r"must end in one of .*, got a\.scan: a scan is only read"):
+        converters.write(walk, tmp_path / "a.scan")
 
 
 def test_usd_gets_y_up_metres_and_the_asked_bands(make_cloud, tmp_path):

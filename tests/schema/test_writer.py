@@ -5,12 +5,16 @@ import tracemalloc
 import numpy as np
 import pytest
 from pxr import Sdf, Usd
+from support.radiant_cloud import radiant_cloud
 
+from beam_warp import converters
+from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.errors import BeamError, InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.schema import writer
 from beam_warp.schema.writer import write_asset
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import matrix_of
 
 
 @pytest.fixture
@@ -266,3 +270,27 @@ def test_layers_agree_on_time_codes(tmp_path, sequence):
     write_asset(sequence(65), tmp_path / "a.usda")
     for path in tmp_path.iterdir():
         assert Sdf.Layer.FindOrOpen(str(path)).timeCodesPerSecond == 24.0
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_blocks_write_what_whole_arrays_say(tmp_path, monkeypatch, cores):
+    monkeypatch.setattr("beam_warp.blocks._core_count", lambda: cores)
+    cloud = radiant_cloud(BLOCK_ROWS + 1, degree=1, materials=True, axes="rub")
+    write_asset(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    read = stage.GetPrimAtPath("/Asset/Splats").GetAttribute
+    stored = {name: np.asarray(read(name).Get()) for name in ("opacitiesh", "orientationsh", "extent")}
+    assert np.array_equal(stored["opacitiesh"].reshape(-1), cloud.opacities.astype(np.float16))
+    wide = cloud.orientations.astype(np.float64)  # unit to float32 rounding, so that nothing is normalised
+    assert np.array_equal(stored["orientationsh"], wide.astype(np.float16))
+    reach = 3.0 * np.linalg.norm(matrix_of(wide) * cloud.scales[:, None], axis=2)
+    low, high = (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+    outwards = [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]
+    assert np.array_equal(stored["extent"], np.float32(outwards))
+
+
+def test_a_source_is_asked_once_for_its_only_frame(tmp_path, cloud):
+    asked = []
+    sequence = GaussianSequence(frame_count=1, read_frame=lambda frame: asked.append(frame) or cloud())
+    converters.write(sequence, tmp_path / "a.usdc")
+    assert asked == [0]

@@ -8,8 +8,10 @@ from reference.harmonics import sh_color
 from scipy.spatial.transform import Rotation
 from support.radiant_cloud import radiant_cloud
 
+from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.axes import AXIS_CODES, TARGETS, axes_matrix, change_axes, handedness
+from beam_warp.world.harmonics import sh_transform
 
 EPSILON = np.finfo(np.float32).eps
 
@@ -91,3 +93,22 @@ def test_zeroth_degree_and_no_optional_arrays():
     moved = change_axes(cloud, "fru")
     assert np.array_equal(moved.radiance, cloud.radiance)
     assert moved.normals is None
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+@pytest.mark.parametrize("target", ["rub", "rfu", "ruf"])
+def test_blocks_give_what_whole_arrays_give(monkeypatch, cores, target):
+    """A turn of y and z (signs alone), one that mixes the bands, and a mirror, against the definition in float64."""
+    monkeypatch.setattr("beam_warp.blocks._core_count", lambda: cores)
+    cloud = radiant_cloud(2 * BLOCK_ROWS + 1, degree=2, materials=True, axes="rdf")
+    turned, matrix = change_axes(cloud, target, scale=2.0), axes_matrix("rdf", target)
+    assert np.array_equal(turned.positions, cloud.positions @ matrix.T.astype(np.float32) * np.float32(2.0))
+    assert np.array_equal(turned.normals, cloud.normals @ matrix.T.astype(np.float32))
+    assert np.array_equal(turned.scales, cloud.scales * np.float32(2.0))
+    transform = np.round(sh_transform(matrix, 2), 14)
+    # A sum of five products in float64 in another order, rounded to float32.
+    expected = np.einsum("jk,nkc->njc", transform, cloud.radiance.astype(np.float64))
+    largest = float(np.abs(cloud.radiance).max())
+    bound = np.spacing(np.abs(expected).astype(np.float32)) / 2 + 5 * np.finfo(float).eps * largest
+    assert (np.abs(turned.radiance - expected) <= bound).all()
+    assert not np.signbit(change_axes(cloud.with_arrays(radiance=0 * cloud.radiance), target).radiance).any()
