@@ -113,7 +113,7 @@ class AssetContents:
             if name in ("orientations", "normals"):
                 arrays[name] = _nearly_unit(arrays[name])
             arrays[name] = arrays[name].astype(np.float16)
-        arrays["extent"] = _extent(cloud)
+        arrays["extent"] = kernel_extent(cloud.positions, cloud.orientations, cloud.scales)
         return arrays
 
 
@@ -263,12 +263,20 @@ def _nearly_unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.abs(length - 1.0) > HALF_EPSILON, vectors / length, vectors).astype(np.float32)
 
 
-def _extent(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
-    if not len(cloud):
+def kernel_extent(
+    positions: NDArray[Any], orientations: NDArray[Any], scales: NDArray[Any]
+) -> NDArray[np.float32]:
+    """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards.
+
+    Args:
+        positions: Centres, ``(N, 3)``.
+        orientations: Unit quaternions xyzw, ``(N, 4)``.
+        scales: Standard deviations along the local axes in the unit of ``positions``, ``(N, 3)``.
+    """
+    if not len(positions):
         return np.zeros((2, 3), np.float32)
-    reach = KERNEL_EXTENT * np.linalg.norm(matrix_of(cloud.orientations) * cloud.scales[:, None, :], axis=2)
-    low, high = (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+    reach = KERNEL_EXTENT * np.linalg.norm(matrix_of(orientations) * scales[:, None, :], axis=2)
+    low, high = (positions - reach).min(axis=0), (positions + reach).max(axis=0)
     return np.stack(
         [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]
     ).astype(np.float32)
