@@ -113,7 +113,7 @@ def _export(stage: Usd.Stage, folder: Path) -> list[str]:
     for layer in _changed(stage):
         name = Path(layer.realPath).relative_to(home)
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        form = str(Usd.UsdFileFormat.GetUnderlyingFormatForLayer(layer))
+        form = str(Sdf.UsdFileFormat.GetUnderlyingFormatForLayer(layer))
         _require_written(layer.Export(str(folder / name), args={"format": form}), str(name))
         names.append(name.as_posix())
     return names
