@@ -263,9 +263,7 @@ def _nearly_unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.abs(length - 1.0) > HALF_EPSILON, vectors / length, vectors).astype(np.float32)
 
 
-def kernel_extent(
-    positions: NDArray[Any], orientations: NDArray[Any], scales: NDArray[Any]
-) -> NDArray[np.float32]:
+def kernel_extent(positions: NDArray[Any], orientations: NDArray[Any], scales: NDArray[Any]) -> NDArray[np.float32]:
     """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards.
 
     Args:

@@ -100,7 +100,14 @@ def run_child(module: str, path: Path, seconds: float, *arguments: str) -> dict[
     Raises:
         AssetFormatError: The child crashed or took too long: the file is not fit to be opened here.
     """
-    command = [sys.executable, "-P", "-m", module, str(path), *arguments]  # a checkout in the working folder is not the package
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        module,
+        str(path),
+        *arguments,
+    ]  # a checkout in the working folder is not the package
     # The child finds this very package even where it was imported from a path that only this process knows.
     places = [place for place in sys.path if place]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}

@@ -25,6 +25,7 @@ GENERATED = ("generatedSchema.usda", "plugInfo.json")
 # The plug-in lives in one flat folder of the Python package and has no compiled library.
 _PLACES = {"@PLUG_INFO_LIBRARY_PATH@": "", "@PLUG_INFO_RESOURCE_PATH@": ".", "@PLUG_INFO_ROOT@": "."}
 
+
 def _validator_plugin() -> dict[str, Any]:
     """Return the entry of plugInfo.json by which other hosts run our rules; OpenUSD imports the module on first use."""
     validators: dict[str, Any] = {"keywords": ["BeamValidators"]}

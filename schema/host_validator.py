@@ -1,4 +1,4 @@
-"""Our rules as validators of OpenUSD, which finds them in plugInfo.json and imports this module when a host asks for them.
+"""Our rules as validators of OpenUSD, which finds them in plugInfo.json and imports this module on first use.
 
 There is one validator for each rule, named after it, and one suite of all. An error has the name of its rule.
 """

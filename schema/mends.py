@@ -174,9 +174,7 @@ def _normalise(prim: Usd.Prim, name: str) -> None:
     _rewrite(prim, name, _columns(name), change)
 
 
-@mending(
-    *("BEAM-GEO-014", "BEAM-MAT-010", "BEAM-MAT-011", "BEAM-MAT-012", "BEAM-MAT-013", "BEAM-MAT-015")
-)
+@mending(*("BEAM-GEO-014", "BEAM-MAT-010", "BEAM-MAT-011", "BEAM-MAT-012", "BEAM-MAT-013", "BEAM-MAT-015"))
 def _clip(prim: Usd.Prim, name: str) -> None:
     """Values that rounding to half explains, up to 0.001 outside, are clipped."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Usd, UsdValidation
-from support.broken_assets import BREAKERS, PREPARED, drop_material, numbered, low_pass
+from support.broken_assets import BREAKERS, drop_material, low_pass, numbered
 
 from beam_warp.schema import PLUGIN_FOLDER
 from beam_warp.schema.report import Report
