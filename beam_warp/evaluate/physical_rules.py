@@ -23,8 +23,8 @@ FAR = 4.0
 CHEBYSHEV, CANTELLI = 1.0 / FAR**2, 1.0 / (1.0 + FAR**2)
 """Largest share of estimates that are off to either side, and to one side."""
 
-BRIGHTEST = 0.9
-"""Largest natural diffuse reflectance: that of fresh snow (Bohren and Beschta 1979: 0.8 to 0.9 in visible light)."""
+BRIGHTEST = 10.0**-0.05
+"""Reflectance of the white patch of a ColorChecker, whose optical density is 0.05; what is whiter is rare."""
 
 LEAST_COUNT = 32
 """Gaussians below which a share means nothing: two of them are 1/16."""
@@ -83,7 +83,7 @@ FURNACE, OCCLUSION, FACING, SHAPE, COLOR, STEADY = PHYSICAL_RULES = (
     PhysicalRule(
         "BEAM-PHYS-005",
         "warning",
-        "Base colour does not exceed that of fresh snow, 0.9, by four standard errors, but for 1/17.",
+        "Base colour does not exceed that of a white chart, 0.89, by four standard errors, but for 1/17.",
         "State the exposure or the light of the capture.",
         "beam:baseColor",
     ),
@@ -191,7 +191,7 @@ def shape(cosines: FloatArray) -> Measured:
 def color(base_color: FloatArray, error: FloatArray) -> Measured:
     """Judge base colours ``(M, 3)`` by their standard errors, 0 where none is stated."""
     errors = np.sqrt(np.square(error) + HALF_EPSILON**2)
-    return _share(COLOR, (base_color - BRIGHTEST > FAR * errors).any(axis=1), CANTELLI, "brighter than snow")
+    return _share(COLOR, (base_color - BRIGHTEST > FAR * errors).any(axis=1), CANTELLI, "whiter than a chart")
 
 
 def steady(variance: FloatArray, error: FloatArray) -> Measured:
