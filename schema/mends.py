@@ -108,8 +108,9 @@ def _clear_half(prim: Usd.Prim, name: str) -> None:
 @mending("BEAM-GEO-004")
 def _write_extent(prim: Usd.Prim, _: str) -> None:
     """Bounds of all kernels at three standard deviations are written for each frame."""
-    home, boxes = _home(prim), {time: _bounds(prim, time) for time in _times(prim)}
-    if home is None or any(box is None for box in boxes.values()):
+    home, times = _home(prim), _times(prim)
+    boxes = {time: box for time in times if (box := _bounds(prim, time)) is not None}
+    if home is None or len(boxes) < len(times):
         return
     spec, offset = home
     attribute = spec.attributes.get("extent") or Sdf.AttributeSpec(spec, "extent", Sdf.ValueTypeNames.Float3Array)
@@ -291,10 +292,11 @@ def _keep_signs(prim: Usd.Prim, name: str) -> None:
 
     def change(array: NDArray[Any], _: Sequence[float]) -> NDArray[Any]:
         nonlocal before
-        same = before is not None and before.shape == array.shape
-        flipped = np.einsum("nk,nk->n", array.astype(np.float32), before.astype(np.float32)) < 0.0 if same else False
-        before = np.where(np.reshape(flipped, (-1, 1)), -array, array) if np.any(flipped) else array
-        return before
+        if before is not None and before.shape == array.shape:
+            flipped = np.einsum("nk,nk->n", array.astype(np.float32), before.astype(np.float32)) < 0.0
+            array = np.where(flipped[:, None], -array, array) if flipped.any() else array
+        before = array
+        return array
 
     _rewrite(prim, name, 4, change)
 

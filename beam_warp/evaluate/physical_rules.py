@@ -191,13 +191,13 @@ def shape(cosines: FloatArray) -> Measured:
 def color(base_color: FloatArray, error: FloatArray) -> Measured:
     """Judge base colours ``(M, 3)`` by their standard errors, 0 where none is stated."""
     errors = np.sqrt(np.square(error) + HALF_EPSILON**2)
-    return _share(COLOR, (base_color - BRIGHTEST > FAR * errors).any(axis=1), CANTELLI, "whiter than a chart")
+    return _share(COLOR, np.any(base_color - BRIGHTEST > FAR * errors, axis=1), CANTELLI, "whiter than a chart")
 
 
 def steady(variance: FloatArray, error: FloatArray) -> Measured:
     """Judge variances over time and standard errors, both ``(M, C)``: of base colour and roughness."""
     expected = np.square(error) + HALF_EPSILON**2
-    return _share(STEADY, (variance > FAR**2 * expected).any(axis=1), CHEBYSHEV, "restless")
+    return _share(STEADY, np.any(variance > FAR**2 * expected, axis=1), CHEBYSHEV, "restless")
 
 
 def _share(rule: PhysicalRule, off: NDArray[np.bool_], probability: float, what: str) -> Measured:
