@@ -264,7 +264,7 @@ def _state_sequence(prim: Usd.Prim, name: str) -> None:
 
 @mending("BEAM-SEQ-002")
 def _state_frame_count(playing: Usd.Prim, name: str) -> None:
-    """Of frame count and range, the one that the time samples contradict becomes theirs."""
+    """The frame count or the range becomes that of the time samples, if these agree with the other one."""
     stage = playing.GetStage()
     prims = [prim for prim in splat_prims(stage) if sequence_prim(prim) == playing]
     times = sorted(set().union(*(sample_times(prim) for prim in prims)))
