@@ -28,6 +28,7 @@ from beam_warp.schema.stage_queries import (
     array_attribute,
     authored,
     clip_sets,
+    has_whole_clips,
     radiance_color_space,
     sample_times,
     sequence_prim,
@@ -79,9 +80,9 @@ def _name_default_prim(root: Usd.Prim, _: str) -> None:
 @mending("BEAM-STAGE-005")
 def _state_times(root: Usd.Prim, name: str) -> None:
     """The range becomes that of the time samples, the rate that of the sequence."""
-    layer, prims = root.GetStage().GetRootLayer(), splat_prims(root.GetStage())
+    layer, prims = root.GetStage().GetRootLayer(), _whole_prims(root.GetStage())
     if name == "startTimeCode":
-        times = sorted(set().union(*(sample_times(prim) for prim in prims)))
+        times = sorted(set().union(*map(sample_times, prims)))
         layer.startTimeCode, layer.endTimeCode = times[0], times[-1]
         return
     playing = [place for place in map(sequence_prim, prims) if place is not None]
@@ -266,8 +267,8 @@ def _state_sequence(prim: Usd.Prim, name: str) -> None:
 def _state_frame_count(playing: Usd.Prim, name: str) -> None:
     """The frame count or the range becomes that of the time samples, if these agree with the other one."""
     stage = playing.GetStage()
-    prims = [prim for prim in splat_prims(stage) if sequence_prim(prim) == playing]
-    times = sorted(set().union(*(sample_times(prim) for prim in prims)))
+    prims = [prim for prim in _whole_prims(stage) if sequence_prim(prim) == playing]
+    times = sorted(set().union(*map(sample_times, prims)))
     if name != SEQUENCE_FACTS[0] or len(times) < 2 or times != [times[0] + frame for frame in range(len(times))]:
         return
     if (times[0], times[-1]) == (stage.GetStartTimeCode(), stage.GetEndTimeCode()):
@@ -352,10 +353,11 @@ def _places(attribute: Usd.Attribute, times: Sequence[float]) -> dict[_Place, li
 def _stored(attribute: Usd.Attribute, time: float) -> Iterator[_Place]:
     """Yield the place of the value at a stage time; nothing if it lies between samples."""
     for spec, offset in attribute.GetPropertyStackWithLayerOffsets(time):
-        local, samples = offset.GetInverse() * time, spec.layer.ListTimeSamplesForPath(spec.path)
-        if samples or spec.HasDefaultValue():
-            if not samples or local in samples:
-                yield _Place(spec.layer, spec.path, local if samples else None)
+        local = offset.GetInverse() * time
+        is_sampled, before, _ = spec.layer.GetBracketingTimeSamplesForPath(spec.path, local)
+        if is_sampled or spec.HasDefaultValue():
+            if not is_sampled or before == local:
+                yield _Place(spec.layer, spec.path, local if is_sampled else None)
             return
 
 
@@ -394,6 +396,11 @@ def _apply(prim: Usd.Prim, schema: str) -> None:
             schemas.deletedItems = [name for name in schemas.deletedItems if name != schema]
             schemas.prependedItems = [*schemas.prependedItems, schema]
         home[0].SetInfo("apiSchemas", schemas)
+
+
+def _whole_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Return the Gaussian-splat prims whose samples can be asked for."""
+    return [prim for prim in splat_prims(stage) if has_whole_clips(prim)]
 
 
 def _times(prim: Usd.Prim) -> list[float]:
