@@ -117,7 +117,7 @@ class AssetContents:
         for name in self.half & arrays.keys():
             arrays[name] = _in_half(arrays[name], make_unit=name in ("orientations", "normals"))
         if "extent" in names:
-            arrays["extent"] = _extent(cloud)
+            arrays["extent"] = kernel_extent(cloud.positions, cloud.orientations, cloud.scales)
         return arrays
 
 
@@ -340,18 +340,23 @@ def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(sum(column * column for column in np.moveaxis(vectors, -1, 0)))
 
 
-def _extent(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
-    if not len(cloud):
+def kernel_extent(positions: NDArray[Any], orientations: NDArray[Any], scales: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards.
+
+    Args:
+        positions: Centres, ``(N, 3)``.
+        orientations: Unit quaternions xyzw, ``(N, 4)``.
+        scales: Standard deviations along the local axes in the unit of ``positions``, ``(N, 3)``.
+    """
+    if not len(positions):
         return np.zeros((2, 3), np.float32)
     bounds: list[NDArray[np.float64]] = []
 
     def work(part: slice) -> None:
-        reach = KERNEL_EXTENT * _lengths(matrix_of(cloud.orientations[part]) * cloud.scales[part, None])
-        positions = cloud.positions[part]
-        bounds.append(np.stack([(positions - reach).min(axis=0), (positions + reach).max(axis=0)]))
+        reach = KERNEL_EXTENT * _lengths(matrix_of(orientations[part]) * scales[part, None])
+        bounds.append(np.stack([(positions[part] - reach).min(axis=0), (positions[part] + reach).max(axis=0)]))
 
-    for_each_block(work, len(cloud))
+    for_each_block(work, len(positions))
     low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
     return np.stack(
         [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]

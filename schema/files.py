@@ -88,13 +88,26 @@ def require_opens(path: Path) -> None:
         raise _broken(path, "must open in OpenUSD", str(answer["error"]))
 
 
-def run_child(module: str, path: Path, seconds: float) -> dict[str, object]:
+def run_child(module: str, path: Path, seconds: float, *arguments: str) -> dict[str, object]:
     """Run a module of ours on an asset in a child process and return the JSON object it prints last.
+
+    Args:
+        module: Name of the module.
+        path: The asset, its first argument.
+        seconds: Time limit [s].
+        arguments: Further arguments.
 
     Raises:
         AssetFormatError: The child crashed or took too long: the file is not fit to be opened here.
     """
-    command = [sys.executable, "-P", "-m", module, str(path)]  # a checkout in the working folder is not the package
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        module,
+        str(path),
+        *arguments,
+    ]  # a checkout in the working folder is not the package
     # The child finds this very package even where it was imported from a path that only this process knows.
     places = [place for place in sys.path if place]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}

@@ -75,7 +75,7 @@ def _finite(frame: FrameArrays) -> Iterator[Fault]:
             yield Fault(f"values must be finite, got NaN or infinity at element {row}. Drop that Gaussian.", name)
 
 
-@entering(FRAME_RULES, "BEAM-GEO-015", "error")
+@entering(FRAME_RULES, "BEAM-GEO-015", "error", "positions")
 def _extent(frame: FrameArrays) -> Iterator[Fault]:
     """extent is a box that contains every position."""
     if frame.extent is None or not frame.count:
@@ -87,14 +87,14 @@ def _extent(frame: FrameArrays) -> Iterator[Fault]:
         yield Fault("extent must contain every position, got one outside. Compute it for each frame.", "extent")
 
 
-@entering(FRAME_RULES, "BEAM-GEO-016", "warning")
+@entering(FRAME_RULES, "BEAM-GEO-016", "warning", "positions")
 def _not_empty(frame: FrameArrays) -> Iterator[Fault]:
     """A frame holds at least one Gaussian."""
     if not frame.count:
         yield Fault("a frame should hold Gaussians, got none. Leave the frame out, or hide the prim.", "positions")
 
 
-@entering(FRAME_RULES, "BEAM-SH-002", "error")
+@entering(FRAME_RULES, "BEAM-SH-002", "error", "radiance")
 def _sh_size(frame: FrameArrays) -> Iterator[Fault]:
     """There are (degree + 1)^2 spherical-harmonics coefficients for each Gaussian."""
     if "radiance" in frame.arrays and frame.sh_degree is not None:
@@ -105,7 +105,7 @@ def _sh_size(frame: FrameArrays) -> Iterator[Fault]:
             )
 
 
-@entering(FRAME_RULES, "BEAM-MAT-017", "warning")
+@entering(FRAME_RULES, "BEAM-MAT-017", "warning", "observability")
 def _observability(frame: FrameArrays) -> Iterator[Fault]:
     """Observability has only flags that the schema defines."""
     for name, array in frame.to_check("observability"):
@@ -117,7 +117,7 @@ def _observability(frame: FrameArrays) -> Iterator[Fault]:
             )
 
 
-@entering(FRAME_RULES, "BEAM-SEQ-005", "error")
+@entering(FRAME_RULES, "BEAM-SEQ-005", "error", "positions")
 def _constant_count(frame: FrameArrays) -> Iterator[Fault]:
     """The number of Gaussians does not change under constant topology."""
     if frame.constant_topology and frame.previous is not None and len(frame.previous["positions"]) != frame.count:
@@ -125,7 +125,7 @@ def _constant_count(frame: FrameArrays) -> Iterator[Fault]:
         yield Fault(f"the count must be constant, got {frame.count} after {before}. Say perFrame.", "positions")
 
 
-@entering(FRAME_RULES, "BEAM-SEQ-006", "error")
+@entering(FRAME_RULES, "BEAM-SEQ-006", "error", "ids")
 def _unique_ids(frame: FrameArrays) -> Iterator[Fault]:
     """Identities are unique within a frame."""
     for name, array in frame.to_check("ids"):
@@ -133,7 +133,7 @@ def _unique_ids(frame: FrameArrays) -> Iterator[Fault]:
             yield Fault("ids must be unique, got one twice. Number the Gaussians anew.", name)
 
 
-@entering(FRAME_RULES, "BEAM-SEQ-007", "error")
+@entering(FRAME_RULES, "BEAM-SEQ-007", "error", "ids")
 def _constant_ids(frame: FrameArrays) -> Iterator[Fault]:
     """The identity of each row does not change under constant topology."""
     if frame.constant_topology and frame.previous is not None and "ids" in frame.changed:
@@ -142,7 +142,7 @@ def _constant_ids(frame: FrameArrays) -> Iterator[Fault]:
             yield Fault("ids must be the same in every frame, got other ones. Say perFrame.", frame.attributes["ids"])
 
 
-@entering(FRAME_RULES, "BEAM-SEQ-008", "warning")
+@entering(FRAME_RULES, "BEAM-SEQ-008", "warning", "orientations")
 def _continuous_quaternions(frame: FrameArrays) -> Iterator[Fault]:
     """Quaternions keep their sign under constant topology; engines that blend components would spin the Gaussians."""
     if not frame.constant_topology or frame.previous is None or "orientations" not in frame.changed:
@@ -186,7 +186,7 @@ _ERRORS = ("ambient_occlusion_error", "base_color_error", "roughness_error")
 _not_negative = partial(_out_of_range, high=np.inf)
 
 FRAME_RULES += [
-    Rule(rule_id, "error", text, partial(check, names=names))
+    Rule(rule_id, "error", text, partial(check, names=names), names)
     for rule_id, text, check, names in (
         ("BEAM-GEO-012", "Orientations are unit quaternions.", _not_unit, ("orientations",)),
         ("BEAM-GEO-013", "Scales are linear and not negative (logarithms would be).", _not_negative, ("scales",)),

@@ -12,28 +12,37 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from beam_warp.errors import OutputError
 from beam_warp.schema import PLUGIN_FOLDER
+from beam_warp.schema.frame_rules import FRAME_RULES
+from beam_warp.schema.rules import STAGE_RULES
+from beam_warp.schema.validator import ALL_RULES, HOST_PLUGIN
 
 GENERATED = ("generatedSchema.usda", "plugInfo.json")
 
 # The plug-in lives in one flat folder of the Python package and has no compiled library.
 _PLACES = {"@PLUG_INFO_LIBRARY_PATH@": "", "@PLUG_INFO_RESOURCE_PATH@": ".", "@PLUG_INFO_ROOT@": "."}
 
-_VALIDATOR_PLUGIN = {
-    "Info": {
-        "Validators": {
-            "keywords": ["BeamValidators"],
-            "AssetRules": {"doc": "The rules of the beam schema; each error is named after the rule that it breaks."},
-        }
-    },
-    "Name": "beam_warp.schema.host_validator",
-    "ResourcePath": ".",
-    "Root": "host_validator.py",  # OpenUSD tells plug-ins apart by this path
-    "Type": "python",
-}
-"""Entry of plugInfo.json by which other hosts run our rules; OpenUSD imports the module on first use."""
+
+def _validator_plugin() -> dict[str, Any]:
+    """Return the entry of plugInfo.json by which other hosts run our rules; OpenUSD imports the module on first use."""
+    validators: dict[str, Any] = {"keywords": ["BeamValidators"]}
+    for rule in ALL_RULES:
+        validators[rule.id] = {"doc": rule.text}
+        if rule not in STAGE_RULES:
+            validators[rule.id] |= {"schemaTypes": ["UsdVolParticleField3DGaussianSplat"]}
+        if rule in FRAME_RULES:
+            validators[rule.id] |= {"isTimeDependent": True}
+    validators["AssetRules"] = {"doc": "All rules of the beam schema.", "isSuite": True}
+    return {
+        "Info": {"Validators": validators},
+        "Name": HOST_PLUGIN,
+        "ResourcePath": ".",
+        "Root": "host_validator.py",  # OpenUSD tells plug-ins apart by this path
+        "Type": "python",
+    }
 
 
 def generate(folder: Path) -> None:
@@ -62,7 +71,7 @@ def generate(folder: Path) -> None:
         info = info.replace(placeholder, value)
     comment, _, body = info.partition("\n{")
     plugins = json.loads("{" + body)
-    plugins["Plugins"].append(_VALIDATOR_PLUGIN)
+    plugins["Plugins"].append(_validator_plugin())
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "generatedSchema.usda").write_text(layer + "\n", encoding="utf-8")
     (folder / "plugInfo.json").write_text(f"{comment}\n{json.dumps(plugins, indent=4)}\n", encoding="utf-8")

@@ -1,20 +1,59 @@
-"""Our rules as an OpenUSD validator, which OpenUSD finds in plugInfo.json and imports when a host asks for it."""
+"""Our rules as validators of OpenUSD, which finds them in plugInfo.json and imports this module on first use.
+
+There is one validator for each rule, named after it, and one suite of all. An error has the name of its rule.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 from pxr import Usd, UsdValidation
 
-from beam_warp.schema.validator import HOST_VALIDATOR, check_rules
+from beam_warp.schema.frame_rules import FRAME_RULES
+from beam_warp.schema.report import BrokenRule
+from beam_warp.schema.rules import FIRST_RULES, STAGE_RULES, Rule
+from beam_warp.schema.stage_queries import has_whole_clips
+from beam_warp.schema.validator import ALL_RULES, HOST_PLUGIN, ask, check_frames
+
+_KINDS = {"error": UsdValidation.ValidationErrorType.Error, "warning": UsdValidation.ValidationErrorType.Warn}
+
+Errors = list[UsdValidation.ValidationError]
 
 
-def _asset_rules(stage: Usd.Stage, _time_range: object) -> list[UsdValidation.ValidationError]:
-    kinds = {"error": UsdValidation.ValidationErrorType.Error, "warning": UsdValidation.ValidationErrorType.Warn}
+def _stage_check(rule: Rule) -> Callable[[Usd.Stage, UsdValidation.ValidationTimeRange], Errors]:
+    return lambda stage, _: _errors(stage, ask(rule, stage, "/"))
+
+
+def _prim_check(rule: Rule) -> Callable[[Usd.Prim, UsdValidation.ValidationTimeRange], Errors]:
+    def check(prim: Usd.Prim, times: UsdValidation.ValidationTimeRange) -> Errors:
+        if rule not in FIRST_RULES and not has_whole_clips(prim):
+            return []
+        if rule in FRAME_RULES:
+            return _errors(prim.GetStage(), check_frames(prim, [rule], times.GetInterval())[0])
+        return _errors(prim.GetStage(), ask(rule, prim, str(prim.GetPath())))
+
+    return check
+
+
+def _errors(stage: Usd.Stage, findings: Iterable[BrokenRule]) -> Errors:
     return [
         UsdValidation.ValidationError(
-            found.rule, kinds[found.severity], [UsdValidation.ValidationErrorSite(stage, found.prim)], found.message
+            found.rule, _KINDS[found.severity], [UsdValidation.ValidationErrorSite(stage, found.prim)], found.message
         )
-        for found in check_rules(stage).findings
+        for found in findings
     ]
 
 
-UsdValidation.ValidationRegistry().RegisterPluginStageValidator(HOST_VALIDATOR, _asset_rules)
+def _register() -> None:
+    registry = UsdValidation.ValidationRegistry()
+    names = [f"{HOST_PLUGIN}:{rule.id}" for rule in ALL_RULES]
+    for rule, name in zip(ALL_RULES, names, strict=True):
+        if rule in STAGE_RULES:
+            registry.RegisterPluginStageValidator(name, _stage_check(rule))
+        else:
+            registry.RegisterPluginPrimValidator(name, _prim_check(rule))
+    suite = registry.GetOrLoadValidatorsByName(names)
+    registry.RegisterPluginValidatorSuite(f"{HOST_PLUGIN}:AssetRules", suite)
+
+
+_register()

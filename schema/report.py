@@ -48,12 +48,14 @@ class Report:
         findings: Broken rules, errors first, then by rule, prim, and attribute.
         frames: Number of frames that were checked.
         gaussians: Number of Gaussians in the first frame, all prims together.
+        mended: Broken rules that `beam_warp.schema.mending.mend` has mended; ``findings`` has what is left.
     """
 
     path: str
     findings: tuple[BrokenRule, ...]
     frames: int = 0
     gaussians: int = 0
+    mended: tuple[BrokenRule, ...] = ()
 
     @property
     def is_valid(self) -> bool:
@@ -62,10 +64,11 @@ class Report:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON-able data."""
-        return {**asdict(self), "findings": [asdict(finding) for finding in self.findings], "valid": self.is_valid}
+        lists = {name: [asdict(found) for found in getattr(self, name)] for name in ("findings", "mended")}
+        return {**asdict(self), **lists, "valid": self.is_valid}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Report:
         """Rebuild a report from `as_dict`."""
-        findings = tuple(BrokenRule(**finding) for finding in data["findings"])
-        return cls(data["path"], findings, data["frames"], data["gaussians"])
+        findings, mended = (tuple(BrokenRule(**found) for found in data[name]) for name in ("findings", "mended"))
+        return cls(data["path"], findings, data["frames"], data["gaussians"], mended)

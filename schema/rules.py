@@ -33,10 +33,11 @@ from beam_warp.world.gaussians import MATERIAL_CHANNELS, MAX_SH_DEGREE
 
 
 class Fault(NamedTuple):
-    """One violation of a rule, as its check yields it."""
+    """One violation of a rule, as its check yields it; ``prim`` is empty if it is the prim that is checked."""
 
     message: str
     attribute: str = ""
+    prim: str = ""
 
 
 Check = Callable[[Any], Iterator[Fault]]
@@ -51,19 +52,21 @@ class Rule:
         severity: ``error`` or ``warning``.
         text: The contract, in one sentence.
         check: Function that yields the violations of a stage, a prim or a frame.
+        reads: Channels that the check of a frame reads beside positions; empty if it reads all.
     """
 
     id: str
     severity: Severity
     text: str
     check: Check
+    reads: tuple[str, ...] = ()
 
 
-def entering(table: list[Rule], rule_id: str, severity: Severity) -> Callable[[Check], Check]:
+def entering(table: list[Rule], rule_id: str, severity: Severity, *reads: str) -> Callable[[Check], Check]:
     """Return a decorator that enters a check in a table of rules, with its docstring as the text."""
 
     def enter(check: Check) -> Check:
-        table.append(Rule(rule_id, severity, (check.__doc__ or "").strip(), check))
+        table.append(Rule(rule_id, severity, (check.__doc__ or "").strip(), check, reads))
         return check
 
     return enter
@@ -81,6 +84,7 @@ TOKENS = {
     "beam:normalSource": ("authored", "shortestAxis", "none"),
     "beam:radianceMeaning": ("captured", "shaded", "baseColorOnly"),
 }
+SEQUENCE_FACTS = ("beam:sequence:frameCount", "beam:sequence:framesPerSecond", "beam:sequence:topology")
 OPTIONAL_TOKENS = {
     "beam:roughnessSource": ("texture", "estimated", "constant", "unknown"),
     "beam:sequence:topology": ("constant", "perSegment", "perFrame"),
@@ -124,10 +128,16 @@ def _time_codes(stage: Usd.Stage) -> Iterator[Fault]:
     """A stage with time samples states its time range and timeCodesPerSecond."""
     if not any(has_whole_clips(prim) and len(sample_times(prim)) > 1 for prim in splat_prims(stage)):
         return
-    if not stage.HasAuthoredTimeCodeRange() or not stage.GetStartTimeCode() <= stage.GetEndTimeCode():
-        yield Fault("startTimeCode and endTimeCode must be authored in order, got none or reversed ones. Author them.")
-    if not stage.HasAuthoredMetadata("timeCodesPerSecond") or not stage.GetTimeCodesPerSecond() > 0.0:
-        yield Fault("timeCodesPerSecond must be authored and positive, got none. Author the frame rate.")
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if not stage.HasAuthoredTimeCodeRange() or not first <= last:
+        got = f"{first:g} and {last:g}" if stage.HasAuthoredTimeCodeRange() else "none"
+        message = f"startTimeCode and endTimeCode must be authored in order, got {got}. Author them."
+        yield Fault(message, "startTimeCode")
+    is_stated, rate = stage.HasAuthoredMetadata("timeCodesPerSecond"), stage.GetTimeCodesPerSecond()
+    if not is_stated or not 0.0 < rate < np.inf:
+        got = f"{rate:g}" if is_stated else "none"
+        message = f"timeCodesPerSecond must be authored and positive, got {got}. Author the frame rate."
+        yield Fault(message, "timeCodesPerSecond")
 
 
 @entering(STAGE_RULES, "BEAM-STAGE-006", "error")
@@ -294,9 +304,9 @@ def _sequence_api(prim: Usd.Prim) -> Iterator[Fault]:
     if playing is None:
         yield Fault(f"an ancestor must have {SEQUENCE_API}, got none. Apply it to the default prim.")
         return
-    for name in ("frameCount", "framesPerSecond", "topology"):
-        if authored(playing, f"beam:sequence:{name}") is None:
-            yield Fault(f"beam:sequence:{name} must be authored on {playing.GetPath()}, got none. Author it.")
+    for name in SEQUENCE_FACTS:
+        if authored(playing, name) is None:
+            yield Fault(f"{name} must be authored, got none. Author it.", name, str(playing.GetPath()))
 
 
 @entering(PRIM_RULES, "BEAM-SEQ-002", "error")
@@ -305,14 +315,15 @@ def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
     playing, stage = sequence_prim(prim), prim.GetStage()
     if playing is None or not stage.HasAuthoredTimeCodeRange():
         return
-    count = authored(playing, "beam:sequence:frameCount")
-    codes = stage.GetEndTimeCode() - stage.GetStartTimeCode() + 1
+    count, rate = (authored(playing, name) for name in SEQUENCE_FACTS[:2])
+    codes, where = stage.GetEndTimeCode() - stage.GetStartTimeCode() + 1, str(playing.GetPath())
     if count is not None and count != codes:
-        yield Fault(f"frameCount must be the length of the range, {codes:g}, got {count}. Mend either.")
-    rate = authored(playing, "beam:sequence:framesPerSecond")
+        message = f"frameCount must be the length of the range, {codes:g}, got {count}. Mend either."
+        yield Fault(message, SEQUENCE_FACTS[0], where)
     if rate is not None and rate != stage.GetTimeCodesPerSecond():
-        got = stage.GetTimeCodesPerSecond()
-        yield Fault(f"framesPerSecond must equal timeCodesPerSecond, {got:g}, got {rate:g}. Mend either.")
+        wanted = stage.GetTimeCodesPerSecond()
+        message = f"framesPerSecond must equal timeCodesPerSecond, {wanted:g}, got {rate:g}. Mend either."
+        yield Fault(message, SEQUENCE_FACTS[1], where)
 
 
 @entering(PRIM_RULES, "BEAM-SEQ-003", "error")

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdr, Tf, Usd, UsdValidation
+from pxr import Gf, Sdr, Tf, Usd, UsdValidation
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
@@ -30,8 +30,8 @@ SECONDS = 120.0
 BYTES_PER_SECOND = 20e6
 """Lowest rate of reading and checking that the time limit allows [byte/s]."""
 
-HOST_VALIDATOR = "beam_warp.schema.host_validator:AssetRules"
-"""Name of our rules among OpenUSD's validators, where they are skipped because they run directly."""
+HOST_PLUGIN = "beam_warp.schema.host_validator"
+"""Plug-in of our rules among OpenUSD's validators, which are skipped because our rules run directly."""
 
 ALL_RULES = tuple(sorted([*STAGE_RULES, *FIRST_RULES, *PRIM_RULES, *FRAME_RULES], key=lambda rule: rule.id))
 """All rules of ours, sorted by id."""
@@ -47,11 +47,16 @@ def validate(path: str | Path) -> Report:
         AssetFormatError: The file cannot be opened at all.
     """
     source = require_asset_file(path)
-    size = sum(file.stat().st_size for file in source.parent.glob(f"{source.stem}*") if file.is_file())
-    answer = run_child("beam_warp.schema.validator", source, SECONDS + size / BYTES_PER_SECOND)
+    answer = run_child("beam_warp.schema.validator", source, time_limit(source))
     if "error" in answer:
         raise AssetFormatError(f"{source} must open in OpenUSD, got {answer['error']}. Export or copy the file again.")
     return Report.from_dict(answer)
+
+
+def time_limit(source: Path) -> float:
+    """Return how long the validation of an asset may take [s]."""
+    size = sum(file.stat().st_size for file in source.parent.glob(f"{source.stem}*") if file.is_file())
+    return SECONDS + size / BYTES_PER_SECOND
 
 
 def validate_stage(stage: Usd.Stage) -> Report:
@@ -67,37 +72,57 @@ def validate_stage(stage: Usd.Stage) -> Report:
 
 def check_rules(stage: Usd.Stage) -> Report:
     """Check a stage against our own rules only; at most two frames are in memory at a time."""
-    findings = [finding for rule in STAGE_RULES for finding in _ask(rule, stage, "/")]
+    findings = [finding for rule in STAGE_RULES for finding in ask(rule, stage, "/")]
     frames = gaussians = 0
     for prim in splat_prims(stage):
         path = str(prim.GetPath())
-        broken = [finding for rule in FIRST_RULES for finding in _ask(rule, prim, path)]
+        broken = [finding for rule in FIRST_RULES for finding in ask(rule, prim, path)]
         if broken:
             findings += broken
             continue
-        findings += [finding for rule in PRIM_RULES for finding in _ask(rule, prim, path)]
-        seen: dict[tuple[str, str], BrokenRule] = {}
-        for index, (time, frame) in enumerate(_frames(prim)):
-            frames = max(frames, index + 1)
-            gaussians += frame.count if index == 0 else 0
-            for rule in FRAME_RULES:
-                for found in _ask(rule, frame, path):
-                    first = seen.get((found.rule, found.attribute))
-                    seen[found.rule, found.attribute] = (
-                        replace(first, frames=first.frames + 1) if first else replace(found, time=time, frames=1)
-                    )
-        findings += seen.values()
+        findings += [finding for rule in PRIM_RULES for finding in ask(rule, prim, path)]
+        found, counts = check_frames(prim, FRAME_RULES)
+        findings += found
+        frames, gaussians = max(frames, len(counts)), gaussians + (counts[0] if counts else 0)
     return Report(stage.GetRootLayer().identifier, tuple(findings), frames, gaussians)
 
 
-def _ask(rule: Rule, subject: object, path: str) -> Iterator[BrokenRule]:
+def check_frames(
+    prim: Usd.Prim, rules: Sequence[Rule], interval: Gf.Interval | None = None
+) -> tuple[list[BrokenRule], list[int]]:
+    """Check the arrays of a prim, frame by frame, against rules about frames.
+
+    Args:
+        prim: A Gaussian-splat prim whose value clips are whole.
+        rules: Rules of `beam_warp.schema.frame_rules`.
+        interval: Time codes to check; None checks all.
+
+    Returns:
+        What is broken, each rule and attribute once, and the number of Gaussians in each frame.
+    """
+    seen: dict[tuple[str, str], BrokenRule] = {}
+    counts = []
+    reads = {name for rule in rules for name in rule.reads or CHANNELS} | {"positions"}
+    for time, frame in _frames(prim, reads, interval):
+        counts.append(frame.count)
+        for rule in rules:
+            for found in ask(rule, frame, str(prim.GetPath())):
+                first = seen.get((found.rule, found.attribute))
+                seen[found.rule, found.attribute] = (
+                    replace(first, frames=first.frames + 1) if first else replace(found, time=time, frames=1)
+                )
+    return list(seen.values()), counts
+
+
+def ask(rule: Rule, subject: object, path: str) -> Iterator[BrokenRule]:
+    """Yield how a stage, a prim or a frame breaks a rule; ``path`` is that of the prim."""
     for fault in rule.check(subject):
-        yield BrokenRule(rule.id, rule.severity, fault.message, path, fault.attribute)
+        yield BrokenRule(rule.id, rule.severity, fault.message, fault.prim or path, fault.attribute)
 
 
-def _frames(prim: Usd.Prim) -> Iterator[tuple[float, FrameArrays]]:
-    """Read a prim frame by frame; arrays that do not vary are read once."""
-    attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items()}
+def _frames(prim: Usd.Prim, names: Set[str], interval: Gf.Interval | None) -> Iterator[tuple[float, FrameArrays]]:
+    """Read arrays of a prim frame by frame; those that do not vary are read once."""
+    attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items() if name in names}
     attributes = {name: attribute for name, attribute in attributes.items() if attribute is not None}
     varying = frozenset(name for name, attribute in attributes.items() if attribute.ValueMightBeTimeVarying())
     playing = sequence_prim(prim)
@@ -106,6 +131,8 @@ def _frames(prim: Usd.Prim) -> Iterator[tuple[float, FrameArrays]]:
     arrays: dict[str, np.ndarray] = {}
     previous = None
     for time in sample_times(prim) or [prim.GetStage().GetStartTimeCode()]:
+        if interval is not None and not interval.Contains(time):
+            continue
         changed = frozenset(attributes) if previous is None else varying
         arrays = dict(arrays)
         for name in changed:
@@ -143,13 +170,17 @@ def _value(attribute: Usd.Attribute, time: float) -> object | None:
 def _usd_findings(stage: Usd.Stage) -> Iterator[BrokenRule]:
     """Run all validators of OpenUSD and its plug-ins except our own."""
     registry = UsdValidation.ValidationRegistry()
-    names = [
-        data.name for data in registry.GetAllValidatorMetadata() if not data.isSuite and data.name != HOST_VALIDATOR
-    ]
+    names = [data.name for data in registry.GetAllValidatorMetadata() if not data.isSuite]
+    others = [name for name in names if not name.startswith(f"{HOST_PLUGIN}:")]
     # The context takes validators: lists of names or metadata are mistaken for types.
-    context = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names))
+    context = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(others))
+    try:
+        errors = context.Validate(stage)
+    except Tf.ErrorException as error:  # a broken clip layer
+        yield BrokenRule("USD-Error", "error", f"OpenUSD must read every layer, got: {said_by_usd(error)}")
+        return
     materialx = any(name.startswith("ND_") for name in Sdr.Registry().GetShaderNodeNames())
-    for error in context.Validate(stage):
+    for error in errors:
         if not materialx and error.GetName() == "MissingShaderIdInRegistry" and "'ND_" in error.GetMessage():
             continue  # usd-core comes without MaterialX, so it knows none of its nodes
         severity: Severity = "error" if error.GetType() == UsdValidation.ValidationErrorType.Error else "warning"

@@ -29,6 +29,7 @@ from beam_warp.demo.from_images import FromImagesOptions
 from beam_warp.image.files import write_exr
 from beam_warp.mesh import extract
 from beam_warp.raster.records import RasterOptions
+from beam_warp.schema import register
 from beam_warp.stage import files
 from beam_warp.stage.meshes import Ground
 from beam_warp.world.camera import Camera
@@ -206,6 +207,13 @@ def of_tracing(folder, monkeypatch):
     }
 
 
+def of_validation(folder, monkeypatch):
+    register()
+    (folder / "person").mkdir()
+    save([a_world()["cloud"]], folder / "person" / "asset.usda")
+    return {}
+
+
 def of_viewer(folder, monkeypatch):
     pytest.importorskip("viser")
     (folder / "person").mkdir()
@@ -230,6 +238,7 @@ PREPARED = {
     "docs/reconstruction.md": of_reconstruction,
     "docs/rendering.md": of_rendering,
     "docs/tracing.md": of_tracing,
+    "docs/validation.md": of_validation,
     "docs/viewer.md": of_viewer,
 }
 """What the examples of a page take for granted: a function of a folder for files, which gives names."""

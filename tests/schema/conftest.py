@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.broken_assets import Asset
 
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -53,3 +54,8 @@ def cloud():
 @pytest.fixture
 def sequence():
     return make_sequence
+
+
+@pytest.fixture
+def asset(tmp_path):
+    return Asset(tmp_path, make_sequence, make_cloud)
