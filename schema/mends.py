@@ -316,6 +316,14 @@ class _Place(NamedTuple):
         else:
             self.layer.SetTimeSample(self.path, self.time, value)
 
+    def repeats(self) -> Iterator[_Place]:
+        """Yield the place of the primvar that shows the same value to shading networks, where there is one."""
+        for channel in CHANNELS.values():
+            if channel.primvar and self.path.name in channel.usd_names:
+                path = self.path.ReplaceName(channel.primvar)
+                if self.layer.GetAttributeAtPath(path) is not None:
+                    yield self._replace(path=path)
+
 
 def _rewrite(prim: Usd.Prim, name: str, columns: int, change: Change) -> None:
     """Change an array wherever it is stored, in order of time; all of it or, if one part cannot be mended, nothing."""
@@ -331,7 +339,8 @@ def _rewrite(prim: Usd.Prim, name: str, columns: int, change: Change) -> None:
         if new is not array:
             changed[place] = new
     for place, array in changed.items():
-        place.write(to_vt(str(attribute.GetTypeName()), array))
+        for each in (place, *place.repeats()):
+            each.write(to_vt(str(attribute.GetTypeName()), array))
 
 
 def _places(attribute: Usd.Attribute, times: Sequence[float]) -> dict[_Place, list[float]]:

@@ -62,6 +62,14 @@ def test_what_is_mended_breaks_no_rule_and_is_not_mended_again(asset, rule):
     assert mend_stage(asset.stage).mended == ()
 
 
+def test_the_primvar_of_a_mended_array_is_mended_with_it(asset):
+    asset.change("beam:baseColorh", 2, ABOVE_ONE)
+    mend_stage(asset.stage)
+    shown = np.asarray(asset.splats.GetAttribute("primvars:baseColor").Get())
+    assert np.array_equal(shown, np.asarray(asset.splats.GetAttribute("beam:baseColorh").Get()))
+    assert shown.max() <= 1.0
+
+
 @pytest.mark.parametrize("rule", sorted(LEFT.keys() - {"BEAM-CLIP-001"}))
 def test_what_only_the_producer_knows_is_left(asset, rule):
     asset.prepare(rule)
