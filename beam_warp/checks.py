@@ -30,8 +30,11 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], dt
         InvalidArrayError: The value cannot be converted, or its shape differs.
     """
     try:
-        array = np.ascontiguousarray(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
+        if isinstance(value, np.ma.MaskedArray) or np.iscomplexobj(value):
+            raise TypeError("masked and complex arrays lose values")
+        with np.errstate(over="ignore"):  # beyond the type's range is infinity, which `require_finite` names
+            array = np.ascontiguousarray(value, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArrayError(
             f"{name} must be an array of {np.dtype(dtype).name}, got {type(value).__name__} ({error}). "
             "Pass a rectangular numeric array."
