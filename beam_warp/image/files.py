@@ -132,9 +132,7 @@ SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
 """Suffixes of formats whose values are not clipped at white, unless their colour space is stated to be another."""
 
 
-def read_image(
-    path: str | os.PathLike[str], *, color_space: str | None = None, max_pixels: int = MAX_PIXELS
-) -> Image:
+def read_image(path: str | os.PathLike[str], *, color_space: str | None = None, max_pixels: int = MAX_PIXELS) -> Image:
     """Read an .exr, .hdr, .png, .jpg or .jpeg file.
 
     Args:
