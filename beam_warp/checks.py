@@ -5,6 +5,7 @@ All conditions are phrased positively (``not (value >= low)``), so that NaN fail
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+
+_SURROGATE = re.compile(r"[\ud800-\udfff]")
 
 UNIT_TOLERANCE = 1e-3
 """Largest | |v| - 1 | accepted as unit length; half-precision quaternions, the coarsest input, are within it."""
@@ -95,6 +98,11 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
     if not (low <= number <= high):
         raise InvalidOptionError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}. Choose one in range.")
     return number
+
+
+def is_text(value: object) -> bool:
+    """Return True for a text that is not empty and can be a file's name: no null, no half of a surrogate pair."""
+    return isinstance(value, str) and bool(value) and "\0" not in value and not _SURROGATE.search(value)
 
 
 def require_choice(name: str, value: str, choices: tuple[str, ...]) -> str:
