@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from beam_warp._version import __version__
-from beam_warp.cli.common.console import print_json, run_command
+from beam_warp.cli.common.console import escaped, print_json, run_command
 
 _EPILOG = """\
 exit code: 0 valid (warnings allowed), 1 a rule of severity error is broken, 2 the file cannot be read
@@ -46,7 +46,7 @@ def _validate(asset: str, as_json: bool, quiet: bool) -> int:
         print_json(report.as_dict())
     elif not quiet:
         for finding in report.findings:
-            print(finding)
+            print(escaped(str(finding)))
         errors = sum(finding.severity == "error" for finding in report.findings)
         warnings = len(report.findings) - errors
         size = f"{_plural(report.frames, 'frame')}, {_plural(report.gaussians, 'Gaussian')}"
