@@ -289,8 +289,8 @@ def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) ->
         most = max(len(times), MAX_HELD_FRAMES)
         if not 1 <= count <= most:
             raise AssetFormatError(
-                f"{source}: beam:sequence:frameCount must be in [1, {most}] for {len(times)} time samples, got {count}. "
-                "Mend it."
+                f"{source}: beam:sequence:frameCount must be in [1, {most}] for {len(times)} time samples, "
+                f"got {count}. Mend it."
             )
         start = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         times = [start + frame for frame in range(count)]

@@ -301,6 +301,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         AssetFormatError: It is larger.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise AssetFormatError(f"file must be regular, got a folder, pipe or device at {path}. Copy it again.")
         if most is not None and path.stat().st_size > most:
             raise AssetFormatError(f"file must be at most {most} bytes, got more at {path}. Check it, or split it.")
         return path.read_bytes()

@@ -51,12 +51,22 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            timer = threading.Timer(LATER, signal.raise_signal, (number,))
+            timer = threading.Timer(LATER, _again, (number,))
             timer.daemon = True
             timer.start()
             return
         frame = frame.f_back
     raise KeyboardInterrupt
+
+
+def _again(number: int) -> None:
+    """Interrupt the main thread from another one, also where it sleeps."""
+    import threading
+
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
 def with_streams_of_our_own(work: Callable[[], int]) -> int:

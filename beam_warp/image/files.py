@@ -272,8 +272,8 @@ def _read_exr(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
         filled, held = (len(described) * int(np.prod(size)) for size in (end - first, data_end - data_first))
         if filled > max(MAX_FILLED_VALUES, 16 * held):
             raise AssetFormatError(
-                f"image must fill a sixteenth of a display window that large, got {held} values for {filled} in {path}. "
-                "Crop its display window."
+                f"image must fill a sixteenth of a display window that large, got {held} values for {filled} "
+                f"in {path}. Crop its display window."
             )
         stored = OpenEXR.File(str(path), separate_channels=True).channels()
         pixels = {name: channel.pixels for name, channel in stored.items()}

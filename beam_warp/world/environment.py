@@ -58,8 +58,8 @@ class EnvironmentMap:
 
         Raises:
             MissingFileError: There is no such file.
-            AssetFormatError: It is no image, no HDR format, not 2:1, larger than `MAX_ENVIRONMENT_PIXELS`, or a texel is
-                negative, NaN or infinite.
+            AssetFormatError: It is no image, no HDR format, not 2:1, larger than `MAX_ENVIRONMENT_PIXELS`, or a texel
+                is negative, NaN or infinite.
         """
         path = Path(path)
         if path.suffix.lower() not in (".exr", ".hdr"):

@@ -1,11 +1,16 @@
 """Values that a layer may state against the schema, by their type or their size, are refused in one line."""
 
+import json
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 from pxr import Usd
 
-from beam_warp.errors import AssetFormatError, SchemaVersionError
+from beam_warp.errors import AssetFormatError, MissingFileError, SchemaVersionError
+from beam_warp.schema.files import require_asset_file, size_around
 from beam_warp.schema.reader import MAX_HELD_FRAMES, read_asset
 from beam_warp.schema.writer import write_asset
 
@@ -86,3 +91,50 @@ def test_frames_are_held_where_samples_end(tmp_path, text):
     clouds = read_all(tmp_path, text, COUNT, "int beam:sequence:frameCount = 4")
     assert len(clouds) == 4 < MAX_HELD_FRAMES
     assert (clouds[3].positions == clouds[1].positions).all()
+
+
+LAYERS = {
+    "sublayer": "#usda 1.0\n(\n  subLayers = [@./pipe.usda@]\n)\n",
+    "reference": "#usda 1.0\n(\n  subLayers = [@./inner.usda@]\n)\n",
+    "clip": """#usda 1.0
+def Xform "A" (
+    clips = {
+        dictionary default = {
+            asset[] assetPaths = [@./pipe.usda@]
+            string primPath = "/A"
+            double2[] active = [(0, 0)]
+        }
+    }
+)
+{
+}
+""",
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names, as POSIX has them")
+@pytest.mark.parametrize("kind", LAYERS)
+def test_a_layer_that_is_a_pipe_is_not_waited_for(tmp_path, kind):
+    """The probe runs in a child; a reader of a pipe without a writer never returns."""
+    os.mkfifo(tmp_path / "pipe.usda")
+    (tmp_path / "inner.usda").write_text('#usda 1.0\ndef Xform "A" (\n  prepend references = @pipe.usda@\n)\n{\n}\n')
+    (tmp_path / "a.usda").write_text(LAYERS[kind])
+    probe = [sys.executable, "-m", "beam_warp.schema.probe", str(tmp_path / "a.usda")]
+    done = subprocess.run(probe, capture_output=True, text=True, timeout=60, check=True)
+    assert json.loads(done.stdout)["error"] == f"{tmp_path / 'pipe.usda'}, which is no regular file"
+    with pytest.raises(MissingFileError, match="got a folder, pipe or device"):
+        require_asset_file(tmp_path / "pipe.usda")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_DATA counts mapped memory on Linux")
+def test_a_child_process_has_its_share_of_memory(tmp_path):
+    (tmp_path / "a[1].usda").write_bytes(bytes(2**20))
+    code = (
+        "import sys; from pathlib import Path; from beam_warp.schema.probe import limit_memory\n"
+        "limit_memory(Path(sys.argv[1])); import numpy\n"
+        "numpy.ones(2**26); numpy.ones(2**27)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a[1].usda")], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "1.00 GiB" in done.stderr
+    assert size_around(tmp_path / "a[1].usda") == 2**20
