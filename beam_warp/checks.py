@@ -93,7 +93,7 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
     """Return a number as a float after checking its range; NaN is outside every range."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if not (low <= number <= high):
         raise InvalidOptionError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}. Choose one in range.")

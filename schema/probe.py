@@ -55,7 +55,10 @@ def special_file(path: Path) -> str | None:
     """Return a file below an asset that is none but a pipe, a device or a folder, on which a reader might wait."""
     waiting, seen = [path], {path}
     while waiting:
-        layer = Sdf.Layer.FindOrOpen(str(waiting.pop()))
+        try:
+            layer = Sdf.Layer.FindOrOpen(str(waiting.pop()))
+        except Tf.ErrorException:  # the stage that names it says so
+            continue
         if layer is None:
             continue
         named = (name for names in UsdUtils.ExtractExternalReferences(layer.identifier) for name in names)
