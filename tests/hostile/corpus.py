@@ -45,6 +45,7 @@ class Reader:
     Attributes:
         make: Writes sound files into a folder, and returns the one that is spoiled.
         read: Reads all that there is, from the path of that file.
+        family: Fuzz target that reads it, too: ``splats``, ``captures`` or ``images``.
         swaps: Name → bytes of the sound file and what replaces them; none of the results may be accepted.
         is_json: True if fields are spoiled one by one, too.
         free: JSON fields that may hold anything.
@@ -53,6 +54,7 @@ class Reader:
 
     make: Callable[[Path], Path]
     read: Callable[[Path], object]
+    family: str = ""
     swaps: dict[str, tuple[bytes, bytes]] = field(default_factory=dict)
     is_json: bool = False
     free: frozenset[str] = frozenset()
@@ -311,11 +313,14 @@ EARLY = (0.0, 0.1, 0.3)
 """Cuts of files whose last part may be missing."""
 
 READERS: dict[str, Reader] = {
-    "ply": Reader(ply, _frames, PLY_SWAPS),
-    "text ply": Reader(text_ply, _frames, {**PLY_SWAPS, "a word": (b"-3.5", b"three"), "nan": (b"-3.5", b"nan")}),
+    "ply": Reader(ply, _frames, "splats", PLY_SWAPS),
+    "text ply": Reader(
+        text_ply, _frames, "splats", {**PLY_SWAPS, "a word": (b"-3.5", b"three"), "nan": (b"-3.5", b"nan")}
+    ),
     "compressed ply": Reader(
         compressed_ply,
         _frames,
+        "splats",
         {
             "a count beyond the file": (b"vertex 2", b"vertex 2000000"),
             "chunks beyond the file": (b"chunk 1", b"chunk 1000000000"),
@@ -326,6 +331,7 @@ READERS: dict[str, Reader] = {
     "usda": Reader(
         usda,
         lambda path: read_asset(path, trusted=True)[0],
+        "",
         {
             "a scalar for an array": (b"point3f[] positions = [", b"point3f positions = (0, 0, 0) #"),
             "no unit": (b"metersPerUnit = 1", b"metersPerUnit = 1e-300"),
@@ -338,6 +344,7 @@ READERS: dict[str, Reader] = {
     "exr": Reader(
         exr,
         EnvironmentMap.read,
+        "images",
         {
             "a window of zeros": (struct.pack("<4i", 0, 0, 31, 15), struct.pack("<4i", 0, 0, 8191, 4095)),
             "a window of ones": (struct.pack("<4i", 0, 0, 31, 15), struct.pack("<4i", 5, 5, 4, 4)),
@@ -347,6 +354,7 @@ READERS: dict[str, Reader] = {
     "hdr": Reader(
         hdr,
         EnvironmentMap.read,
+        "images",
         {
             "a large size": (b"-Y 16 +X 32", b"-Y 16384 +X 32768"),
             "a size beyond the file": (b"-Y 16 +X 32", b"-Y 512 +X 1024"),
@@ -361,28 +369,34 @@ READERS: dict[str, Reader] = {
     "png": Reader(
         png,
         read_image,
+        "images",
         {"a large size": (struct.pack(">II", 40, 30), struct.pack(">II", 2**30, 2**30))},
-        cuts=(0.0, 0.1, 0.3),
+        cuts=EARLY,
     ),
     "nerfstudio": Reader(
-        nerfstudio, _capture, is_json=True, free=frozenset({"k1", "k2", "p1", "truth", "noon", "relit"})
+        nerfstudio, _capture, "captures", is_json=True, free=frozenset({"k1", "k2", "p1", "truth", "noon", "relit"})
     ),
     "colmap cameras, text": Reader(
         colmap_text,
         _capture,
+        "captures",
         {"a word": (b"40 30", b"40 x"), "nan": (b"50.0", b"nan"), "a model": (b"PINHOLE", b"\x1b[31m")},
         cuts=(0.0, 0.3, 0.6),
     ),
     "colmap images, text": Reader(
         colmap_text_images,
         _capture,
+        "captures",
         {"a word": (b"0.25", b"x"), "nan": (b"0.25", b"nan"), "zero": (b"1 1 0", b"1 0 0")},
         cuts=(0.0, 0.3),
     ),
-    "colmap points, text": Reader(colmap_text_points, _capture, {"nan": (b"0.5 0.5", b"nan 0.5")}, cuts=(0.3,)),
+    "colmap points, text": Reader(
+        colmap_text_points, _capture, "captures", {"nan": (b"0.5 0.5", b"nan 0.5")}, cuts=(0.3,)
+    ),
     "colmap cameras": Reader(
         colmap_cameras,
         _capture,
+        "captures",
         {
             "a count beyond the file": (struct.pack("<QI", 1, 1), struct.pack("<QI", 2**60, 1)),
             "a size of nothing": (struct.pack("<QQ", 40, 30), struct.pack("<QQ", 0, 30)),
@@ -392,6 +406,7 @@ READERS: dict[str, Reader] = {
     "colmap images": Reader(
         colmap_images,
         _capture,
+        "captures",
         {
             "a count beyond the file": (struct.pack("<QI", 1, 1), struct.pack("<QI", 2**63, 1)),
             "a name without end": (b"a.png\0", b"a.pngx"),
@@ -399,17 +414,21 @@ READERS: dict[str, Reader] = {
         },
     ),
     "colmap points": Reader(
-        colmap_points, _capture, {"a count beyond the file": (struct.pack("<QQ", 1, 1), struct.pack("<QQ", 2**62, 1))}
+        colmap_points,
+        _capture,
+        "captures",
+        {"a count beyond the file": (struct.pack("<QQ", 1, 1), struct.pack("<QQ", 2**62, 1))},
     ),
     "projections": Reader(
         projections,
         _capture,
+        "captures",
         {"a word": (b"50 0 20", b"x 0 20"), "nan": (b"50 0 20", b"nan 0 20"), "singular": (b"0 0 1 3", b"0 0 0 3")},
         cuts=(0.0, 0.1, 0.3, 0.6),
     ),
-    "projection options": Reader(projection_options, _capture, is_json=True),
+    "projection options": Reader(projection_options, _capture, "captures", is_json=True),
     "stage": Reader(stage, lambda path: Stage.read(path).cloud_at(0.0), is_json=True, free=frozenset({"name"})),
-    "lights": Reader(lights, read_lights, is_json=True),
+    "lights": Reader(lights, read_lights, "captures", is_json=True),
     "stored frame": Reader(stored, read_frame, cuts=(0.0, 0.01, 0.1, 0.3)),
 }
 """Every reader of files that strangers made."""
