@@ -1,4 +1,4 @@
-"""Fuzzes the readers of captures: ``python tests/fuzz/captures.py -max_total_time=3600``, or other libFuzzer options."""
+"""Fuzzes the readers of captures: ``python tests/fuzz/captures.py -max_total_time=3600``, or any libFuzzer option."""
 
 import sys
 from pathlib import Path
