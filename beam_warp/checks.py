@@ -5,6 +5,7 @@ All conditions are phrased positively (``not (value >= low)``), so that NaN fail
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+
+_SURROGATE = re.compile(r"[\ud800-\udfff]")
 
 UNIT_TOLERANCE = 1e-3
 """Largest | |v| - 1 | accepted as unit length; half-precision quaternions, the coarsest input, are within it."""
@@ -30,8 +33,11 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], dt
         InvalidArrayError: The value cannot be converted, or its shape differs.
     """
     try:
-        array = np.ascontiguousarray(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
+        if isinstance(value, np.ma.MaskedArray) or np.iscomplexobj(value):
+            raise TypeError("masked and complex arrays lose values")
+        with np.errstate(over="ignore"):  # beyond the type's range is infinity, which `require_finite` names
+            array = np.ascontiguousarray(value, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArrayError(
             f"{name} must be an array of {np.dtype(dtype).name}, got {type(value).__name__} ({error}). "
             "Pass a rectangular numeric array."
@@ -87,11 +93,16 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
     """Return a number as a float after checking its range; NaN is outside every range."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if not (low <= number <= high):
         raise InvalidOptionError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}. Choose one in range.")
     return number
+
+
+def is_text(value: object) -> bool:
+    """Return True for a text that is not empty and can be a file's name: no null, no half of a surrogate pair."""
+    return isinstance(value, str) and bool(value) and "\0" not in value and not _SURROGATE.search(value)
 
 
 def require_choice(name: str, value: str, choices: tuple[str, ...]) -> str:

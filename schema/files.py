@@ -6,6 +6,7 @@ here only after a child process has opened it and read from it.
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import struct
@@ -18,8 +19,11 @@ from beam_warp.errors import AssetFormatError, MissingFileError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
-PROBE_SECONDS = 60.0
-"""Time limit for a child process that opens an asset [s]."""
+PROBE_SECONDS = 20.0
+"""Time limit for a child process that opens a small asset [s]."""
+
+PROBE_BYTES_PER_SECOND = 2e7
+"""Rate at which a child process reads at least, beyond `PROBE_SECONDS`."""
 
 MAX_PACKAGE_ENTRIES = 4096
 ZIP_ALIGNMENT = 64
@@ -43,6 +47,8 @@ def require_asset_file(path: str | Path) -> Path:
             f"{source} must end in {', '.join(SUFFIXES)}, got {source.suffix or 'no suffix'}. "
             "Convert it with beam-convert."
         )
+    if source.exists() and not source.is_file():
+        raise MissingFileError(f"{source} must be a readable file, got a folder, pipe or device. Check the path.")
     try:
         with source.open("rb") as stream:
             head = stream.read(16)
@@ -81,11 +87,16 @@ def require_opens(path: Path) -> None:
     """Open an asset in a child process, read from every layer there, and refuse the asset if this fails.
 
     Raises:
-        AssetFormatError: The child found a fault, crashed, or took longer than `PROBE_SECONDS`.
+        AssetFormatError: The child found a fault, crashed, or took longer than `PROBE_SECONDS` and its size explain.
     """
-    answer = run_child("beam_warp.schema.probe", path, PROBE_SECONDS)
+    answer = run_child("beam_warp.schema.probe", path, PROBE_SECONDS + size_around(path) / PROBE_BYTES_PER_SECOND)
     if answer.get("error"):
         raise _broken(path, "must open in OpenUSD", str(answer["error"]))
+
+
+def size_around(path: Path) -> int:
+    """Return the bytes of the files beside an asset that are named as it is: its layers, if it is one of ours."""
+    return sum(file.stat().st_size for file in path.parent.glob(f"{glob.escape(path.stem)}*") if file.is_file())
 
 
 def run_child(module: str, path: Path, seconds: float, *arguments: str) -> dict[str, object]:

@@ -123,6 +123,13 @@ def to_vt(type_name: str, array: NDArray[Any]) -> Any:
 
 
 def from_vt(channel: Channel, value: Any) -> NDArray[Any]:
-    """Convert a USD array to rows ``(M,)`` or ``(M, columns)`` of its own precision."""
+    """Convert a USD array to rows ``(M,)`` or ``(M, columns)`` of its own precision.
+
+    Raises:
+        ValueError: It is a single value, or its elements have another number of components.
+    """
     array = np.asarray(value)
-    return array.reshape(-1) if channel.columns == 1 else array.reshape(-1, channel.columns)
+    element = () if channel.columns == 1 else (channel.columns,)
+    if not array.ndim or (array.size and array.shape[1:] != element):
+        raise ValueError(f"shape {array.shape}")
+    return array.reshape(-1, *element)

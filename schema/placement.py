@@ -65,8 +65,13 @@ def placement_of(matrix: NDArray[np.float64], meters_per_unit: float, where: str
     """Decompose a local-to-world matrix of USD (row vectors, ``p' = p M``) into a similarity in metres.
 
     Raises:
-        AssetFormatError: The matrix shears, scales unevenly, or is singular.
+        AssetFormatError: The matrix projects, shears, scales unevenly, or is singular.
     """
+    if not (np.isfinite(matrix).all() and np.array_equal(matrix[:, 3], (0.0, 0.0, 0.0, 1.0))):
+        raise AssetFormatError(
+            f"{where} must be placed by rotation, uniform scale and translation, got a transform whose last column is "
+            f"{matrix[:, 3].tolist()}. Bake the transform into the Gaussians."
+        )
     linear = matrix[:3, :3].T
     determinant = float(np.linalg.det(linear))
     scale = abs(determinant) ** (1.0 / 3.0)

@@ -14,17 +14,19 @@ from pxr import Sdf, Tf, Usd, UsdUtils
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
-from beam_warp.schema.files import require_whole_crate
+from beam_warp.schema.files import SUFFIXES, require_whole_crate, size_around
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
-ADDRESS_SPACE = 8 * 2**30
-"""Address space for OpenUSD itself [byte]; a corrupt length that asks for more fails instead of filling memory."""
+MEMORY = 2**30
+"""Memory for OpenUSD itself [byte], of which it takes a tenth; a corrupt length that asks for more fails instead."""
 
 
 def fault(path: Path) -> str | None:
     """Return why an asset cannot be read, or None."""
     try:
+        if special := special_file(path):
+            return f"{special}, which is no regular file"
         stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
         problems = stage.GetCompositionErrors()
         if problems:
@@ -49,6 +51,26 @@ def fault(path: Path) -> str | None:
     return None
 
 
+def special_file(path: Path) -> str | None:
+    """Return a file below an asset that is none but a pipe, a device or a folder, on which a reader might wait."""
+    waiting, seen = [path], {path}
+    while waiting:
+        try:
+            layer = Sdf.Layer.FindOrOpen(str(waiting.pop()))
+        except Tf.ErrorException:  # the stage that names it says so
+            continue
+        if layer is None:
+            continue
+        named = (name for names in UsdUtils.ExtractExternalReferences(layer.identifier) for name in names)
+        for found in {Path(layer.ComputeAbsolutePath(name)) for name in named if name} - seen:
+            seen.add(found)
+            if found.is_file():
+                waiting += [found] if found.suffix.lower() in SUFFIXES else []
+            elif found.exists():
+                return str(found)
+    return None
+
+
 def said_by_usd(error: Tf.ErrorException) -> str:
     """Return OpenUSD's messages without its source lines and without repetition."""
     words = dict.fromkeys(str(getattr(item, "commentary", item)) for item in error.args)
@@ -68,20 +90,20 @@ def _touch(prim: Usd.Prim) -> None:
                 attribute.Get()
 
 
-def _limit_memory(path: Path) -> None:
+def limit_memory(path: Path) -> None:
+    """Bound the memory of this process by the size of an asset's files, where the platform can."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
-    size = sum(file.stat().st_size for file in path.parent.glob(f"{path.stem}*") if file.is_file())
-    limit = ADDRESS_SPACE + 4 * size
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    limit = MEMORY + 4 * size_around(path)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
 def main() -> None:
     """Probe the asset named on the command line."""
     path = Path(sys.argv[1])
-    _limit_memory(path)
+    limit_memory(path)
     register()
     reason = fault(path)
     print(json.dumps({"error": reason} if reason else {}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Tf, Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom, Vt
 
 from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
@@ -34,6 +35,12 @@ from beam_warp.schema.stage_queries import (
 )
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, Topology
 from beam_warp.world.metadata import UNSTATED_RASTER, capture_frames_metadata, raster_metadata
+
+MAX_HELD_FRAMES = 16_384
+"""Most frames that an asset may count beyond its time samples: nine minutes of stillness at 30 frames per second."""
+
+RATE_RANGE = (1e-3, 1e6)
+"""Range of playback rates [1/s]."""
 
 _MOVED = frozenset({"positions", "orientations", "scales", "normals", "radiance"})
 """Arrays that a moving transform changes."""
@@ -190,10 +197,11 @@ class _FrameReader:
             if value is None:
                 raise ValueError("no value")
             array = from_vt(channel, value)
-            array = array.astype(np.float32) if array.dtype.kind == "f" else array
+            with np.errstate(over="ignore"):  # the cloud refuses infinity, in words
+                array = array.astype(np.float32) if array.dtype.kind == "f" else array
         except (TypeError, ValueError) as error:
             raise AssetFormatError(
-                f"{where}: {attribute.GetName()} must be {channel.type_name}, got {attribute.GetTypeName()} "
+                f"{where}: {attribute.GetName()} must be {channel.type_name}, got {type(value).__name__} "
                 f"({error}). Export it again."
             ) from error
         if not attribute.ValueMightBeTimeVarying():
@@ -241,16 +249,16 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
             word = authored(playing, name)
             if word:
                 said[key] = str(word)
-        frames = authored(playing, "beam:sequence:captureFrames")
+        frames = authored(playing, "beam:sequence:captureFrames", Vt.IntArray)
         if frames is not None:
             said.update(capture_frames_metadata(frames))
     if not has_material_api(prim):
         return said
     version = str(authored(prim, "beam:schemaVersion") or "")
     major, _, minor = version.partition(".")
-    if major != SCHEMA_VERSION.partition(".")[0] or not minor.isdecimal():
+    if major != SCHEMA_VERSION.partition(".")[0] or not re.fullmatch("[0-9]{1,6}", minor):
         raise SchemaVersionError(
-            f"{source} must have schema version {SCHEMA_VERSION}, got {version or 'none'!r} at {prim.GetPath()}. "
+            f"{source} must have schema version {SCHEMA_VERSION}, got {version[:40] or 'none'!r} at {prim.GetPath()}. "
             "Upgrade beam-warp, or export the asset again."
         )
     said["schema_version"] = version
@@ -261,7 +269,7 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
         word = authored(prim, name)
         if word is not None:
             said[key] = str(word)
-    raster = [authored(prim, name) for name in ("beam:rasterAntialiased", "beam:rasterLowPass")]
+    raster = [authored(prim, "beam:rasterAntialiased", bool), authored(prim, "beam:rasterLowPass", float)]
     if raster != [None, None]:
         antialiased, low_pass = (UNSTATED_RASTER[i] if value is None else value for i, value in enumerate(raster))
         said.update(raster_metadata(bool(antialiased), low_pass))
@@ -274,14 +282,16 @@ def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) ->
     """Return the time of each frame, the playback rate, and the topology."""
     times = sample_times(prim)
     rate = stage.GetTimeCodesPerSecond()
-    if not rate > 0.0:
-        raise AssetFormatError(f"{source} must have a positive timeCodesPerSecond, got {rate:g}. Set it.")
     playing = sequence_prim(prim)
     topology = str(authored(playing, "beam:sequence:topology") or "perFrame") if playing is not None else "perFrame"
-    count = authored(playing, "beam:sequence:frameCount") if playing is not None else None
+    count = authored(playing, "beam:sequence:frameCount", int) if playing is not None else None
     if count is not None and len(times) != count:
-        if count < 1:
-            raise AssetFormatError(f"{source}: beam:sequence:frameCount must be at least 1, got {count}. Mend it.")
+        most = max(len(times), MAX_HELD_FRAMES)
+        if not 1 <= count <= most:
+            raise AssetFormatError(
+                f"{source}: beam:sequence:frameCount must be in [1, {most}] for {len(times)} time samples, "
+                f"got {count}. Mend it."
+            )
         start = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         times = [start + frame for frame in range(count)]
     elif len(times) > 1:
@@ -290,6 +300,11 @@ def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) ->
         if not np.allclose(steps, steps[0], rtol=1e-6):
             notes.append("time samples are unevenly spaced; the rate is that of the median step")
     times = times or [stage.GetStartTimeCode()]
+    if not (np.isfinite(times).all() and RATE_RANGE[0] <= rate <= RATE_RANGE[1]):
+        raise AssetFormatError(
+            f"{source} must have finite time codes and {RATE_RANGE[0]:g} to {RATE_RANGE[1]:g} frames per second, got "
+            f"{rate:g} from time {times[0]:g}. Set startTimeCode and timeCodesPerSecond."
+        )
     return times, rate, "constant" if topology == "constant" or len(times) == 1 else "perFrame"
 
 

@@ -20,6 +20,7 @@ from beam_warp.schema.layout import CHANNELS, SH_DEGREE
 from beam_warp.schema.placement import placement_of
 from beam_warp.schema.report import Severity
 from beam_warp.schema.stage_queries import (
+    METERS_RANGE,
     array_attribute,
     authored,
     clip_sets,
@@ -104,8 +105,8 @@ def _meters_per_unit(stage: Usd.Stage) -> Iterator[Fault]:
     meters = UsdGeom.GetStageMetersPerUnit(stage)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         yield Fault("metersPerUnit must be authored, got none. Set it, for example to 1.")
-    elif not 0.0 < meters < np.inf:
-        yield Fault(f"metersPerUnit must be positive, got {meters:g}. Set it, for example to 1.")
+    elif not METERS_RANGE[0] <= meters <= METERS_RANGE[1]:
+        yield Fault(f"metersPerUnit must be positive and at most {METERS_RANGE[1]:g}, got {meters:g}. Set it to 1.")
 
 
 @entering(STAGE_RULES, "BEAM-STAGE-003", "error")

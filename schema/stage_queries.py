@@ -24,6 +24,9 @@ _COLOR_SPACES = {
 }
 """Names that writers give to the two spaces in which splats are trained; OpenUSD has no name for the first."""
 
+METERS_RANGE = (1e-9, 1e16)
+"""Range of metersPerUnit: from `UsdGeom.LinearUnits.nanometers` to beyond `UsdGeom.LinearUnits.lightYears`."""
+
 
 def open_asset(path: str | Path, *, trusted: bool) -> tuple[Path, Usd.Stage]:
     """Check a file, register our schema, and open the file as a stage.
@@ -82,11 +85,12 @@ def stage_meters(stage: Usd.Stage, source: Path) -> float:
     """Return the length of a stage's unit [m], USD's default if it states none.
 
     Raises:
-        AssetFormatError: It is not positive.
+        AssetFormatError: It is beyond the units that OpenUSD names, from nanometres to light years.
     """
     meters = UsdGeom.GetStageMetersPerUnit(stage)
-    if not 0.0 < meters < np.inf:
-        raise AssetFormatError(f"{source} must have a positive metersPerUnit, got {meters:g}. Set it.")
+    if not METERS_RANGE[0] <= meters <= METERS_RANGE[1]:
+        low, high = METERS_RANGE
+        raise AssetFormatError(f"{source} must have metersPerUnit in [{low:g}, {high:g}], got {meters:g}. Set it.")
     return meters
 
 
@@ -118,10 +122,28 @@ def ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
         prim = prim.GetParent()
 
 
-def authored(prim: Usd.Prim, name: str) -> Any:
-    """Return an attribute's authored value at the default time, or None."""
+def authored(prim: Usd.Prim, name: str, kind: type = object) -> Any:
+    """Return an attribute's authored value at the default time, or None.
+
+    Args:
+        prim: Prim that has the attribute.
+        name: Name of the attribute.
+        kind: Type that the value must have; a layer may author another one than the schema's.
+
+    Raises:
+        AssetFormatError: It is of another type.
+    """
     attribute = prim.GetAttribute(name)
-    return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+    if not (attribute and attribute.HasAuthoredValue()):
+        return None
+    value = attribute.Get()
+    if not isinstance(value, kind):
+        got = type(value).__name__
+        raise AssetFormatError(
+            f"{prim.GetStage().GetRootLayer().identifier}: {attribute.GetPath()} must be of type {kind.__name__}, "
+            f"got {got}. Export it again."
+        )
+    return value
 
 
 def array_attribute(prim: Usd.Prim, channel: Channel) -> Usd.Attribute | None:

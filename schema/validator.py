@@ -16,10 +16,10 @@ from pxr import Gf, Sdr, Tf, Usd, UsdValidation
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
-from beam_warp.schema.files import require_asset_file, run_child
+from beam_warp.schema.files import require_asset_file, run_child, size_around
 from beam_warp.schema.frame_rules import FRAME_RULES, FrameArrays
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
-from beam_warp.schema.probe import said_by_usd
+from beam_warp.schema.probe import limit_memory, said_by_usd, special_file
 from beam_warp.schema.report import BrokenRule, Report, Severity
 from beam_warp.schema.rules import FIRST_RULES, PRIM_RULES, STAGE_RULES, Rule
 from beam_warp.schema.stage_queries import array_attribute, authored, sample_times, sequence_prim, splat_prims
@@ -55,8 +55,7 @@ def validate(path: str | Path) -> Report:
 
 def time_limit(source: Path) -> float:
     """Return how long the validation of an asset may take [s]."""
-    size = sum(file.stat().st_size for file in source.parent.glob(f"{source.stem}*") if file.is_file())
-    return SECONDS + size / BYTES_PER_SECOND
+    return SECONDS + size_around(source) / BYTES_PER_SECOND
 
 
 def validate_stage(stage: Usd.Stage) -> Report:
@@ -192,8 +191,12 @@ def _usd_findings(stage: Usd.Stage) -> Iterator[BrokenRule]:
 
 def main() -> None:
     """Validate the asset named on the command line; print the report, or why the asset cannot be opened."""
+    limit_memory(Path(sys.argv[1]))
     register()
     try:
+        if special := special_file(Path(sys.argv[1])):
+            print(json.dumps({"error": f"{special}, which is no regular file"}))
+            return
         stage = Usd.Stage.Open(sys.argv[1], Usd.Stage.LoadAll)
     except Tf.ErrorException as error:
         print(json.dumps({"error": said_by_usd(error)}))

@@ -126,11 +126,8 @@ def _judge_duplicates(rig: Mapping[str, Camera], findings: Findings) -> None:
     positions = poses[:, :3, 3]
     middle = np.median(positions, axis=0)
     scale = float(np.median(np.linalg.norm(positions - middle, axis=1)))
-    pairs = [
-        f"{names[i]} = {names[j]}"
-        for i, j in sorted(cKDTree(positions).query_pairs(1e-5 * scale + 1e-12))
-        if np.abs(poses[i, :3, :3] - poses[j, :3, :3]).max() < 1e-4
-    ]
+    rows = np.concatenate([positions / (1e-5 * scale + 1e-12), poses[:, :3, :3].reshape(-1, 9) / 1e-4], axis=1)
+    pairs = [f"{names[i]} = {names[j]}" for i, j in _neighbours(rows)]
     if pairs:
         findings.warn(
             "duplicate-pose",
@@ -138,6 +135,18 @@ def _judge_duplicates(rig: Mapping[str, Camera], findings: Findings) -> None:
             pairs,
             "Check that each camera has its own calibration.",
         )
+
+
+def _neighbours(rows: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return pairs of rows that differ by less than 1 everywhere: of each row one at most, so that few are many."""
+    _, firsts, groups = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    first = firsts[groups.reshape(-1)]
+    pairs = {(int(i), row) for row, i in enumerate(first) if i != row}
+    firsts = np.sort(firsts)
+    distances, nearest = cKDTree(rows[firsts]).query(rows[firsts], k=[2], p=np.inf, distance_upper_bound=1.0)
+    close = np.isfinite(distances[:, 0])
+    near = np.stack([firsts[close], firsts[nearest[close, 0]]], axis=1)
+    return sorted(pairs | {(min(i, j), max(i, j)) for i, j in near.tolist()})
 
 
 def _judge_up(rig: Mapping[str, Camera], findings: Findings) -> None:

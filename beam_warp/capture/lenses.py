@@ -28,6 +28,9 @@ COEFFICIENT_NAMES = ("k1", "k2", "k3", "k4", "p1", "p2")
 MAX_COEFFICIENT = 1e6
 """Largest coefficient; those of long lenses, whose tangents are small, reach thousands."""
 
+NEGLIGIBLE = 1e-12
+"""Coefficients up to this move no pixel of any photograph, and are too small to find the roots of a polynomial with."""
+
 MAX_TANGENT = 1e3
 """Largest tangent for which a lens is inverted, 3.4 arc minutes short of a right angle to the axis."""
 
@@ -80,7 +83,9 @@ class Lens:
         The derivative is 1 in the middle; this is the first place where it is 0.
         """
         derivative = [*(n * k for n, k in zip((9, 7, 5, 3), self.coefficients[3::-1], strict=True)), 1.0]
-        roots = np.roots(derivative)
+        if not any(abs(k) > NEGLIGIBLE for k in derivative[:-1]):
+            return np.inf
+        roots = np.roots([k if abs(k) > NEGLIGIBLE else 0.0 for k in derivative])
         squares = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
         return float(np.sqrt(squares.min())) if len(squares) else np.inf
 

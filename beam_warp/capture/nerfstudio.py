@@ -30,6 +30,7 @@ from beam_warp.capture.records import (
     read_json,
 )
 from beam_warp.capture.undistort import Intrinsics
+from beam_warp.checks import is_text
 from beam_warp.converters.ply_container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
@@ -38,7 +39,7 @@ from beam_warp.world.camera import OPENGL_TO_OPENCV
 FILE_NAME = "transforms.json"
 """Name of the file that describes the capture."""
 
-MAX_FILE_BYTES = 2**30
+MAX_FILE_BYTES = 2**27
 """Largest file that is read; a million records take about half of it."""
 
 MAX_FRAME = 10**9
@@ -139,14 +140,14 @@ class _Fields:
     def text(self, name: str, default: str | None = None) -> str:
         """Return a text that is not empty."""
         value = self._get(name, default)
-        if not isinstance(value, str) or not value or "\0" in value:
+        if not is_text(value):
             raise self.error(name, "a text", value)
         return value
 
     def texts(self, name: str) -> list[str]:
         """Return a list of texts; an empty one if the field is absent."""
         value = self.values.get(name, [])
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        if not isinstance(value, list) or not all(map(is_text, value)):
             raise self.error(name, "a list of texts", value)
         return value
 
@@ -164,7 +165,7 @@ class _Fields:
     def paths(self, name: str, root: Path) -> dict[str, Path]:
         """Return named files; none if the field is absent."""
         value = self.values.get(name, {})
-        if not isinstance(value, dict) or not all(isinstance(item, str) and item for item in value.values()):
+        if not isinstance(value, dict) or not all(map(is_text, value.values())):
             raise self.error(name, "an object of file names", value)
         return {key: root / item for key, item in value.items()}
 

@@ -183,7 +183,7 @@ def _read_options(path: Path) -> _Options:
         raise AssetFormatError(f"scale must be a number in [0.001, 1000], got {scale!r} at {path}. Correct the file.")
     if centers not in (None, "half", "integer"):
         raise AssetFormatError(f"pixel_centers must be half or integer, got {centers!r} at {path}. Correct the file.")
-    if space is not None and space not in COLOR_SPACES:
+    if space is not None and not (isinstance(space, str) and space in COLOR_SPACES):
         raise AssetFormatError(
             f"color_space must be one of {', '.join(COLOR_SPACES)}, got {space!r} at {path}. Correct the file."
         )

@@ -22,6 +22,9 @@ from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.image.files import Image, read_image
 from beam_warp.world.camera import Camera
 
+MAX_CONTAINERS = 2**21
+"""Most lists and objects of a JSON file; each takes 30 times its bytes in memory. A record has six."""
+
 MAX_RECORDS = 2**22
 """Most images that one capture may have."""
 
@@ -298,6 +301,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         AssetFormatError: It is larger.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise AssetFormatError(f"file must be regular, got a folder, pipe or device at {path}. Copy it again.")
         if most is not None and path.stat().st_size > most:
             raise AssetFormatError(f"file must be at most {most} bytes, got more at {path}. Check it, or split it.")
         return path.read_bytes()
@@ -316,6 +321,10 @@ def read_text(path: Path, most: int | None = None) -> str:
 def read_json(path: Path, what: str, most: int) -> Any:
     """Return the content of a JSON file, which errors call ``what``; see `read_bytes`."""
     text = read_text(path, most)
+    if (count := text.count("[") + text.count("{")) > MAX_CONTAINERS:
+        raise AssetFormatError(
+            f"{what} must hold at most {MAX_CONTAINERS} lists and objects, got {count} at {path}. Split it."
+        )
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -334,6 +343,8 @@ def mask_beside(root: Path, file_path: str) -> Path | None:
     image = PurePosixPath(file_path.replace("\\", "/"))
     parts = image.parts[1:] if image.parts[:1] == (IMAGE_FOLDER,) else image.parts
     inner = PurePosixPath(*parts)
+    if not inner.name:  # the image is named as a folder
+        return None
     for name in (inner.with_suffix(".png"), inner.with_name(inner.name + ".png")):
         path = root / MASK_FOLDER / name
         if path.is_file():

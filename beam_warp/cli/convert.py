@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.cli.common.console import print_json, print_notes, progress, run_command
+from beam_warp.cli.common.console import escaped, print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, Quiet, notes_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
@@ -144,7 +144,7 @@ def inspect(command: InspectCommand) -> int:
     if command.json:
         print_json(dataclasses.asdict(found))
     else:
-        print(found.as_text())
+        print("\n".join(map(escaped, found.as_text().split("\n"))))
     return 0
 
 

@@ -13,7 +13,7 @@ from beam_warp.capture.inspect import MAX_IMAGES, inspect_capture
 from beam_warp.capture.page import write_page
 from beam_warp.capture.picture import headline, verdict, write_picture
 from beam_warp.checks import require_package
-from beam_warp.cli.common.console import print_json, progress
+from beam_warp.cli.common.console import escaped, print_json, progress
 from beam_warp.cli.common.flags import make_folder
 
 
@@ -55,8 +55,8 @@ def inspect(args: Inspect) -> int:
         print_json({**report.as_dict(), "files": [str(path) for path in files]})
     elif not args.quiet:
         for finding in report.findings:
-            print(finding)
-        print(f"{args.capture}: {verdict(report)} ({headline(report)})")
+            print(escaped(str(finding)))
+        print(escaped(f"{args.capture}: {verdict(report)} ({headline(report)})"))
         if files:
             print(f"look at {files[0]} and {files[1]}")
     return 0 if report.is_reconstructable else 1

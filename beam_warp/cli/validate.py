@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beam_warp._version import __version__
-from beam_warp.cli.common.console import print_json, progress, run_command
+from beam_warp.cli.common.console import escaped, print_json, progress, run_command
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -92,9 +92,9 @@ def _with_physics(report: Report, options: argparse.Namespace) -> tuple[Report, 
 def _say(asset: str, report: Report, measured: Sequence[Measured]) -> None:
     """Print a report for people."""
     for finding in report.mended:
-        print(f"mended  {str(finding).removeprefix(f'{finding.severity:7} ')}")
+        print(escaped(f"mended  {str(finding).removeprefix(f'{finding.severity:7} ')}"))
     for finding in report.findings:
-        print(finding)
+        print(escaped(str(finding)))
     for each in measured:
         print(each)
     errors = sum(finding.severity == "error" for finding in report.findings)

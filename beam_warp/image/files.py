@@ -20,13 +20,20 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.checks import require_array, require_choice, require_finite, require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError, OutputError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
-from beam_warp.image.hdr import read_radiance_hdr
+from beam_warp.image.hdr import radiance_hdr_size, read_radiance_hdr
 
 MAX_SIDE = 32_768
 """Largest width or height read or written [px]."""
 
-MAX_PIXELS = 512 * 2**20
+MAX_PIXELS = 2**28
 """Largest number of pixels read; it is checked in the header, before memory is allocated."""
+
+MAX_ENVIRONMENT_PIXELS = 8192 * 4096
+"""Largest number of pixels of an environment: beyond, light costs gigabytes and minutes, and no render differs."""
+
+MAX_FILLED_VALUES = 2**26
+"""Most values of an EXR's display window, unless its data window holds a sixteenth of them: zeros that a few bytes of a
+header ask for."""
 
 MAX_CHANNELS = 64
 """Most channels read from one EXR."""
@@ -125,20 +132,21 @@ SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
 """Suffixes of formats whose values are not clipped at white, unless their colour space is stated to be another."""
 
 
-def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) -> Image:
+def read_image(path: str | os.PathLike[str], *, color_space: str | None = None, max_pixels: int = MAX_PIXELS) -> Image:
     """Read an .exr, .hdr, .png, .jpg or .jpeg file.
 
     Args:
         path: The file.
         color_space: Colour space of a file that departs from the convention of its format: EXR and HDR are
             scene-linear with premultiplied alpha, PNG and JPEG are display sRGB with straight alpha.
+        max_pixels: Largest number of pixels read; more are refused before memory is allocated.
 
     Returns:
         The image. An EXR's data window is placed in its display window, with zeros outside and overscan cut off.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be read.
-        AssetFormatError: The file is damaged, larger than `MAX_SIDE`, `MAX_PIXELS` or `MAX_CHANNELS`, or of a kind
+        AssetFormatError: The file is damaged, larger than `MAX_SIDE`, ``max_pixels`` or `MAX_CHANNELS`, or of a kind
             (deep, multi-part, subsampled, CMYK, ...) that is not read. NaN and infinity in an EXR are kept.
     """
     path = Path(path)
@@ -147,16 +155,16 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None) 
     suffix = path.suffix.lower()
     _require_file(path)
     if suffix == ".exr":
-        return Image(path, _read_exr(path), color_space or LINEAR_REC709, premultiplied=True)
+        return Image(path, _read_exr(path, max_pixels), color_space or LINEAR_REC709, premultiplied=True)
     if suffix == ".hdr":
-        rgb = read_radiance_hdr(path, _require_size)
+        rgb = read_radiance_hdr(path, lambda *size: _require_size(*size, max_pixels))
         channels = {name: rgb[..., index] for index, name in enumerate("RGB")}
         return Image(path, channels, color_space or LINEAR_REC709, premultiplied=True)
-    return Image(path, _read_pillow(path), color_space or DISPLAY_SRGB, premultiplied=False)
+    return Image(path, _read_pillow(path, max_pixels), color_space or DISPLAY_SRGB, premultiplied=False)
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return the width and height of an image file; only an .hdr is decoded for it.
+    """Return the width and height of an image file, from its header.
 
     Raises:
         MissingFileError: There is no such file, or it cannot be read.
@@ -166,8 +174,9 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     _require_file(path)
     suffix = path.suffix.lower()
     if suffix == ".hdr":
-        image = read_image(path)
-        return image.width, image.height
+        size = radiance_hdr_size(path)
+        _require_size(path, *size)
+        return size
     if suffix == ".exr":
         import OpenEXR
 
@@ -188,10 +197,10 @@ def _require_file(path: Path) -> None:
         raise MissingFileError(f"image must be a readable file, got {path} (no such file). Check the path.")
 
 
-def _require_size(path: Path, width: int, height: int) -> None:
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+def _require_size(path: Path, width: int, height: int, max_pixels: int = MAX_PIXELS) -> None:
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= max_pixels):
         raise AssetFormatError(
-            f"image must have sides in [1, {MAX_SIDE}] px and at most {MAX_PIXELS} px, got {width} x {height} "
+            f"image must have sides in [1, {MAX_SIDE}] px and at most {max_pixels} px, got {width} x {height} "
             f"in {path}. Resize it."
         )
 
@@ -220,26 +229,28 @@ def _intact(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _picture(path: Path) -> Iterator[Any]:
+def _picture(path: Path, max_pixels: int = MAX_PIXELS) -> Iterator[Any]:
     """Open a PNG or JPEG file with Pillow, after checking its size."""
     from PIL import Image as PillowImage
 
     try:
         with _intact(path), PillowImage.open(path, formats=("PNG", "JPEG")) as picture:
-            _require_size(path, *picture.size)
+            _require_size(path, *picture.size, max_pixels)
             yield picture
     except PillowImage.DecompressionBombError as error:
         raise AssetFormatError(f"image must be smaller, got {path} ({error}). Resize it.") from error
 
 
-def _window(path: Path, header: Mapping[str, Any], name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _window(
+    path: Path, header: Mapping[str, Any], name: str, max_pixels: int = MAX_PIXELS
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first and last + 1 corner of an EXR window as (x, y), after checking its size."""
     first, last = (np.asarray(corner, np.int64) for corner in header[name])
-    _require_size(path, *(last - first + 1).tolist())
+    _require_size(path, *(last - first + 1).tolist(), max_pixels)
     return first, last + 1
 
 
-def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
+def _read_exr(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
     import OpenEXR
 
     with _intact(path):
@@ -256,8 +267,14 @@ def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
                 f"image must have 1 to {MAX_CHANNELS} channels without subsampling, got {len(described)} channels "
                 f"in {path}. Export fewer, or not as luminance-chroma."
             )
-        data_first, data_end = _window(path, header, "dataWindow")
-        first, end = _window(path, header, "displayWindow")
+        data_first, data_end = _window(path, header, "dataWindow", max_pixels)
+        first, end = _window(path, header, "displayWindow", max_pixels)
+        filled, held = (len(described) * int(np.prod(size)) for size in (end - first, data_end - data_first))
+        if filled > max(MAX_FILLED_VALUES, 16 * held):
+            raise AssetFormatError(
+                f"image must fill a sixteenth of a display window that large, got {held} values for {filled} "
+                f"in {path}. Crop its display window."
+            )
         stored = OpenEXR.File(str(path), separate_channels=True).channels()
         pixels = {name: channel.pixels for name, channel in stored.items()}
         if any(array.shape != tuple(data_end - data_first)[::-1] for array in pixels.values()):
@@ -280,8 +297,8 @@ def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
 _PILLOW_CHANNELS = {"L": ("Y",), "LA": ("Y", "A"), "RGB": ("R", "G", "B"), "RGBA": ("R", "G", "B", "A")}
 
 
-def _read_pillow(path: Path) -> dict[str, NDArray[np.float32]]:
-    with _picture(path) as picture:
+def _read_pillow(path: Path, max_pixels: int) -> dict[str, NDArray[np.float32]]:
+    with _picture(path, max_pixels) as picture:
         coding = str(picture.tile[0][3] if picture.tile else "")
         if picture.mode == "P":
             picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")

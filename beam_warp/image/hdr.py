@@ -8,7 +8,7 @@ the same light; pictures in XYZE or with transposed scan order are refused.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -39,21 +39,40 @@ def read_radiance_hdr(path: Path, require_size: Callable[[Path, int, int], None]
         MissingFileError: There is no such file.
         AssetFormatError: The file is not a Radiance picture, is truncated or corrupt, or exceeds the limits.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MissingFileError(
-            f"image must be a readable file, got {path} ({error.strerror}). Check the path."
-        ) from error
+    data = _bytes_of(path)
     flip_y, flip_x, height, width, exposure, start = _parse_header(path, data)
     require_size(path, width, height)
     # A scanline takes at least one four-byte entry: refuse what cannot be complete before allocating for it.
     if len(data) - start < 4 * height:
         raise _truncated(path, 0)
-    rgbe = _decode(path, data, start, height, width)[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
     scale = np.ldexp(1.0 / exposure, np.arange(256) - 136)
     scale[0] = 0.0  # exponent 0 is black by definition
-    return (rgbe[..., :3] * scale[rgbe[..., 3], None]).astype(np.float32)
+    radiance = np.empty((height, width, 3), np.float32)
+    with np.errstate(over="ignore"):  # an exposure next to zero: infinity, which who asked for finite light refuses
+        for row, rgbe in enumerate(_scanlines(path, data, start, height, width)):
+            radiance[row] = rgbe[:, :3] * scale[rgbe[:, 3], None]
+    return radiance[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+
+
+def radiance_hdr_size(path: Path) -> tuple[int, int]:
+    """Return the width and height of a picture, from its header.
+
+    Raises:
+        MissingFileError: There is no such file.
+        AssetFormatError: The file is not a Radiance picture.
+    """
+    _, _, height, width, _, _ = _parse_header(path, _bytes_of(path, 2 * MAX_HEADER_BYTES))
+    return width, height
+
+
+def _bytes_of(path: Path, most: int = -1) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(most)
+    except OSError as error:
+        raise MissingFileError(
+            f"image must be a readable file, got {path} ({error.strerror}). Check the path."
+        ) from error
 
 
 def _truncated(path: Path, row: int) -> AssetFormatError:
@@ -86,16 +105,17 @@ def _parse_header(path: Path, data: bytes) -> tuple[bool, bool, int, int, float,
                 exposure *= float(value)
             except ValueError:
                 exposure = float("nan")
-    if not (0.0 < exposure < float("inf")):
-        raise AssetFormatError(f"image must have a positive EXPOSURE, got {exposure} in {path}. Mend its header.")
+    if not (1e-30 < exposure < 1e30):
+        raise AssetFormatError(
+            f"image must have an EXPOSURE in (1e-30, 1e30), got {exposure} in {path}. Mend its header."
+        )
     sign_y, height, sign_x, width = match.groups()
     return sign_y == b"+", sign_x == b"-", int(height), int(width), exposure, match.end()
 
 
-def _decode(path: Path, data: bytes, start: int, height: int, width: int) -> NDArray[np.uint8]:
-    """Return the RGBE bytes, ``(H, W, 4)``; the first bytes of each scanline state its encoding."""
+def _scanlines(path: Path, data: bytes, start: int, height: int, width: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield the RGBE bytes of each scanline, ``(W, 4)``; its first bytes state its encoding."""
     marker = bytes((2, 2, width >> 8, width & 255)) if MIN_RUN_WIDTH <= width <= MAX_RUN_WIDTH else None
-    rows = []
     position = start
     for row in range(height):
         if marker is not None and data.startswith(marker, position):
@@ -104,8 +124,7 @@ def _decode(path: Path, data: bytes, start: int, height: int, width: int) -> NDA
             line, position = _decode_old(data, position, width)
         if line is None:
             raise _truncated(path, row)
-        rows.append(line)
-    return np.stack(rows)
+        yield line
 
 
 def _decode_new(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint8] | None, int]:

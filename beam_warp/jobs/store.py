@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.errors import OutputError
+from beam_warp.errors import AssetFormatError, OutputError
 
 KEY = "beam_key"
 
@@ -62,7 +62,7 @@ def frame_key(path: Path) -> str | None:
     try:
         with h5py.File(path, "r") as file:
             return str(file.attrs[KEY])
-    except (OSError, KeyError):
+    except (OSError, KeyError, RuntimeError, ValueError):
         return None
 
 
@@ -73,10 +73,20 @@ def frame_names(path: Path) -> tuple[str, ...]:
 
 
 def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
-    """Read a frame's arrays, all or some."""
-    with h5py.File(path, "r") as file:
-        wanted = tuple(file) if names is None else names
-        return {name: np.asarray(file[name]) for name in wanted}
+    """Read a frame's arrays, all or some.
+
+    Raises:
+        AssetFormatError: The file is damaged, or lacks one.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            wanted = tuple(file) if names is None else names
+            return {name: np.asarray(file[name]) for name in wanted}
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
+        reason = " ".join(str(error).split())
+        raise AssetFormatError(
+            f"stored frame must be whole, got a damaged file at {path} ({reason}). Delete it; it is made again."
+        ) from error
 
 
 def kept_frame(path: Path, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

@@ -9,9 +9,10 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
+from beam_warp.checks import is_text
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 
-MAX_FILE_BYTES = 2**28
+MAX_FILE_BYTES = 2**24
 """Largest file read."""
 
 
@@ -120,7 +121,7 @@ class Fields:
     def text(self, name: str) -> str:
         """Return a text that is not empty."""
         value = self._values.get(name)
-        if not isinstance(value, str) or not value or "\0" in value:
+        if not is_text(value):
             raise self.error(name, "a text", "Write it in quotes.")
         return value
 
@@ -135,7 +136,10 @@ class Fields:
 
     def path(self, name: str, folder: Path, *, folders: bool = False) -> Path:
         """Return an existing file, relative to a folder unless it is absolute; with ``folders``, a folder will do."""
-        path = folder / Path(self.text(name)).expanduser()
+        try:
+            path = folder / Path(self.text(name)).expanduser()
+        except RuntimeError as error:  # ~ of a user that there is not
+            raise self.error(name, "an existing file", "Write its path without ~.") from error
         if not (path.is_file() or (folders and path.is_dir())):
             kind = "file or folder" if folders else "file"
             raise MissingFileError(

@@ -63,6 +63,7 @@ def frame_times(
     """
     first, end, step = _parse(frames, frame_count)
     if seconds is None and fps is None and speed is None:
+        _require_few(len(range(first, end, step)))
         numbers = tuple(range(first, end, step))
         return FrameTimes(numbers, tuple(number / frame_rate for number in numbers), frame_rate / step)
     if step != 1:
@@ -74,10 +75,14 @@ def frame_times(
     length = (end - first) / (frame_rate * pace) if seconds is None else seconds
     require_number("seconds", length, *SECONDS_RANGE)
     count = max(1, round(length * rate))
-    if count > MAX_IMAGES:
-        raise InvalidOptionError(f"seconds must hold at most {MAX_IMAGES} images, got {count}. Choose fewer.")
+    _require_few(count)
     start = first / frame_rate
     return FrameTimes(tuple(range(count)), tuple(start + number / rate * pace for number in range(count)), rate)
+
+
+def _require_few(count: int) -> None:
+    if count > MAX_IMAGES:
+        raise InvalidOptionError(f"seconds must hold at most {MAX_IMAGES} images, got {count}. Choose fewer.")
 
 
 def _parse(words: str | None, count: int) -> tuple[int, int, int]:

@@ -49,9 +49,9 @@ class Lamps:
         self._folder = server.gui.add_folder("Placed lights", visible=False)
 
     def add(self, kind: LightKind) -> int | None:
-        """Add a light, and return its number; None if there are too many."""
+        """Add a light, and return its number; None if there are too many, or the kind is none."""
         with self._lock:
-            if len(self._lamps) >= MOST_LAMPS:
+            if len(self._lamps) >= MOST_LAMPS or kind not in KINDS:
                 return None
             self._count += 1
             number = self._count

@@ -1,4 +1,4 @@
-"""A viser server on one address or none, silent, and never shared with the world."""
+"""A viser server on one address or none, silent, never shared with the world, and only for who has its token."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError, MissingPackageError
+from beam_warp.view.admission import Doorkeeper, admitting
 
 if TYPE_CHECKING:
     import viser
@@ -36,9 +37,12 @@ def start_server(host: str, port: int, label: str) -> viser.ViserServer:
 
     import rich
     import viser
+    from viser import _messages
 
     class Server(viser.ViserServer):
         """Asks no other machine to let the world in, whatever a page asks for."""
+
+        doorkeeper = Doorkeeper(host)
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
@@ -46,12 +50,15 @@ def start_server(host: str, port: int, label: str) -> viser.ViserServer:
     console = rich.get_console()
     was_quiet, console.quiet = console.quiet, True  # viser prints a panel of its own, whatever it is told
     try:
-        server: Any = Server(host=host, port=port, label=label, verbose=False)
+        with admitting(Server.doorkeeper):
+            server: Any = Server(host=host, port=port, label=label, verbose=False)
     finally:
         console.quiet = was_quiet
     if port and server.get_port() != port:  # somebody was faster; viser took the next one
         stop_server(server)
         raise _taken(host, port, "address already in use")
+    for upload in (_messages.FileTransferStartUpload, _messages.FileTransferPart):  # none of our controls takes files
+        server._websock_server.unregister_handler(upload)
     return server
 
 
@@ -68,10 +75,10 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def server_url(server: viser.ViserServer) -> str:
-    """Return what to type into a browser on this machine."""
+    """Return what to type into a browser on this machine, with the token."""
     host = server.get_host()
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    return f"http://{name}:{server.get_port()}"
+    return f"http://{name}:{server.get_port()}/?token={server.doorkeeper.token}"  # type: ignore[attr-defined]
 
 
 def _require_free(host: str, port: int) -> None:

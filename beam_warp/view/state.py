@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import srgb_to_linear
-from beam_warp.image.tone import ViewTransform
+from beam_warp.image.tone import TRANSFORMS, ViewTransform
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, Light, PointLight, SpotLight, unknown_light
@@ -35,8 +35,14 @@ NO_GROUND, GREY_GROUND, SHADOW_GROUND = "none", "grey", "shadows"
 LIMITS = {"rotation": (-360.0, 360.0), "exposure": (-16.0, 16.0), "samples": (1, 1_000_000), "frame": (0, 2**31 - 1)}
 """Least and most of every number."""
 
+CHOICES = {"mode": (DEFERRED, TRACED), "ground": (NO_GROUND, GREY_GROUND, SHADOW_GROUND), "transform": TRANSFORMS}
+"""Names of what every viewer has; those of channels and environments depend on the asset and the command line."""
+
 SPOT_CORE = 0.7
 """Part of a spot light's cone that gets all of its light."""
+
+FARTHEST = 1e6
+"""Largest coordinate of a light [m]."""
 
 LARGEST_SIDE = 8192
 """Sides of a page beyond this are a mistake [pixel]."""
@@ -63,6 +69,7 @@ class ViewState:
             deferred; where there is no GPU, once nothing moves.
         mode: `DEFERRED` or `TRACED`.
         samples: Paths a pixel at which path tracing ends.
+        choices: Names that a field may have, for every field that names something.
     """
 
     frame: int = 0
@@ -77,10 +84,11 @@ class ViewState:
     environment_shadows: bool = True
     mode: str = DEFERRED
     samples: int = 256
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: CHOICES, compare=False)
 
     def changed(self, **values: Any) -> ViewState:
-        """Return the state with other values; a number that is none is left as it was, one out of range is cut."""
-        known = {entry.name for entry in fields(self)}
+        """Return the state with other values; what is no number or no choice is left as it was, numbers are cut."""
+        known = {entry.name for entry in fields(self)} - {"choices"}
         kept: dict[str, Any] = {}
         for name, value in values.items():
             if name not in known:
@@ -90,6 +98,8 @@ class ViewState:
                 kept[name] = type(getattr(self, name))(number)
             elif name == "background":
                 kept[name] = color_within(value, self.background)
+            elif name in self.choices:
+                kept[name] = value if value in self.choices[name] else getattr(self, name)
             else:
                 kept[name] = value
         return replace(self, **kept)
@@ -219,9 +229,10 @@ class PlacedLight:
             kept["color"] = color_within(kept["color"], self.color)
         for name in ("position", "wxyz"):
             if name in kept:
-                numbers = tuple(float(number) for number in kept[name])
-                sound = all(map(math.isfinite, numbers)) and (name == "position" or math.hypot(*numbers) > 1e-9)
-                kept[name] = numbers if sound else getattr(self, name)
+                before = getattr(self, name)
+                numbers = tuple(number_within(number, math.nan, -FARTHEST, FARTHEST) for number in kept[name])
+                sound = len(numbers) == len(before) and all(map(math.isfinite, numbers))
+                kept[name] = numbers if sound and (name == "position" or math.hypot(*numbers) > 1e-9) else before
         return replace(self, **kept)
 
     def light(self) -> Light:

@@ -26,6 +26,7 @@ from beam_warp.view.painter import CloudPainter, Picture
 from beam_warp.view.schedule import LONGEST_SIDE, Pace, Schedule
 from beam_warp.view.server import DEFAULT_HOST, DEFAULT_PORT, server_url, start_server, stop_server
 from beam_warp.view.state import (
+    CHOICES,
     DEFERRED,
     GREY_GROUND,
     LIT,
@@ -133,6 +134,7 @@ class Viewer:
                 environment=next(iter(environments), NO_ENVIRONMENT),
                 environment_shadows=self._painter.is_cuda,
                 channel=self._painter.channels[0],
+                choices={**CHOICES, "channel": self._painter.channels, "environment": (*environments, NO_ENVIRONMENT)},
             )
             traced = Pace(500.0, first_pixels=2.0**22 if self._painter.is_cuda else 2.0**15)
             schedule = Schedule(first, moving=Pace(1000.0 / options.rate), traced=traced, longest=options.longest)
@@ -313,7 +315,7 @@ class _Controls:
         words = {LABELS.get(name, name): name for name in self._painter.channels}
         names = {name: word for word, name in words.items()}
         channels = gui.add_dropdown("Channel", tuple(words), initial_value=names[state.channel])
-        self._bind("channel", channels, words.__getitem__, names.__getitem__)
+        self._bind("channel", channels, words.get, names.__getitem__)
         if self._painter.can_trace:
             hint = "Paths are traced once nothing moves"
             self._bind("mode", gui.add_dropdown("Mode", (DEFERRED, TRACED), initial_value=state.mode, hint=hint))
@@ -421,8 +423,11 @@ class _Controls:
 
         @control.on_update
         async def _(event: Any) -> None:
-            if event.client is not None:  # a hand, and not `follow`
-                self._loop.change(**{name: meant(event.target.value)})
+            if event.client is None:  # `follow`, and not a hand
+                return
+            kept = shown(getattr(self._loop.change(**{name: meant(event.target.value)}), name))
+            if control.value != kept:  # what cannot be is not shown as if it were
+                control.value = kept
 
 
 def _framing(subject: SubjectBox) -> Camera:

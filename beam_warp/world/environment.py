@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_count, require_number
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError
-from beam_warp.image.files import MAX_SIDE, read_image
+from beam_warp.image.files import MAX_ENVIRONMENT_PIXELS, MAX_SIDE, read_image
 
 MIN_HEIGHT = 4
 """Fewest rows of a map: below, a texel spans more than an octant."""
@@ -58,7 +58,8 @@ class EnvironmentMap:
 
         Raises:
             MissingFileError: There is no such file.
-            AssetFormatError: It is no image, no HDR format, not 2:1, or a texel is negative, NaN or infinite.
+            AssetFormatError: It is no image, no HDR format, not 2:1, larger than `MAX_ENVIRONMENT_PIXELS`, or a texel
+                is negative, NaN or infinite.
         """
         path = Path(path)
         if path.suffix.lower() not in (".exr", ".hdr"):
@@ -66,7 +67,7 @@ class EnvironmentMap:
                 f"environment must be an .exr or .hdr file, got {path}. A display-referred image lacks the range of "
                 "light: export a high-dynamic-range one."
             )
-        radiance = read_image(path).rgb()
+        radiance = read_image(path, max_pixels=MAX_ENVIRONMENT_PIXELS).rgb()
         _require_environment("environment", radiance, f" in {path}", AssetFormatError)
         return cls(radiance)
 

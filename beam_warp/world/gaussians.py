@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
+from itertools import permutations, product
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +31,9 @@ from beam_warp.image.color import COLOR_SPACES
 
 WORLD_AXES = "rfu"
 """Axes of the internal world: x right, y forward, z up; right-handed."""
+
+_AXIS_CODES = {"".join(code) for ends in product("lr", "ud", "fb") for code in permutations(ends)}
+"""Every way in which x, y and z can point."""
 
 MATERIAL_CHANNELS = ("base_color", "roughness", "ambient_occlusion", "normals")
 """The channels that relighting reads."""
@@ -165,6 +169,10 @@ class GaussianCloud:
 
     def __post_init__(self) -> None:
         """Convert every array to its canonical type once and check it against its contract."""
+        if not (isinstance(self.axes, str) and self.axes in _AXIS_CODES):
+            raise InvalidOptionError(
+                f"axes must name one of l/r, u/d and f/b each, got {self.axes!r}. Write a code such as rfu."
+            )
         count = len(np.atleast_1d(np.asarray(self.positions)))
         for name, attribute in ATTRIBUTES.items():
             value: ArrayLike | None = getattr(self, name)

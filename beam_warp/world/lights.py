@@ -177,11 +177,13 @@ def read_lights(path: Path) -> tuple[Light, ...]:
         MissingFileError: The file cannot be read.
         AssetFormatError: The file is not JSON, or its list is wrong: see `lights_from_json`.
     """
+    if not path.is_file():
+        raise MissingFileError(f"lights must be a file, got {path} (no such file). Check its name.")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise MissingFileError(f"lights must be a file, got {path} ({error.strerror}). Check its name.") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise AssetFormatError(f"lights must be JSON, got {path} ({error}). Correct it.") from error
     if isinstance(content, dict) and "lights" in content:
         content = content["lights"]
@@ -200,6 +202,8 @@ def _light(record: Any, where: str) -> Light:
     for name in record:
         if name != "type" and name not in known:
             raise AssetFormatError(f"{where} must have attributes of {', '.join(known)}, got {name!r}. Leave it out.")
+    if not isinstance(record.get("casts_shadows", True), bool):
+        raise AssetFormatError(f"{where}.casts_shadows must be true or false, got another. Write it without quotes.")
     try:
         return kind(**{name: value for name, value in record.items() if name != "type"})
     except BeamError as error:

@@ -32,7 +32,7 @@ FLAGS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 )
-SHARP = "?fixedDpr=1"
+SHARP = "&fixedDpr=1"
 """Part of the address: the page takes away no pixels where it is slow."""
 
 FIRST = {"frame": 0, "channel": "lit", "environment": "studio", "rotation": 0.0, "exposure": 0.0}

@@ -47,6 +47,14 @@ def test_changes_are_told(placed):
     assert told[-1] == (light,)
 
 
+def test_a_kind_that_is_none_adds_nothing(placed):
+    """A page may send any word; a light that cannot be made would keep all later ones from being told."""
+    lamps, told, _ = placed
+    assert lamps.add("laser") is None
+    lamps.add("point")
+    assert [type(light) for light in told[-1]] == [PointLight]
+
+
 def test_there_is_a_most(placed):
     lamps, told, _ = placed
     for _ in range(MOST_LAMPS):

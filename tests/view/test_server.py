@@ -23,7 +23,7 @@ def test_it_serves_its_page_on_this_machine(capsys):
     server = start_server("127.0.0.1", 0, "figure")
     try:
         url = server_url(server)
-        assert url == f"http://127.0.0.1:{server.get_port()}"
+        assert url == f"http://127.0.0.1:{server.get_port()}/?token={server.doorkeeper.token}"
         with urllib.request.urlopen(url, timeout=20) as page:
             assert page.status == 200
         assert server.request_share_url() is None

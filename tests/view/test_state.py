@@ -1,6 +1,8 @@
 """What a viewer looks at: cameras agree with ours, numbers that are none change nothing, lights point where they do."""
 
+import asyncio
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +27,21 @@ from beam_warp.view.state import (
 )
 from beam_warp.world.camera import Camera
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
+
+
+def test_names_that_are_no_choice_are_left_as_they_were():
+    state = ViewState(environment="noon", choices={**ViewState().choices, "environment": ("noon", "none")})
+    hostile = {"environment": "no such", "mode": "x", "ground": ["none"], "transform": None}
+    assert state.changed(**hostile) == state
+    assert state.changed(environment="none", mode=TRACED).environment == "none"
+
+
+@pytest.mark.parametrize("name", ["position", "wxyz"])
+@pytest.mark.parametrize("numbers", [(1.0, 2.0), ("a", "b", "c", "d"), (math.inf,) * 3, ()])
+def test_a_light_stays_where_it_is_if_it_is_put_nowhere(name, numbers):
+    placed = PlacedLight(kind="spot", position=(1.0, 2.0, 3.0))
+    assert placed.changed(**{name: numbers}) == placed
+    assert placed.changed(position=(1e300, 0.0, 0.0)).position == (1e6, 0.0, 0.0)
 
 
 def seen_by(camera, fov):
@@ -173,3 +190,18 @@ def test_time_runs():
     assert [once.frame_at(100.0 + 0.25 * step) for step in range(5)] == [2, 3, 4, 4, 4]
     assert not once.is_over(100.4)
     assert once.is_over(100.5)
+
+
+def test_a_control_shows_what_holds_and_not_what_a_page_asked_for():
+    """An environment that is none would fail every page until somebody chose another."""
+    from beam_warp.view.viewer import _Controls
+
+    state = ViewState(environment="noon", choices={"environment": ("noon",)})
+    control = SimpleNamespace(value="noon")
+    control.on_update = lambda heard: setattr(control, "heard", heard)
+    controls = object.__new__(_Controls)
+    controls._loop, controls._bound = SimpleNamespace(change=state.changed), {}
+    controls._bind("environment", control)
+    control.value = "no such"
+    asyncio.run(control.heard(SimpleNamespace(client=1, target=control)))
+    assert control.value == "noon"

@@ -13,18 +13,40 @@ from beam_warp.jobs.listeners import NotedProgress
 
 
 def run_command(command: Callable[[], int]) -> int:
-    """Run a command; a caller's mistake becomes one line on stderr and exit code 2, never a traceback."""
+    """Run a command; a caller's mistake becomes one line on stderr and exit code 2, never a traceback.
+
+    What the system refuses, and names that no file can have, are the caller's to mend as well. Whoever knows more of
+    such an error has said so before; here it only becomes a line.
+    """
     try:
         return command()
-    except BeamError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as error:
-        print(f"stopped: {error}" if str(error) else "stopped", file=sys.stderr)
-        return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except KeyboardInterrupt as error:
+        print(escaped(f"stopped: {error}") if str(error) else "stopped", file=sys.stderr)
+        return 130
+    except (BeamError, OSError, UnicodeError, MemoryError) as error:
+        print(f"error: {escaped(_in_words(error))}", file=sys.stderr)
+        return 2
+
+
+def _in_words(error: Exception) -> str:
+    """Return what an error says to a user."""
+    if isinstance(error, BeamError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "memory must hold what is worked on, got too little of it. Use a smaller input, or a larger machine."
+    if isinstance(error, UnicodeError):
+        return f"names and texts must be UTF-8, got others ({error}). Rename the file, or mend the text."
+    place = "files" if error.filename is None else str(error.filename)  # type: ignore[attr-defined]
+    reason = error.strerror or str(error)  # type: ignore[attr-defined]
+    return f"{place} must be within reach, got {reason}. Check its name and rights, and the room on the disk."
+
+
+def escaped(text: str) -> str:
+    """Return one line that a terminal can only show: what does not print, such as ESC and newlines, is escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
 def print_json(value: Any) -> None:
@@ -36,7 +58,7 @@ def print_json(value: Any) -> None:
 def print_notes(notes: Iterable[str], warnings: Iterable[str] = ()) -> None:
     """Print on stderr what a user should know, beside the results."""
     for line in (*(f"note: {note}" for note in notes), *(f"warning: {warning}" for warning in warnings)):
-        print(line, file=sys.stderr)
+        print(escaped(line), file=sys.stderr)
 
 
 SPEED_PERIOD = 600.0
