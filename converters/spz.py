@@ -65,7 +65,7 @@ _MOST_RATIO, _ALWAYS_UNPACKED = 64, 1 << 24
 
 _MOST_RECORD_BYTES = 1 << 16
 
-_ZSTANDARD_LEVEL, _ZSTANDARD_WINDOW = 12, 1 << 27
+_GZIP_LEVEL, _ZSTANDARD_LEVEL, _ZSTANDARD_WINDOW = 4, 9, 1 << 27
 
 _FRACTIONAL_BITS = 12
 """Fractional bits of positions as other writers have them: 0.24 mm in metres."""
@@ -429,7 +429,7 @@ def _bands(higher: NDArray[np.float32]) -> bytes:
 
 def _stream(facts: tuple[Any, ...], arrays: list[bytes], records: bytes) -> bytes:
     """Return a file of version 3."""
-    packer = zlib.compressobj(wbits=31)
+    packer = zlib.compressobj(_GZIP_LEVEL, wbits=31)
     parts = (_STREAM_HEADER.pack(*facts), *arrays, records)
     return b"".join([*(packer.compress(part) for part in parts), packer.flush()])
 
