@@ -75,6 +75,8 @@ FORMATS: dict[str, Format] = {
         read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
     ),
     ".compressed.ply": Format(name="compressed PLY", reader="ply"),
+    ".spz": Format(name="SPZ", reader="spz", writer="spz", axes="rub"),
+    **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf", writer="gltf_writer", axes="rub")),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""

@@ -20,18 +20,22 @@ class FrameToWrite:
     """One frame as a file is to hold it.
 
     Attributes:
+        name: Name of the file without its suffix.
         cloud: Gaussians in the axes and the units of the file.
         number: Number of the frame, from 0.
         frames_per_second: Playback rate.
         units_per_meter: Units of the file in a metre.
         raster: How splats are to be drawn: antialiased or not, and the low-pass [px²]; None if that is not stated.
+        beside: Returns the temporary place of another file, which appears under the given name together with this one.
     """
 
+    name: str
     cloud: GaussianCloud
     number: int
     frames_per_second: float
     units_per_meter: float
     raster: tuple[bool, float] | None
+    beside: Callable[[str], Path]
 
 
 Encode = Callable[[FrameToWrite, Path, WriteOptions], None]
@@ -50,8 +54,13 @@ def write_frames(
     """
     count = len(sequence)
     paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
-    raster = stated_raster(sequence.metadata)
+    raster, others = stated_raster(sequence.metadata), list[Path]()
     with ExitStack() as outputs:
+
+        def beside(name: str) -> Path:
+            others.append(path.with_name(name))
+            return outputs.enter_context(replacing(others[-1]))
+
         for number, final in enumerate(paths):
             cloud, units_per_meter = sequence[number], 1.0
             if fixed_axes is not None:
@@ -60,11 +69,13 @@ def write_frames(
                 axes, units_per_meter = TARGETS[options.target]
                 cloud = change_axes(cloud, axes, scale=units_per_meter)
             frame = FrameToWrite(
+                name=final.stem,
                 cloud=cloud,
                 number=number,
                 frames_per_second=sequence.frames_per_second,
                 units_per_meter=units_per_meter,
                 raster=raster,
+                beside=beside,
             )
             encode(frame, outputs.enter_context(replacing(final)), options)
-    return paths
+    return paths + others

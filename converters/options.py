@@ -56,6 +56,7 @@ class WriteOptions:
         target: Consumer whose axes and units to write; None keeps the cloud's axes in metres (USD is always ``usd``).
         profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
+        spz_version: SPZ only. 3 is read by nearly everything; 4 is smaller and also holds degree 4.
         full_float: USD only. Single precision throughout instead of half where half suffices.
 
     Raises:
@@ -65,6 +66,7 @@ class WriteOptions:
     target: Target | None = None
     profile: Profile = "standard"
     sh_degree: int | None = None
+    spz_version: int = 3
     full_float: bool = False
 
     def __post_init__(self) -> None:
@@ -74,3 +76,4 @@ class WriteOptions:
         require_choice("profile", self.profile, ("standard", "beam"))
         if self.sh_degree is not None:
             require_count("sh_degree", self.sh_degree, 0, 3)
+        require_count("spz_version", self.spz_version, 3, 4)

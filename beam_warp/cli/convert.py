@@ -44,6 +44,7 @@ class ConvertCommand:
         "standard"
     )
     sh_degree: Annotated[int | None, arg(metavar="0..3", help="Pad or cut spherical harmonics to this degree.")] = None
+    spz_version: Annotated[int, arg(metavar="3|4", help="SPZ: 3 for nearly every reader, 4 for smaller files.")] = 3
     activation: Annotated[
         Activation | None, arg(help="How a PLY stores scales and opacities: log (3DGS) or linear.")
     ] = None
@@ -82,7 +83,11 @@ def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
     options = converters.WriteOptions(
-        target=command.target, profile=command.profile, sh_degree=command.sh_degree, full_float=command.full_float
+        target=command.target,
+        profile=command.profile,
+        sh_degree=command.sh_degree,
+        spz_version=command.spz_version,
+        full_float=command.full_float,
     )
     converters.require_output(command.output)
     sequence = converters.read(
