@@ -75,6 +75,8 @@ FORMATS: dict[str, Format] = {
         read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
     ),
     ".compressed.ply": Format(name="compressed PLY", reader="ply"),
+    ".sog": Format(name="SOG", reader="sog", writer="sog_writer", axes="rdf"),
+    "meta.json": Format(name="SOG", reader="sog"),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""
