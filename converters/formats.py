@@ -77,6 +77,8 @@ FORMATS: dict[str, Format] = {
     ".compressed.ply": Format(name="compressed PLY", reader="ply"),
     ".spz": Format(name="SPZ", reader="spz", writer="spz", axes="rub"),
     **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf", writer="gltf_writer", axes="rub")),
+    ".sog": Format(name="SOG", reader="sog", writer="sog_writer", axes="rdf"),
+    "meta.json": Format(name="SOG", reader="sog"),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""
