@@ -11,14 +11,20 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.world.harmonics import SH_C0
 
 LOG_SCALE_LIMITS = (-30.0, 20.0)
-"""Range of the natural log of a plausible standard deviation; above it, the activation is wrong."""
+"""Range of the natural log of a plausible standard deviation; above it, the activation is wrong.
+
+A writer says the lower limit for a scale of 0: readers that divide by its square in float32 still get a finite 1e26.
+"""
 
 LOGIT_LIMIT = 20.0
-"""Largest logit written: sigmoid(20) rounds to 1 in float32, and sigmoid(-20) = 2.1e-9 shows nothing."""
+"""Largest logit written: sigmoid(20) rounds to 1 in float32, and sigmoid(-20) = 2.1e-9 shows nothing.
+
+Of the opacities below 1, the largest float32 has the logit 16.6, so that 1 alone is written as the limit.
+"""
 
 
 def sigmoid(logits: ArrayLike) -> NDArray[np.float32]:
-    """Return 1 / (1 + exp(-x)); NaN stays NaN."""
+    """Return 1 / (1 + exp(-x)): exactly 1 for +inf and 0 for -inf; NaN stays NaN."""
     bounded = np.clip(np.asarray(logits, dtype=np.float64), -700.0, 700.0)  # exp(700) is still finite
     return (1.0 / (1.0 + np.exp(-bounded))).astype(np.float32)
 
@@ -32,7 +38,7 @@ def logit(opacities: ArrayLike) -> NDArray[np.float32]:
 
 
 def exp_scale(log_scales: ArrayLike) -> NDArray[np.float32]:
-    """Return the standard deviations of natural logs that lie in `LOG_SCALE_LIMITS`."""
+    """Return the standard deviations of natural logs that lie in `LOG_SCALE_LIMITS`; -inf is the log of 0."""
     return np.exp(np.asarray(log_scales, dtype=np.float64)).astype(np.float32)
 
 

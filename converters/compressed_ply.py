@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.blocks import for_each_block
 from beam_warp.converters.activations import dc_from_color, exp_scale
-from beam_warp.converters.ply_checks import require_log_scales, require_types
-from beam_warp.converters.ply_container import Element, PlyHeader, malformed, read_table
+from beam_warp.converters.ply_checks import require_types, settle_log_scales
+from beam_warp.converters.ply_container import Element, PlyHeader, malformed, open_columns, read_columns
 from beam_warp.image.color import DISPLAY_SRGB
 
 CHUNK_ROWS = 256
@@ -27,6 +28,13 @@ _SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "ma
 _COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
+PLACES = np.array([[0 if i == largest else 1 + i - (i > largest) for i in (1, 2, 3, 0)] for largest in range(4)])
+"""Where x, y, z, w are among the largest component and the other three in order, by its place in w, x, y, z."""
+
+_BITS_11_10_11 = ((21, 11), (11, 10), (0, 11))
+_BITS_8_8_8 = ((24, 8), (16, 8), (8, 8))
+"""Place from the lowest bit, and width, of the three fields of a word that lie between bounds [bit]."""
+
 
 def is_compressed(header: PlyHeader) -> bool:
     """True if the vertices are packed words."""
@@ -34,8 +42,12 @@ def is_compressed(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in vertex.names
 
 
-def decode(header: PlyHeader) -> dict[str, Any]:
+def decode(header: PlyHeader, drop_invalid: bool = False) -> dict[str, Any]:
     """Unpack a file into the fields of a cloud, in its own axes and units.
+
+    Args:
+        header: The file's header.
+        drop_invalid: Leave NaN where a row is no valid Gaussian, instead of refusing the file.
 
     Returns:
         positions, orientations (xyzw, unit), scales, opacities, radiance and radiance_color_space.
@@ -43,28 +55,38 @@ def decode(header: PlyHeader) -> dict[str, Any]:
     Raises:
         AssetFormatError: Elements, properties, types or counts differ from the layout above.
     """
-    vertex = header.element("vertex")
+    vertex, sh = header.element("vertex"), header.element("sh")
     assert vertex is not None  # is_compressed has seen it
-    bounds = _require_layout(header, vertex)
-    words = read_table(header, "vertex").columns(_WORDS, np.uint32)
-    position_words, rotation_words, scale_words, color_words = words.T
+    bounds, count = _require_layout(header, vertex), vertex.count
+    settle_log_scales(header.path, bounds[:, 6:12], drop_invalid)
+    bands = 0 if sh is None else len(sh.names) // 3
+    shapes = {"positions": (3,), "orientations": (4,), "scales": (3,), "opacities": (), "radiance": (1 + bands, 3)}
+    fields = {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
+    _, read_words = open_columns(header, "vertex")
+    _, read_bands = (None, None) if sh is None else open_columns(header, "sh")
 
-    chunk_of_row = np.arange(vertex.count) // CHUNK_ROWS
-    log_scales = _between(bounds[:, 6:12], _unpack_11_10_11(scale_words), chunk_of_row)
-    require_log_scales(header.path, log_scales)
-    color = _unpack_8888(color_words)
-    shown = _between(bounds[:, 12:18], color[:, :3], chunk_of_row) if bounds.shape[1] == 18 else color[:, :3]
-    radiance = dc_from_color(shown)[:, None]
-    if header.element("sh") is not None:
-        radiance = np.concatenate([radiance, _higher_bands(header)], axis=1)
-    return {
-        "positions": _between(bounds[:, 0:6], _unpack_11_10_11(position_words), chunk_of_row),
-        "orientations": _unpack_rotation(rotation_words),
-        "scales": exp_scale(log_scales),
-        "opacities": color[:, 3],
-        "radiance": radiance,
-        "radiance_color_space": DISPLAY_SRGB,
-    }
+    def unpack(part: slice) -> None:
+        words = np.empty((part.stop - part.start, 4), np.uint32)
+        read_words(part, [(_WORDS, words)])
+        position, rotation, scale, color = words.T
+        chunks = bounds[part.start // CHUNK_ROWS : -(-part.stop // CHUNK_ROWS)]
+        fields["positions"][part] = _between(chunks[:, 0:6], position, _BITS_11_10_11)
+        fields["orientations"][part] = _unpack_rotation(rotation)
+        fields["scales"][part] = exp_scale(_between(chunks[:, 6:12], scale, _BITS_11_10_11))
+        fields["opacities"][part] = _unorm(color, 0, 8)
+        fields["radiance"][part, 0] = dc_from_color(_between(chunks[:, 12:18], color, _BITS_8_8_8))
+        if read_bands is not None:
+            bytes_ = np.empty((len(words), 3 * bands), np.uint8)
+            read_bands(part, [(_band_names(bands), bytes_)])
+            fields["radiance"][part, 1:] = _band_values(bytes_).reshape(-1, bands, 3)
+
+    for_each_block(unpack, count)
+    return {**fields, "radiance_color_space": DISPLAY_SRGB}
+
+
+def _band_names(bands: int) -> list[str]:
+    """Return the columns of the higher bands, coefficient after coefficient; the file has channel after channel."""
+    return [f"f_rest_{channel * bands + k}" for k in range(bands) for channel in range(3)]
 
 
 def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
@@ -73,7 +95,8 @@ def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
     if chunk is None:
         raise malformed(header.path, "packed vertices must come with an element chunk", "none", "Export it again.")
     require_types(header.path, vertex, _WORDS, ("u4",))
-    names = _BOUNDS + _SCALE_BOUNDS + (_COLOR_BOUNDS if "min_r" in chunk.names else ())
+    colors = _COLOR_BOUNDS if "min_r" in chunk.names else ()
+    names = _BOUNDS + _SCALE_BOUNDS + colors
     require_types(header.path, chunk, names, ("f4",))
     wanted = -(-vertex.count // CHUNK_ROWS)
     if chunk.count != wanted:
@@ -92,7 +115,8 @@ def _require_layout(header: PlyHeader, vertex: Element) -> NDArray[np.float64]:
                 "Export it again.",
             )
         require_types(header.path, sh, tuple(f"f_rest_{i}" for i in range(len(sh.names))), ("u1",))
-    return read_table(header, "chunk").columns(names, np.float64)
+    (bounds,) = read_columns(header, "chunk", [names], np.float64)
+    return bounds if colors else np.hstack([bounds, np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 1.0], (len(bounds), 1))])
 
 
 def _unorm(words: NDArray[np.uint32], shift: int, bits: int) -> NDArray[np.float64]:
@@ -101,41 +125,34 @@ def _unorm(words: NDArray[np.uint32], shift: int, bits: int) -> NDArray[np.float
     return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask
 
 
-def _unpack_11_10_11(words: NDArray[np.uint32]) -> NDArray[np.float64]:
-    return np.column_stack([_unorm(words, 21, 11), _unorm(words, 11, 10), _unorm(words, 0, 11)])
-
-
-def _unpack_8888(words: NDArray[np.uint32]) -> NDArray[np.float64]:
-    return np.column_stack([_unorm(words, shift, 8) for shift in (24, 16, 8, 0)])
-
-
 def _between(
-    bounds: NDArray[np.float64], fraction: NDArray[np.float64], chunk_of_row: NDArray[np.intp]
+    bounds: NDArray[np.float64], words: NDArray[np.uint32], fields: tuple[tuple[int, int], ...]
 ) -> NDArray[np.float64]:
-    low, high = bounds[chunk_of_row, :3], bounds[chunk_of_row, 3:]
-    return low * (1.0 - fraction) + high * fraction
+    """Return three fields of each word, between the bounds of its chunk."""
+    values = np.empty((len(words), 3))
+    for column, (shift, bits) in enumerate(fields):
+        fraction = _unorm(words, shift, bits)
+        low, high = (np.repeat(bounds[:, place], CHUNK_ROWS)[: len(words)] for place in (column, column + 3))
+        values[:, column] = low * (1.0 - fraction) + high * fraction
+    return values
+
+
+def _band_values(bytes_: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the coefficient that a byte means: the middle of its interval in ± 4, but of the ends the ends."""
+    values = bytes_.astype(np.float32)
+    values += np.float32(0.5)
+    values *= np.float32(8.0 / 256.0)
+    values -= np.float32(4.0)  # exact so far: sums of a few powers of two
+    values[bytes_ == 0], values[bytes_ == 255] = -4.0, 4.0
+    return values
 
 
 def _unpack_rotation(words: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Return unit quaternions xyzw from the three smaller components in the order w, x, y, z."""
-    smaller = (np.column_stack([_unorm(words, shift, 10) for shift in (20, 10, 0)]) - 0.5) * np.sqrt(2.0)
-    squared = np.einsum("ij,ij->i", smaller, smaller)
-    largest_at = (words >> np.uint32(30)).astype(np.intp)
-    # The largest component is taken out of the order: the others keep theirs around it.
-    place = np.arange(3) + (np.arange(3) >= largest_at[:, None])
-    wxyz = np.empty((len(words), 4))
-    np.put_along_axis(wxyz, place, smaller, axis=1)
-    np.put_along_axis(wxyz, largest_at[:, None], np.sqrt(np.maximum(1.0 - squared, 0.0))[:, None], axis=1)
-    wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)  # rounding to 10 bits can leave more than 1 in the three
-    return wxyz[:, [1, 2, 3, 0]]
-
-
-def _higher_bands(header: PlyHeader) -> NDArray[np.float32]:
-    """Return the coefficients above the zeroth, ``(N, K - 1, 3)``."""
-    table = read_table(header, "sh")
-    bytes_ = table.columns([f"f_rest_{i}" for i in range(len(table.names))], np.uint8)
-    # A byte means the middle of its interval, except that the ends mean the ends.
-    levels = (np.arange(256) + 0.5) / 256.0
-    levels[[0, 255]] = 0.0, 1.0
-    values = ((levels - 0.5) * 8.0).astype(np.float32)[bytes_]
-    return values.reshape(len(values), 3, -1).transpose(0, 2, 1)
+    parts = np.empty((len(words), 4))
+    smaller = parts[:, 1:]
+    for column, shift in enumerate((20, 10, 0)):
+        smaller[:, column] = (_unorm(words, shift, 10) - 0.5) * np.sqrt(2.0)
+    parts[:, 0] = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", smaller, smaller), 0.0))
+    parts /= np.linalg.norm(parts, axis=1, keepdims=True)  # rounding to 10 bits can leave more than 1 in the three
+    return np.take_along_axis(parts, PLACES[words >> np.uint32(30)], axis=1)

@@ -6,7 +6,6 @@ as a logit, scale as natural logs, rot as w x y z. A file without ``scale_2`` (2
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,22 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_choice, require_number, rows_at
+from beam_warp.blocks import replace_rows
+from beam_warp.checks import require_choice, require_number
 from beam_warp.converters import compressed_ply
 from beam_warp.converters.activations import exp_scale, sigmoid
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.frames import DecodedFrame
-from beam_warp.converters.options import ReadOptions
-from beam_warp.converters.ply_checks import require_log_scales, require_not_linear, require_types
-from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, PlyTable, malformed, read_header, read_table
-from beam_warp.converters.producers import (
-    LAYOUTS,
-    NORMAL_NAMES,
-    MaterialLayout,
-    guess_producer,
-    material_producer,
-    material_properties,
-)
+from beam_warp.converters.options import MaterialActivation, ReadOptions
+from beam_warp.converters.ply_checks import require_not_linear, require_rotations, require_types, settle_log_scales
+from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, malformed, read_columns, read_header
+from beam_warp.converters.producers import LAYOUTS, NORMAL_NAMES, guess_producer, material_producer, material_properties
 from beam_warp.errors import AssetFormatError, BeamError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
@@ -58,11 +51,10 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     header = read_header(path)
     statements = _Statements.of(header)
     notes: list[str] = []
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is infinite or NaN, which a cloud refuses
-        if compressed_ply.is_compressed(header):
-            fields = compressed_ply.decode(header)
-        else:
-            fields = _decode(header, options, statements, notes)
+    if compressed_ply.is_compressed(header):
+        fields = compressed_ply.decode(header, options.drop_invalid)
+    else:
+        fields = _decode(header, options, statements, notes)
     return DecodedFrame(
         fields=fields,
         format=_format(header),
@@ -158,178 +150,138 @@ def _require_gaussians(header: PlyHeader) -> tuple[str, ...]:
     return names
 
 
-@dataclass
-class _Reading:
-    """A file while its columns are read.
-
-    Attributes:
-        header: The header.
-        options: Statements of the caller.
-        statements: Statements of the file.
-        notes: List to which assumptions and omissions are added.
-        table: The vertices.
-        read_names: Properties that have been read.
-    """
-
-    header: PlyHeader
-    options: ReadOptions
-    statements: _Statements
-    notes: list[str]
-    table: PlyTable
-    read_names: set[str]
-
-    def has(self, names: Sequence[str]) -> bool:
-        """Return True if the file has all these properties."""
-        return set(names) <= set(self.table.names)
-
-    def columns(self, names: Sequence[str]) -> NDArray[np.float32]:
-        """Return properties as ``(N, len(names))``."""
-        self.read_names |= set(names)
-        return self.table.columns(names)
+_Groups = dict[str, tuple[str, ...]]
+"""Names of the columns that each field of a cloud is made of."""
 
 
 def _decode(header: PlyHeader, options: ReadOptions, statements: _Statements, notes: list[str]) -> dict[str, Any]:
     """Return the fields of a cloud in the file's axes and units."""
     names = _require_gaussians(header)
-    reading = _Reading(header, options, statements, notes, read_table(header, "vertex"), set())
-    if options.drop_invalid:
-        reading.table = _without_invalid_rows(reading.table, notes)
-    fields = _geometry(reading)
-    fields |= _materials(reading)
-    fields |= _radiance(reading, "base_color" in fields)
-    unread = [name for name in names if name not in reading.read_names and name not in NORMAL_NAMES]
-    if unread:
+    material = options.material_activation or ("linear" if statements.material_linear else None)
+    layout = LAYOUTS[material or "linear"]
+    groups = _geometry_groups(names, notes)
+    groups |= _material_groups(header, names, options, material, notes)
+    groups |= {"normals": layout.normals} if set(layout.normals) <= set(names) else {}
+    groups |= _radiance_groups(header, names, statements, "base_color" in groups, notes)
+    met = {*NORMAL_NAMES, *_DC, *(name for group in groups.values() for name in group)}
+    if unread := [name for name in names if name not in met and not name.startswith("f_rest_")]:
         notes.append(f"properties left out: {', '.join(unread[:12])}{', …' if len(unread) > 12 else ''}")
+
+    fields: dict[str, Any] = dict(zip(groups, read_columns(header, "vertex", list(groups.values())), strict=True))
+    _activate(header.path, fields, options)
+    for name, (_, activate) in layout.channels.items():
+        if name in fields:
+            replace_rows(activate, fields[name])
+    for name in ("opacities", "roughness", "ambient_occlusion"):
+        if name in fields:
+            fields[name] = fields[name][:, 0]
+    if "radiance" in fields:
+        fields["radiance"] = fields["radiance"].reshape(len(fields["radiance"]), len(groups["radiance"]) // 3, 3)
+        fields["radiance_color_space"] = statements.radiance_color_space
+    if "normals" in fields and not _make_unit_normals(fields["normals"], notes):
+        del fields["normals"]
     return fields
 
 
-def _geometry(reading: _Reading) -> dict[str, Any]:
-    """Return positions, orientations, scales and opacities."""
-    path, activation = reading.header.path, reading.options.activation
-    is_flat = not reading.has(_SCALE)
-    scales, opacities = reading.columns(_FLAT if is_flat else _SCALE), reading.columns(["opacity"])[:, 0]
-    if activation != "linear":
-        if activation is None:
-            require_not_linear(path, scales, opacities)
-        require_log_scales(path, scales)
-        finite = np.isfinite(opacities)
-        if not finite.all():
-            raise malformed(path, "opacity must be finite", f"NaN or infinity at {rows_at(~finite)}", _DROP_REMEDY)
-        scales, opacities = exp_scale(scales), sigmoid(opacities)
+def _geometry_groups(names: tuple[str, ...], notes: list[str]) -> _Groups:
+    """Return the columns of positions, orientations, scales and opacities."""
+    is_flat = not set(_SCALE) <= set(names)
     if is_flat:
-        reading.notes.append("no scale_2: read as 2D Gaussians of thickness 0")
-        scales = np.column_stack([scales, np.zeros(len(scales), np.float32)])
+        notes.append("no scale_2: read as 2D Gaussians of thickness 0")
     return {
-        "positions": reading.columns(_POSITION),
-        "orientations": _orientations(path, reading.columns(_ROTATION)),
-        "scales": scales,
-        "opacities": opacities,
+        "positions": _POSITION,
+        "orientations": (*_ROTATION[1:], _ROTATION[0]),
+        "scales": _FLAT if is_flat else _SCALE,
+        "opacities": ("opacity",),
     }
 
 
-_DROP_REMEDY = "Repair those rows, or drop them with --drop-invalid."
+def _activate(path: Path, fields: dict[str, Any], options: ReadOptions) -> None:
+    """Make scales and opacities linear and quaternions unit, in place."""
+    scales, opacities = fields["scales"], fields["opacities"]
+    if options.activation != "linear":
+        if options.activation is None:
+            require_not_linear(path, scales, opacities)
+        settle_log_scales(path, scales, options.drop_invalid)
+        replace_rows(exp_scale, scales)
+        replace_rows(sigmoid, opacities)
+    if scales.shape[1] == 2:
+        fields["scales"] = np.column_stack([scales, np.zeros(len(scales), np.float32)])
+    replace_rows(_unit, fields["orientations"])
+    if not options.drop_invalid:
+        require_rotations(path, fields["orientations"])
 
 
-def _without_invalid_rows(table: PlyTable, notes: list[str]) -> PlyTable:
-    """Leave out rows that are no valid Gaussian."""
-    geometry = table.columns([name for name in table.names if name in (*_POSITION, "opacity", *_SCALE, *_DC)])
-    rotations = table.columns(_ROTATION).astype(np.float64)
-    valid = np.isfinite(geometry).all(axis=1) & (np.linalg.norm(rotations, axis=1) > 1e-12)
-    valid &= np.isfinite(rotations).all(axis=1)
-    if not valid.all():
-        notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} Gaussians dropped: not finite, or zero quaternions")
-    return table if valid.all() else PlyTable(table.names, table.rows[valid])
-
-
-def _orientations(path: Path, wxyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return unit quaternions xyzw; those that are unit already keep their bits."""
-    length = _lengths(wxyz)
-    bad = ~((length > 1e-12) & np.isfinite(length))
-    if bad.any():
-        zero = length[int(np.flatnonzero(bad)[0])] <= 1e-12
-        got = f"{'a zero quaternion' if zero else 'NaN or infinity'} at {rows_at(bad)}"
-        raise malformed(path, "rot_0 … rot_3 must be a quaternion", got, _DROP_REMEDY)
-    return _unit(wxyz[:, [1, 2, 3, 0]], length)
-
-
-def _lengths(vectors: NDArray[np.float32]) -> NDArray[np.float64]:
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors, dtype=np.float64))
-
-
-def _unit(vectors: NDArray[np.float32], lengths: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Divide vectors by their lengths, except where these are 1 to rounding."""
-    divisor = np.where(np.abs(lengths - 1.0) <= _UNIT_ROUNDING, 1.0, lengths)
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Divide vectors by their lengths; a zero vector stays zero, and one that is unit to rounding keeps its bits."""
+    lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors, dtype=np.float64))
+    divisor = np.where((np.abs(lengths - 1.0) <= _UNIT_ROUNDING) | (lengths == 0.0), 1.0, lengths)
     return (vectors / divisor[:, None]).astype(np.float32)
 
 
-def _radiance(reading: _Reading, has_base_color: bool) -> dict[str, Any]:
-    """Return the captured colour, unless the file states that its colour only repeats the material."""
-    statements = reading.statements
-    rest = [name for name in reading.table.names if name.startswith("f_rest_")]
-    present = [name for name in _DC if name in reading.table.names]
+def _radiance_groups(
+    header: PlyHeader, names: tuple[str, ...], statements: _Statements, has_base_color: bool, notes: list[str]
+) -> _Groups:
+    """Return the columns of the captured colour, unless the file states that its colour only repeats the material."""
+    rest = [name for name in names if name.startswith("f_rest_")]
+    present = [name for name in _DC if name in names]
     if not present and not rest:
-        reading.notes.append("no f_dc_0 … f_dc_2: read without colour")
+        notes.append("no f_dc_0 … f_dc_2: read without colour")
         return {}
     ordered = tuple(f"f_rest_{index}" for index in range(len(rest)))
     if len(present) != 3 or set(ordered) != set(rest) or len(rest) not in (0, 9, 24, 45, 72):
         raise malformed(
-            reading.header.path,
+            header.path,
             "spherical harmonics must be f_dc_0 … 2 and f_rest_0 … with 0, 9, 24, 45 or 72 of them",
             f"{len(present)} and {len(rest)}",
             "Export it again with full bands.",
         )
-    reading.read_names |= {*_DC, *rest}
     if statements.radiance_meaning == NO_COLOR or (statements.radiance_meaning == BASE_COLOR_ONLY and has_base_color):
         return {}
     if statements.radiance_meaning == BASE_COLOR_ONLY:
-        reading.notes.append("colour is base colour times ambient occlusion, not captured radiance")
-    radiance = np.empty((len(reading.table.rows), 1 + len(rest) // 3, 3), np.float32)
-    radiance[:, 0] = reading.columns(_DC)
-    if rest:
-        radiance[:, 1:] = reading.columns(ordered).reshape(len(radiance), 3, -1).transpose(0, 2, 1)
-    return {"radiance": radiance, "radiance_color_space": statements.radiance_color_space}
+        notes.append("colour is base colour times ambient occlusion, not captured radiance")
+    bands = len(rest) // 3  # of a channel; the file has channel after channel, a cloud coefficient after coefficient
+    return {"radiance": (*_DC, *(ordered[channel * bands + k] for k in range(bands) for channel in range(3)))}
 
 
-def _materials(reading: _Reading) -> dict[str, Any]:
-    """Return the material channels and normals whose storage the file or the caller states."""
-    asked = reading.options.material_activation
-    activation = asked or ("linear" if reading.statements.material_linear else None)
-    layout = LAYOUTS[activation or "linear"]
-    fields: dict[str, Any] = {}
-    found = material_properties(reading.table.names)
-    if activation is None and found:
-        producer = material_producer(reading.table.names)
-        named = f" of {producer[0]}" if producer else ""
-        choice = producer[1] if producer and producer[1] else "linear|r3dg|gsir|irgs"
-        reading.notes.append(
-            f"materials{named} left out ({', '.join(found)}): pass --material-activation {choice} to read them"
-        )
-    elif activation is not None:
-        for channel, (names, activate) in layout.channels.items():
-            if reading.has(names):
-                values = activate(reading.columns(names))
-                fields[channel] = values if len(names) == 3 else values[:, 0]
-        if asked is not None and not fields:
-            wanted = ", ".join(name for names, _ in layout.channels.values() for name in names)
-            raise malformed(
-                reading.header.path,
-                f"materials of {activation} must have {wanted}",
-                ", ".join(found) or "no material channels",
-                "Choose another --material-activation, or leave it out.",
+def _material_groups(
+    header: PlyHeader,
+    names: tuple[str, ...],
+    options: ReadOptions,
+    activation: MaterialActivation | None,
+    notes: list[str],
+) -> _Groups:
+    """Return the columns of the material channels whose storage the file or the caller states."""
+    found = material_properties(names)
+    if activation is None:
+        if found:
+            producer = material_producer(names)
+            named = f" of {producer[0]}" if producer else ""
+            choice = producer[1] if producer and producer[1] else "linear|r3dg|gsir|irgs"
+            notes.append(
+                f"materials{named} left out ({', '.join(found)}): pass --material-activation {choice} to read them"
             )
-    return fields | _normals(reading, layout)
+        return {}
+    channels = LAYOUTS[activation].channels
+    groups = {name: columns for name, (columns, _) in channels.items() if set(columns) <= set(names)}
+    if options.material_activation is not None and not groups:
+        wanted = ", ".join(name for columns, _ in channels.values() for name in columns)
+        raise malformed(
+            header.path,
+            f"materials of {activation} must have {wanted}",
+            ", ".join(found) or "no material channels",
+            "Choose another --material-activation, or leave it out.",
+        )
+    return groups
 
 
-def _normals(reading: _Reading, layout: MaterialLayout) -> dict[str, Any]:
-    """Return unit normals, or nothing if the file has the usual zeros."""
-    if not reading.has(layout.normals):
-        return {}
-    normals = reading.columns(layout.normals)
-    length = _lengths(normals)
-    usable = (length > 1e-6) & np.isfinite(length)
-    if not usable.any():
-        return {}
+def _make_unit_normals(normals: NDArray[np.float32], notes: list[str]) -> bool:
+    """Normalise normals in place; return False if the file has the usual zeros, or has them in part."""
+    squares = np.einsum("ij,ij->i", normals, normals, dtype=np.float64)
+    usable = (squares > 1e-12) & np.isfinite(squares)
+    if usable.any() and not usable.all():
+        notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
     if not usable.all():
-        reading.notes.append(f"normals left out: {np.count_nonzero(~usable)} of {len(usable)} are zero or not finite")
-        return {}
-    return {"normals": _unit(normals, length)}
+        return False
+    replace_rows(_unit, normals)
+    return bool(len(normals))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.blocks import for_each_block
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 MAX_HEADER_BYTES = 64 * 1024
@@ -99,24 +100,6 @@ class PlyHeader:
         """Comments of the form ``beam_<key> <value>``, by which our own writer describes a file."""
         pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
         return {key: value.strip() for key, _, value in pairs}
-
-
-@dataclass(frozen=True)
-class PlyTable:
-    """Rows of one element: a matrix if all columns have the same type, else a structured array."""
-
-    names: tuple[str, ...]
-    rows: NDArray[Any]
-
-    def columns(self, names: Sequence[str], dtype: Any = np.float32) -> NDArray[Any]:
-        """Return some columns as a new matrix ``(N, len(names))``; values too large for ``dtype`` become infinite."""
-        places = [self.names.index(name) for name in names]
-        with np.errstate(over="ignore", invalid="ignore"):
-            if self.rows.dtype.names:
-                return np.stack([self.rows[name].astype(dtype) for name in names], axis=1)
-            run = places == list(range(places[0], places[0] + len(places)))
-            picked = self.rows[:, places[0] : places[0] + len(places)] if run else self.rows[:, places]
-            return np.array(picked, dtype=dtype, order="C")
 
 
 def malformed(path: Path, contract: str, got: str, remedy: str) -> AssetFormatError:
@@ -250,12 +233,58 @@ def _check_sizes(header: PlyHeader) -> None:
             )
 
 
-def read_table(header: PlyHeader, name: str) -> PlyTable:
-    """Read the rows of one element.
+def read_columns(
+    header: PlyHeader, name: str, groups: Sequence[Sequence[str]], dtype: Any = np.float32
+) -> list[NDArray[Any]]:
+    """Read columns of one element, in one pass over the file that holds a block of its rows for each core.
+
+    Args:
+        header: The file's header.
+        name: Name of the element.
+        groups: Names of columns that the element has, for each matrix to return.
+        dtype: Type of the matrices; values too large for it become infinite.
+
+    Returns:
+        For each group a new matrix ``(N, len(group))`` with the columns in the group's order.
 
     Raises:
         AssetFormatError: The element is absent, has list properties, follows lists of unknown length, or is cut short.
     """
+    element, read = open_columns(header, name)
+    matrices = [np.empty((element.count, len(group)), dtype) for group in groups]
+
+    def fill(part: slice) -> None:
+        read(part, [(group, matrix[part]) for group, matrix in zip(groups, matrices, strict=True)])
+
+    for_each_block(fill, element.count)
+    return matrices
+
+
+ReadBlock = Callable[[slice, Sequence[tuple[Sequence[str], NDArray[Any]]]], None]
+"""Reads some rows: copies columns, named in their order, into each matrix."""
+
+
+def open_columns(header: PlyHeader, name: str) -> tuple[Element, ReadBlock]:
+    """Return an element and a function that reads blocks of its rows, on any thread.
+
+    Raises:
+        AssetFormatError: As `read_columns`; if the file has been cut since, the function raises it.
+    """
+    element, offset = _require_plain_rows(header, name)
+    is_text, order = header.encoding == "ascii", ENCODINGS[header.encoding]
+    kind = np.dtype([(column.name, "f4" if is_text else order + column.code) for column in element.properties])
+    text = _ascii_rows(header, element, offset).view(kind)[:, 0] if is_text else None
+
+    def read(part: slice, matrices: Sequence[tuple[Sequence[str], NDArray[Any]]]) -> None:
+        rows = _binary_rows(header, kind, offset, part) if text is None else text[part]
+        for names, matrix in matrices:
+            _pick(rows, names, matrix)
+
+    return element, read
+
+
+def _require_plain_rows(header: PlyHeader, name: str) -> tuple[Element, int]:
+    """Return an element whose rows can be found without reading, and where they begin: at a byte, or a text row."""
     element = header.element(name)
     if element is None:
         names = ", ".join(e.name for e in header.elements) or "no elements"
@@ -269,30 +298,34 @@ def read_table(header: PlyHeader, name: str) -> PlyTable:
                 ", ".join(column.name for column in other.properties if not column.code),
                 "Export Gaussians, not a mesh.",
             )
-    if not element.properties or not element.count:
-        return PlyTable(element.names, np.empty((element.count if element.properties else 0, len(element.names)), "f4"))
     if header.encoding == "ascii":
-        return PlyTable(element.names, _ascii_rows(header, element, sum(other.count for other in before)))
-    offset = header.data_start + sum(other.count * (other.stride or 0) for other in before)
-    return PlyTable(element.names, _binary_rows(header, element, offset))
+        return element, sum(other.count for other in before)
+    return element, header.data_start + sum(other.count * (other.stride or 0) for other in before)
 
 
-def _binary_rows(header: PlyHeader, element: Element, offset: int) -> NDArray[Any]:
-    order = ENCODINGS[header.encoding]
-    codes = {column.code for column in element.properties}
-    uniform = len(codes) == 1
-    if uniform:
-        dtype, items = np.dtype(order + codes.pop()), element.count * len(element.properties)
-    else:
-        dtype, items = np.dtype([(c.name, order + c.code) for c in element.properties]), element.count
+def _pick(rows: NDArray[Any], names: Sequence[str], out: NDArray[Any]) -> None:
+    """Copy columns of a structured array into a matrix."""
+    fields = rows.dtype.fields or {}
+    if {field[0] for field in fields.values()} == {out.dtype}:  # a matrix: one call that copies all columns is faster
+        places = [list(fields).index(name) for name in names]
+        np.take(rows.view(out.dtype).reshape(len(rows), -1), places, axis=1, out=out, mode="clip")
+        return
+    for column, name in enumerate(names):
+        out[:, column] = rows[name]
+
+
+def _binary_rows(header: PlyHeader, kind: np.dtype[Any], offset: int, part: slice) -> NDArray[Any]:
     # Not memory-mapped: a file that another program cuts while it is mapped would kill the process.
-    rows = np.fromfile(header.path, dtype=dtype, count=items, offset=offset)
-    if len(rows) != items:
+    count = part.stop - part.start
+    rows = np.fromfile(header.path, dtype=kind, count=count, offset=offset + part.start * kind.itemsize)
+    if len(rows) != count:
         raise malformed(header.path, "the file must not change while it is read", "fewer bytes", "Read it again.")
-    return rows.reshape(element.count, -1) if uniform else rows
+    return rows
 
 
 def _ascii_rows(header: PlyHeader, element: Element, skipped_rows: int) -> NDArray[np.float32]:
+    if not element.count:
+        return np.empty((0, len(element.properties)), np.float32)
     with header.path.open("rb") as file, warnings.catch_warnings():
         file.seek(header.data_start)
         text = io.TextIOWrapper(file, encoding="ascii", errors="replace")

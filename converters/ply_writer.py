@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp._version import __version__
+from beam_warp.blocks import for_each_block
 from beam_warp.converters.activations import log_scale, logit
 from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, display_radiance, resize_bands
 from beam_warp.converters.frame_files import FrameToWrite
@@ -26,9 +27,6 @@ from beam_warp.world.gaussians import GaussianCloud
 
 MAX_FILE_BYTES = 2**31 - 1
 """Largest file [byte]: importers index with signed 32-bit integers."""
-
-_BLOCK_ROWS = 1 << 14
-"""Rows converted at a time; a block of 62 floats a row fits into a core's cache."""
 
 _MATERIALS = ("base_color", "roughness", "ambient_occlusion")
 
@@ -92,10 +90,14 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
             "Write fewer bands (sh_degree) or fewer Gaussians."
         )
     rows = _row_source(cloud, radiance, extras, len(names))
-    with path.open("wb") as file:
-        file.write(header)
-        for start in range(0, len(cloud), _BLOCK_ROWS):
-            file.write(rows(slice(start, start + _BLOCK_ROWS)).data)
+    path.write_bytes(header)
+
+    def write(part: slice) -> None:
+        with path.open("r+b") as file:  # a handle of its own, so that threads write side by side
+            file.seek(len(header) + part.start * 4 * len(names))
+            file.write(rows(part).data)
+
+    for_each_block(write, len(cloud))
 
 
 def _property_names(coefficient_count: int, extras: list[str]) -> list[str]:
@@ -112,8 +114,8 @@ def _row_source(
     cloud: GaussianCloud, radiance: NDArray[np.float32], extras: list[str], width: int
 ) -> Callable[[slice], NDArray[np.float32]]:
     """Return a function that converts a slice of the cloud to rows of the file."""
-    rest = 3 * (radiance.shape[1] - 1)
-    tail = 9 + rest
+    bands = radiance.shape[1] - 1
+    tail = 9 + 3 * bands
 
     def rows(part: slice) -> NDArray[np.float32]:
         positions = cloud.positions[part]
@@ -122,7 +124,8 @@ def _row_source(
         if cloud.normals is not None:
             block[:, 3:6] = cloud.normals[part]
         block[:, 6:9] = radiance[part, 0]
-        block[:, 9:tail] = radiance[part, 1:].transpose(0, 2, 1).reshape(len(positions), rest)
+        for channel in range(3):
+            block[:, 9 + channel * bands : 9 + (channel + 1) * bands] = radiance[part, 1:, channel]
         block[:, tail] = logit(cloud.opacities[part])
         block[:, tail + 1 : tail + 4] = log_scale(cloud.scales[part])
         block[:, tail + 4] = cloud.orientations[part, 3]

@@ -30,7 +30,7 @@ from beam_warp.capture.records import (
     read_json,
 )
 from beam_warp.capture.undistort import Intrinsics
-from beam_warp.converters.ply_container import read_header, read_table
+from beam_warp.converters.ply_container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.world.camera import OPENGL_TO_OPENCV
@@ -98,21 +98,21 @@ def read_points(path: Path) -> SparsePoints:
         AssetFormatError: It is damaged, has no positions, or has some that are not finite.
     """
     header = read_header(path)
-    table = read_table(header, "vertex")
-    if missing := [name for name in "xyz" if name not in table.names]:
+    element = header.element("vertex")
+    properties = element.names if element else tuple("xyz")  # without the element, reading says what is there
+    if missing := [name for name in "xyz" if name not in properties]:
         raise AssetFormatError(f"points must have x, y and z, got no {missing[0]} in {path}. Export points.")
-    positions = table.columns(tuple("xyz"), np.float64)
+    names = ("red", "green", "blue")
+    groups = [tuple("xyz"), *([names] if set(names) <= set(properties) else [])]
+    positions, *colors = read_columns(header, "vertex", groups, np.float64)
     if not np.isfinite(positions).all():
         raise AssetFormatError(f"points must be finite, got NaN or infinity in {path}. Drop those points.")
-    names = ("red", "green", "blue")
-    if not all(name in table.names for name in names):
+    if not colors:
         return SparsePoints(positions)
-    element = header.element("vertex")
     codes = {column.code for column in element.properties if column.name in names} if element else set()
     if codes != {"u1"}:
         raise AssetFormatError(f"colours of points must be bytes, got {sorted(codes)} in {path}. Export them as uchar.")
-    colors = srgb_to_linear(table.columns(names, np.float64) / 255.0).astype(np.float32)
-    return SparsePoints(positions, colors)
+    return SparsePoints(positions, srgb_to_linear(colors[0] / 255.0).astype(np.float32))
 
 
 class _Fields:

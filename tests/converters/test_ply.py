@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 from reference.harmonics import sh_color
 
 from beam_warp import converters
+from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.converters import WriteOptions
 from beam_warp.converters.activations import LOGIT_LIMIT
 from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, SchemaVersionError
@@ -360,12 +361,64 @@ def test_normals_zero_in_part_are_left_out(columns, ply_file):
     assert "normals left out: 1 of 3 are zero or not finite" in notes_of(sequence)
 
 
+def test_limits_are_values(columns, ply_file, tmp_path):
+    # splat-transform writes +inf for an alpha of 1, and -inf for a scale of 0.
+    columns |= {"opacity": [np.inf, -np.inf, 0.0], "scale_2": [-np.inf, -7.0, -7.0]}
+    cloud = converters.read(ply_file(columns))[0]
+    assert np.array_equal(cloud.opacities, [1.0, 0.0, 0.5])
+    assert np.array_equal(cloud.scales[:, 2], np.float32([0.0, np.exp(-7.0), np.exp(-7.0)]))
+    kept = converters.read(tmp_path / "a.ply", drop_invalid=True)
+    assert np.array_equal(kept[0].positions, cloud.positions)
+    write(cloud, tmp_path / "b.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "b.ply"))["vertex"].data
+    assert np.array_equal(vertex["opacity"], [20.0, -20.0, 0.0])
+    assert np.array_equal(vertex["scale_2"], [-30.0, -7.0, -7.0])
+    back = converters.read(tmp_path / "b.ply")[0]
+    assert np.array_equal(back.opacities, np.float32([1.0, 1.0 / (1.0 + np.exp(20.0)), 0.5]))
+
+
 def test_invalid_rows_are_dropped_on_request(columns, ply_file):
-    columns["x"][0] = np.nan
-    columns["rot_0"][2] = 0.0
+    columns = {name: values * 2 for name, values in columns.items()}
+    columns["x"][0] = columns["opacity"][1] = columns["scale_0"][2] = np.nan
+    columns["scale_1"][3], columns["rot_0"][5] = 1000.0, 0.0
     sequence = converters.read(ply_file(columns), drop_invalid=True)
     assert np.array_equal(sequence[0].positions, [[1, -1, 2]])
-    assert "2 of 3 Gaussians dropped: not finite, or zero quaternions" in notes_of(sequence)
+    assert "5 of 6 Gaussians dropped: 4 not finite, 1 with a zero quaternion" in notes_of(sequence)
+
+
+def test_linear_values_are_seen_among_invalid_rows(columns, ply_file):
+    columns |= {"opacity": [0.1, np.nan, 1.0]} | {f"scale_{i}": [0.01, 0.02, np.nan] for i in range(3)}
+    with pytest.raises(AssetFormatError, match="which look linear"):
+        converters.read(ply_file(columns), drop_invalid=True)
+
+
+def test_writing_again_keeps_bits(make_cloud, tmp_path, rng):
+    """Positions, rotations and colour are copied. exp and ln of a log x, |x| >= 1/2, give x again to one rounding."""
+    cloud = make_cloud(3000, opacities=rng.uniform(size=3000), scales=np.exp(rng.uniform(-12, -0.5, (3000, 3))))
+    write(cloud, tmp_path / "a.ply")
+    once = converters.read(tmp_path / "a.ply")[0]
+    write(once, tmp_path / "b.ply")
+    first, again = (plyfile.PlyData.read(str(tmp_path / f"{name}.ply"))["vertex"].data for name in "ab")
+    lossy = ("opacity", "scale_0", "scale_1", "scale_2")
+    assert all(np.array_equal(first[name], again[name]) for name in first.dtype.names if name not in lossy)
+    for name in lossy[1:]:  # s is rounded by eps / 2, which moves ln s by as much: at most half a unit of |ln s| >= 1/2
+        assert (np.abs(again[name] - first[name]) <= np.spacing(np.abs(first[name]))).all()
+    twice = converters.read(tmp_path / "b.ply")[0]
+    # A logit has at most 16 EPSILON of rounding, of which o (1 - o) <= 1/4 arrives; o itself is rounded once more.
+    assert np.abs(twice.opacities - once.opacities).max() <= 5 * EPSILON
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_blocks_on_threads_join_without_a_seam(make_cloud, tmp_path, monkeypatch, cores):
+    monkeypatch.setattr("beam_warp.blocks._core_count", lambda: cores)
+    for count in (BLOCK_ROWS - 1, BLOCK_ROWS, 2 * BLOCK_ROWS + 1):
+        cloud = make_cloud(count, degree=1)
+        write(cloud, tmp_path / "a.ply")
+        back, plain = converters.read(tmp_path / "a.ply")[0], through_plyfile(tmp_path / "a.ply")
+        assert np.array_equal(back.radiance, cloud.radiance)
+        assert np.array_equal(back.positions, plain["positions"].astype(np.float32))
+        assert np.array_equal(back.scales, plain["scales"].astype(np.float32))
+        assert np.array_equal(back.opacities, plain["opacities"].astype(np.float32))
 
 
 def test_a_beam_profile_needs_materials(make_cloud, tmp_path):
@@ -396,14 +449,6 @@ def test_a_full_disk_leaves_nothing(make_cloud, tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=message):
         write(make_cloud(), tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
-
-
-def test_sixteen_thousand_row_blocks_join_without_a_seam(make_cloud, tmp_path):
-    # The writer converts 16,384 rows at a time: one less, the same, one more.
-    for count in (16383, 16384, 16385):
-        cloud = make_cloud(count, degree=0)
-        write(cloud, tmp_path / "a.ply")
-        assert np.array_equal(converters.read(tmp_path / "a.ply")[0].positions, cloud.positions)
 
 
 def test_options_are_checked():

@@ -9,7 +9,7 @@ import pytest
 
 from beam_warp import converters
 from beam_warp.cli.convert import main
-from beam_warp.converters.ply_container import read_header, read_table
+from beam_warp.converters.ply_container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 
 
@@ -135,9 +135,9 @@ def test_a_point_cloud_is_named(ply_bytes, tmp_path):
     [
         ("x", [0.0, np.nan, np.inf], "positions must be finite, got NaN or infinity at row 1 (2 rows in all)"),
         ("f_dc_0", [0.0, 0.0, np.nan], "radiance must be finite, got NaN or infinity at row 2."),
-        ("opacity", [0.0, np.nan, 0.0], "opacity must be finite, got NaN or infinity at row 1. Repair those rows, or"),
-        ("scale_0", [-4.0, np.nan, np.nan], "natural logs in [-30, 20], got nan at row 1 (2 rows in all)"),
-        ("scale_1", [-4.0, 1000.0, -4.0], "natural logs in [-30, 20], got 1000 at row 1."),
+        ("opacity", [0.0, np.nan, np.inf], "opacities must be finite, got NaN or infinity at row 1. Drop or repair"),
+        ("scale_0", [-4.0, np.nan, np.nan], "natural logs in [-30, 20], or -inf, got nan at row 1 (2 rows in all)"),
+        ("scale_1", [-4.0, 1000.0, np.inf], "[-30, 20], or -inf, got 1000 at row 1 (2 rows in all). Drop those rows"),
         ("rot_0", [0.0, 0.0, 0.0], f"{QUATERNION}, got a zero quaternion at row 0 (2 rows in all)"),
         ("rot_2", [0.0, np.nan, 0.0], f"{QUATERNION}, got NaN or infinity at row 1."),
     ],
@@ -198,13 +198,13 @@ def test_malformed_text(tmp_path, rows, message):
     text = f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nend_header\n{rows}"
     (tmp_path / "a.ply").write_bytes(text.encode("latin-1"))
     with pytest.raises(AssetFormatError) as caught:
-        read_table(read_header(tmp_path / "a.ply"), "vertex")
+        read_columns(read_header(tmp_path / "a.ply"), "vertex", ["xy"])
     assert message in str(caught.value)
 
 
 def test_an_element_that_is_not_there(columns, ply_file):
     with pytest.raises(AssetFormatError, match=r"a\.ply: the file must have an element face, got vertex\. Check"):
-        read_table(read_header(ply_file(columns)), "face")
+        read_columns(read_header(ply_file(columns)), "face", ["x"])
 
 
 def test_rows_without_columns_cost_no_time(tmp_path):
