@@ -31,6 +31,8 @@ def notes_of(sequence):
 
 
 def write(cloud, path, **options):
+    if "target" not in options:
+        options = {"axes": cloud.axes} | options
     return converters.write(GaussianSequence.from_clouds([cloud]), path, WriteOptions(**options))
 
 
