@@ -14,7 +14,7 @@ from beam_warp.converters.numbering import numbered_path as numbered_path
 from beam_warp.converters.options import Activation, MaterialActivation, ReadOptions
 from beam_warp.converters.options import WriteOptions as WriteOptions
 from beam_warp.converters.staging import folders_made, require_writable
-from beam_warp.errors import InvalidOptionError
+from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.gaussians import GaussianSequence
 
 if TYPE_CHECKING:
@@ -60,10 +60,13 @@ def read(
         drop_invalid=drop_invalid,
     )
     paths = files_at(source)
-    for form in {id(form): form for form in map(format_of, paths)}.values():
-        form.require_meaningful(options, source)
-    if format_of(paths[0]).holds_sequences:
-        return format_of(paths[0]).of_reader("read")(paths[0], options)
+    form = format_of(paths[0])
+    if not paths[0].is_file():
+        raise MissingFileError(f"input must be an existing file or folder, got {source}. Check the path.")
+    for other in dict.fromkeys(map(format_of, paths)):
+        other.require_meaningful(options, source)
+    if form.holds_sequences:
+        return form.of_reader("read")(paths[0], options)
     for other in paths[1:]:  # so that a truncated file is found before any work is done
         probe(other)
     names = [file.name for file in paths]

@@ -1,8 +1,8 @@
 """Arrays by name in NumPy's ``.npz`` and in HDF5; ``docs/formats.md`` lists the names, those of a `GaussianCloud`.
 
 Both may also state ``axes``, ``meters_per_unit``, ``frames_per_second`` and ``radiance_color_space``: as arrays without
-an axis in ``.npz``, as attributes of the file in HDF5. An HDF5 file holds one frame, or several: in arrays with one more
-axis in front, or in a group for each. What is shared by all frames stands at the root once.
+an axis in ``.npz``, as attributes of the file in HDF5. An HDF5 file holds one frame, or several: in arrays with one
+more axis in front, or in a group for each. What is shared by all frames stands at the root once.
 """
 
 from __future__ import annotations

@@ -66,6 +66,8 @@ class Importer:
             )
 
 
+_IN_CHROMIUM = "run in headless Chromium, by `tests/web`"
+
 _ARAS_P = Importer(
     name="aras-p UnityGaussianSplatting",
     axes="ruf",
@@ -94,28 +96,28 @@ IMPORTERS: dict[str, Importer] = {
         suffixes=(".ply", ".compressed.ply", ".sog"),
         to_do="`entity.setLocalEulerAngles(0, 0, 180)`",
         evidence="source, npm 2.23.0: values are taken as they are, in a world with y up",
-        was_run="an RDF PLY loads",
+        was_run=_IN_CHROMIUM,
     ),
     "spark": Importer(
         name="Spark 2.2 (three.js)",
         suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
-        to_do="`splats.quaternion.set(1, 0, 0, 0)`",
+        to_do="`splats.quaternion.set(1, 0, 0, 0)`, but not for SPZ, which has y up.",
         evidence="documentation, npm 2.2.0: its examples turn the mesh by 180° about x",
-        was_run="an RDF PLY loads",
+        was_run=_IN_CHROMIUM,
     ),
     "mkkellogg": Importer(
         name="GaussianSplats3D 0.4.7 (three.js)",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".spz"),
-        to_do="`new Viewer({cameraUp: [0, -1, 0]})`, or `rotation: [1, 0, 0, 0]` of the scene",
+        suffixes=(".ply", ".splat"),
+        to_do="`new Viewer({cameraUp: [0, -1, 0]})`",
         evidence="source, eb2fc45: values are taken as they are; up is +y unless it is set",
-        was_run="an RDF PLY loads",
+        was_run=_IN_CHROMIUM,
     ),
     "babylon": Importer(
         name="Babylon.js 8",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
+        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz", ".glb"),
         to_do="Nothing.",
         evidence="source, npm 8.56.2: y is negated, in a left-handed world with y up",
-        was_run="an RDF PLY loads",
+        was_run=_IN_CHROMIUM,
     ),
     "aras-p": _ARAS_P,
     "gsplat-unity": Importer(

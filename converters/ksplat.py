@@ -3,9 +3,9 @@
 Source of the layout: mkkellogg/GaussianSplats3D, version 0.1 of its SplatBuffer. A header of 4096 bytes is followed by
 one of 1024 bytes for each section, and by the sections. A section has the lengths of its partly filled buckets, the
 centres of all its buckets, and its rows: position, linear standard deviations, quaternion w x y z, red, green, blue and
-opacity as bytes, spherical harmonics of degree 1 and 2 channel after channel. Compression level 0 stores float32; level 1
-stores half, and positions as offsets from the centre of a bucket; level 2 stores spherical harmonics as bytes, too. Axes
-and units are not stated; they are those of the PLY from which such files are made.
+opacity as bytes, spherical harmonics of degree 1 and 2 channel after channel. Compression level 0 stores float32; level
+1 stores half, and positions as offsets from the centre of a bucket; level 2 stores spherical harmonics as bytes, too.
+Axes and units are not stated; they are those of the PLY from which such files are made.
 """
 
 from __future__ import annotations

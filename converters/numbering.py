@@ -52,12 +52,10 @@ def files_at(path: Path) -> list[Path]:
     is the only place that decides it.
 
     Raises:
-        MissingFileError: There is nothing at the path, or a folder cannot be listed.
+        MissingFileError: A folder cannot be listed.
         AssetFormatError: A folder holds no Gaussians, or frames that are no sequence.
     """
     if not path.is_dir():
-        if not path.is_file():
-            raise MissingFileError(f"input must be an existing file or folder, got {path}. Check the path.")
         return [path]
     whole = next((path / name for name in (ASSET_NAME, SOG_NAME) if (path / name).is_file()), None)
     return [whole] if whole is not None else _numbered_files(path)
