@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TypeVar, get_type_hints
 
 import tyro
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import FlagCreatePairsOff, Positional
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 FIRST, ALL = ("-h", "--help"), "--help-all"
@@ -65,3 +65,25 @@ def parse(record: type[Record], words: Sequence[str], prog: str) -> Record:
         if left_out and not stopped.code:
             print(MORE)
         raise
+
+
+def flags_of(record: type) -> dict[str, str]:
+    """Return by the name of each field the option that sets it, also of the records in a record.
+
+    Fields whose value stands on the command line without an option are left out.
+    """
+    flags: dict[str, str] = {}
+    hints = get_type_hints(record, include_extras=True)
+    for field in dataclasses.fields(record):
+        marks = getattr(hints[field.name], "__metadata__", ())
+        kind = next(iter(getattr(hints[field.name], "__args__", ())), hints[field.name]) if marks else hints[field.name]
+        if dataclasses.is_dataclass(kind):
+            flags |= flags_of(kind)  # type: ignore[arg-type]
+        elif not set(marks).intersection(_POSITIONAL):
+            named = next((mark.name for mark in marks if getattr(mark, "name", None)), field.name)
+            flags[field.name] = f"--{named.replace('_', '-')}"
+    return flags
+
+
+_POSITIONAL = getattr(Positional[int], "__metadata__", ())
+"""Marks of a field that no option sets."""
