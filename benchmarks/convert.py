@@ -48,12 +48,15 @@ ONE_FILE = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".ksplat", ".gl
 """Endings of splat formats that keep a frame in one file, for the tables."""
 
 AXES = "rdf"
-"""Axes of every cloud here. splat-transform writes numbers as they are, also in SPZ; only to glTF it turns them."""
+"""Axes of every cloud here."""
+
+THEIR_AXES = {".glb": "luf"}
+"""Axes in which splat-transform writes such a cloud, which it does not state; into other formats it copies numbers."""
 
 KSPLAT_LEVELS = (0, 1, 2)
 
-FOLDERS = ("splats", "fixtures/splat_transform", "sequences/wave_sog")
-"""Folders of the data that hold splats."""
+PATTERNS = ("splats/**/*", "fixtures/splat_transform/*", "sequences/wave_sog/wave_0*01.sog")
+"""Files of other producers, in the folder of data."""
 
 _LAUNCH = """
 import json, os, sys, time
@@ -285,10 +288,15 @@ def their_reading(bench: Bench, path: Path) -> Looks:
     return looks_of_ply(ply)
 
 
-def our_reading(path: Path, *, axes: str | None = None) -> Looks:
-    """Return what we read in a file, in the axes that it has, or turned from those to others."""
+def our_reading(path: Path) -> Looks:
+    """Return what we read in a file, in the axes that it has."""
+    return looks_of_cloud(read(path)[0])
+
+
+def our_reading_turned(path: Path, axes: str | None) -> Looks:
+    """Return what we read in a file, in `AXES`; the file's are given, or else those that it states."""
     cloud = read(path)[0]
-    return looks_of_cloud(cloud, np.eye(3) if axes is None else axes_matrix(cloud.axes, axes))
+    return looks_of_cloud(cloud, axes_matrix(axes or cloud.axes, AXES))
 
 
 def errors(bench: Bench) -> Iterator[Row]:
@@ -301,7 +309,7 @@ def errors(bench: Bench) -> Iterator[Row]:
         row: Row = {
             "name": name,
             "bytes": path.stat().st_size,
-            "written": difference(our_reading(path, axes=axes), truth),
+            "written": difference(our_reading_turned(path, axes), truth),
         }
         if ending in bench.reads:
             row["readings"] = difference(our_reading(path), their_reading(bench, path))
@@ -309,20 +317,19 @@ def errors(bench: Bench) -> Iterator[Row]:
         yield {"gaussians": bench.error_count, "rows": rows}
 
 
-def _files_of_both(bench: Bench, source: Path) -> Iterator[tuple[str, Path, str]]:
-    """Yield files that hold what a PLY does: a name, the file, and the axes that our reading of it is turned to."""
+def _files_of_both(bench: Bench, source: Path) -> Iterator[tuple[str, Path, str | None]]:
+    """Yield files that hold what a PLY does: a name, the file, and its axes where it does not state them."""
     for ending in ONE_FILE:
         if not _roles(ending)[0]:
             continue
         if _roles(ending)[1]:
             path = bench.folder / f"ours{ending}"
             write(read(source), path)
-            yield f"{ending}, ours", path, AXES
+            yield f"{ending}, ours", path, None
         if ending in bench.writes:
             path = bench.folder / f"theirs{ending}"
             run(theirs(bench, source, path))
-            # Its SPZ holds the PLY's numbers without saying so; we read it as the specification has it.
-            yield f"{ending}, theirs", path, FORMATS[ending].axes if ending == ".spz" else AXES  # type: ignore[misc]
+            yield f"{ending}, theirs", path, THEIR_AXES.get(ending, AXES)
         if ending == ".ksplat" and bench.theirs:
             for level in KSPLAT_LEVELS:
                 path = bench.folder / f"level{level}.ksplat"
@@ -334,10 +341,9 @@ def files(bench: Bench) -> Iterator[Row]:
     """Compare both readings of files of other producers."""
     rows: list[Row] = []
     yield {"rows": rows}
-    for path in sorted(found for folder in FOLDERS for found in (bench.data / folder).rglob("*")):
-        if suffix_of(path.name) in bench.reads and not re.search(
-            r"wave_sog/.*[^1]\.sog$", str(path)
-        ):  # every tenth frame
+    found = sorted(path for pattern in PATTERNS for path in bench.data.glob(pattern))
+    for path in found:
+        if suffix_of(path.name) in bench.reads:
             rows.append(_compared(bench, path))
             yield {"rows": rows}
 
