@@ -103,6 +103,11 @@ class SpzHeader:
     stream_count: int = 0
     table_at: int = 0
 
+    @property
+    def most_records(self) -> int:
+        """Most bytes of extension records."""
+        return _MOST_RECORD_BYTES if self.flags & _EXTENDED else 0
+
     def widths(self) -> dict[str, int]:
         """Return the bytes of a Gaussian in each array, in the order of the file."""
         return {
@@ -127,7 +132,7 @@ def probe(path: Path) -> SpzHeader:
             _read_table(file, header, path)
             return header
         end, held = _STREAM_HEADER.size + sum(header.sizes().values()), _unpacked_size(file)
-        if held < end < 1 << 32:  # gzip counts modulo 2^32
+        if not end <= held <= end + header.most_records and end < 1 << 31:  # gzip counts modulo 2^32
             raise malformed(path, f"{header.count} Gaussians must have {end} bytes", str(held), _REMEDY)
     return header
 
@@ -202,12 +207,12 @@ def _read_header(file: BinaryIO, path: Path) -> SpzHeader:
     if not start.startswith(_MAGIC):
         raise malformed(path, "SPZ must start with NGSP, plain or in gzip", repr(start[:4]), "Check that it is SPZ.")
     version = int.from_bytes(start[4:8], "little")
-    layout = _STREAM_HEADER if version < 4 else _FRAMES_HEADER
-    if len(start) < layout.size:
-        raise malformed(path, f"the header must have {layout.size} bytes", str(len(start)), _REMEDY)
     if not 1 <= version <= (3 if zipped else 4):
         kind = "in gzip must be 1 to 3" if zipped else "must be 1 to 4"
         raise malformed(path, f"the version of SPZ {kind}", str(version), "Update beam-warp, or export an older one.")
+    layout = _STREAM_HEADER if version < 4 else _FRAMES_HEADER
+    if len(start) < layout.size:
+        raise malformed(path, f"the header must have {layout.size} bytes", str(len(start)), _REMEDY)
     header = SpzHeader(*layout.unpack_from(start)[1:])
     if header.degree > MAX_SH_DEGREE or header.fractional_bits > 24:
         got = f"{header.degree} and {header.fractional_bits}"
@@ -227,13 +232,13 @@ def _of_stream(file: BinaryIO, header: SpzHeader, path: Path) -> tuple[dict[str,
     if content.startswith(_GZIP):
         stream = zlib.decompressobj(31)
         try:
-            content = stream.decompress(content, end + _MOST_RECORD_BYTES)
+            content = stream.decompress(content, end + header.most_records + 1)
         except zlib.error as error:
             raise malformed(path, "SPZ must hold a gzip stream", str(error), _REMEDY) from error
         if not stream.eof:
-            got = f"more than {len(content)} bytes" if len(content) > end else f"a stream cut after {len(content)}"
-            raise malformed(path, f"{header.count} Gaussians must fill the gzip stream", got, _REMEDY)
-    if len(content) < end:
+            got = f"{'more' if len(content) > end else 'a stream cut'} after {len(content)}"
+            raise malformed(path, f"{header.count} Gaussians must fill {end} bytes of gzip", got, _REMEDY)
+    if not end <= len(content) <= end + header.most_records:
         raise malformed(path, f"{header.count} Gaussians must have {end} bytes", str(len(content)), _REMEDY)
     arrays, at, view = {}, _STREAM_HEADER.size, memoryview(content)
     for name, size in header.sizes().items():
