@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import lru_cache
 from pathlib import Path
 
 from beam_warp.converters.colors import resize_bands
@@ -57,9 +58,10 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     """Write an asset, y up and in metres."""
     axes = IMPORTERS["usd"].axes
 
+    @lru_cache(maxsize=1)  # a writer asks for the first frame more than once
     def prepared(frame: int) -> GaussianCloud:
         cloud = change_axes(sequence[frame], axes)
-        if cloud.radiance is None:
+        if cloud.radiance is None or options.sh_degree is None:
             return cloud
         return cloud.with_arrays(radiance=resize_bands(cloud.radiance, options.sh_degree))
 

@@ -6,7 +6,7 @@ and each layer is complete for a host that does not know it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Vt
 
 from beam_warp._version import __version__
+from beam_warp.blocks import for_each_block
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
 from beam_warp.schema.layout import (
@@ -94,7 +95,7 @@ class AssetContents:
         keep_signs = self.sequence.topology == "constant" and "orientations" in self.survey.varying
         previous: NDArray[Any] | None = None
         for frame in range(len(self.sequence)):
-            arrays = self.stored(self.sequence[frame])
+            arrays = self.stored(self.sequence[frame], self.varying)
             if keep_signs:
                 current = arrays["orientations"]
                 if previous is not None:
@@ -103,17 +104,17 @@ class AssetContents:
                 previous = arrays["orientations"] = current
             yield frame, arrays
 
-    def stored(self, cloud: GaussianCloud) -> dict[str, NDArray[Any]]:
-        """Return a cloud's arrays in the shape and precision in which they are written, and its extent."""
-        arrays = stored_arrays(cloud)
-        missing = (self.survey.sh_degree + 1) ** 2 - arrays["radiance"].shape[1]
-        padded = np.pad(arrays["radiance"], ((0, 0), (0, missing), (0, 0)))
-        arrays["radiance"] = padded.reshape(-1, 3)
+    def stored(self, cloud: GaussianCloud, names: Container[str]) -> dict[str, NDArray[Any]]:
+        """Return some of a cloud's arrays, and its extent, in the shape and precision in which they are written."""
+        arrays = {name: array for name, array in stored_arrays(cloud).items() if name in names}
+        if "radiance" in arrays:
+            if missing := (self.survey.sh_degree + 1) ** 2 - arrays["radiance"].shape[1]:
+                arrays["radiance"] = np.pad(arrays["radiance"], ((0, 0), (0, missing), (0, 0)))
+            arrays["radiance"] = arrays["radiance"].reshape(-1, 3)
         for name in self.half & arrays.keys():
-            if name in ("orientations", "normals"):
-                arrays[name] = _nearly_unit(arrays[name])
-            arrays[name] = arrays[name].astype(np.float16)
-        arrays["extent"] = _extent(cloud)
+            arrays[name] = _in_half(arrays[name], make_unit=name in ("orientations", "normals"))
+        if "extent" in names:
+            arrays["extent"] = _extent(cloud)
         return arrays
 
 
@@ -194,11 +195,10 @@ def _author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     color.colorSpace = LINEAR_REC709
     color.default = to_vt("color3f[]", display_color(first)[None])
     author_declarations(prim, contents, (*survey.names, "extent"))
-    arrays = contents.stored(first)
-    for name in (*survey.names, "extent"):
-        if name not in contents.varying:
-            usd_name, type_name = contents.attribute(name)
-            prim.attributes[usd_name].default = to_vt(type_name, arrays[name])
+    constant = [name for name in (*survey.names, "extent") if name not in contents.varying]
+    for name, array in contents.stored(first, constant).items():
+        usd_name, type_name = contents.attribute(name)
+        prim.attributes[usd_name].default = to_vt(type_name, array)
 
 
 def author_declarations(prim: Sdf.PrimSpec, contents: AssetContents, names: tuple[str, ...]) -> None:
@@ -254,21 +254,44 @@ def _choice(metadata: Mapping[str, str], key: str, choices: tuple[str, ...]) -> 
     return value if value in choices else choices[0]
 
 
+def _in_half(array: NDArray[np.float32], *, make_unit: bool) -> NDArray[np.float16]:
+    """Round an array to half, after making its rows unit if they are directions."""
+    half = np.empty(array.shape, np.float16)
+
+    def work(part: slice) -> None:
+        half[part] = _nearly_unit(array[part]) if make_unit else array[part]
+
+    for_each_block(work, len(array))
+    return half
+
+
 def _nearly_unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Normalise the rows whose length differs from 1 by more than rounding to half explains.
 
     Rows that were read from half stay as they are, so that writing them again changes no bit.
     """
-    length = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
+    length = _lengths(vectors.astype(np.float64))[:, None]
     return np.where(np.abs(length - 1.0) > HALF_EPSILON, vectors / length, vectors).astype(np.float32)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths along the last axis; a sum over so few terms is several times as fast column by column."""
+    return np.sqrt(sum(column * column for column in np.moveaxis(vectors, -1, 0)))
 
 
 def _extent(cloud: GaussianCloud) -> NDArray[np.float32]:
     """Return the bounds ``(2, 3)`` of all kernels at three standard deviations, rounded outwards."""
     if not len(cloud):
         return np.zeros((2, 3), np.float32)
-    reach = KERNEL_EXTENT * np.linalg.norm(matrix_of(cloud.orientations) * cloud.scales[:, None, :], axis=2)
-    low, high = (cloud.positions - reach).min(axis=0), (cloud.positions + reach).max(axis=0)
+    bounds: list[NDArray[np.float64]] = []
+
+    def work(part: slice) -> None:
+        reach = KERNEL_EXTENT * _lengths(matrix_of(cloud.orientations[part]) * cloud.scales[part, None])
+        positions = cloud.positions[part]
+        bounds.append(np.stack([(positions - reach).min(axis=0), (positions + reach).max(axis=0)]))
+
+    for_each_block(work, len(cloud))
+    low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
     return np.stack(
         [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]
     ).astype(np.float32)

@@ -73,7 +73,7 @@ def survey_sequence(sequence: GaussianSequence) -> Survey:
             if frame and name not in varying and not np.array_equal(array, held[name]):
                 varying.add(name)
             if array.dtype.kind == "f" and array.size:
-                largest[name] = max(largest[name], float(np.abs(array).max()))
+                largest[name] = max(largest[name], float(array.max()), -float(array.min()))
                 if CHANNELS[name].relative:
                     smallest[name] = min(smallest[name], float(np.abs(array[array != 0]).min(initial=np.inf)))
     return Survey(

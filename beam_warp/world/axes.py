@@ -7,6 +7,7 @@ and USD with z up, ``ruf`` Unity (left-handed) and ``fru`` Unreal (left-handed).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import permutations
 from itertools import product as cartesian
 from typing import Literal
@@ -14,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.blocks import for_each_block
 from beam_warp.checks import require_number
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
@@ -105,20 +107,28 @@ def change_axes(cloud: GaussianCloud, target: str, *, scale: float = 1.0) -> Gau
     matrix = axes_matrix(require_axes("cloud.axes", cloud.axes), require_axes("target", target))
     if target == cloud.axes and scale == 1.0:
         return cloud
-    changes = {
-        "positions": (cloud.positions @ matrix.T * scale).astype(np.float32),
-        "scales": (cloud.scales.astype(np.float64) * scale).astype(np.float32),
-        "axes": target,
+    maps: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+        "positions": lambda rows: rows @ matrix.T * scale
     }
+    if scale != 1.0:
+        maps["scales"] = lambda rows: rows * scale
     if target != cloud.axes:
         flip, rotation = _flip_and_rotation(matrix)
-        orientations = product(quaternion_of(rotation), cloud.orientations.astype(np.float64))
-        orientations[:, :3] *= np.prod(flip) * flip
-        changes["orientations"] = orientations.astype(np.float32)
+        turn, flips = quaternion_of(rotation), np.append(np.prod(flip) * flip, 1.0)
+        maps["orientations"] = lambda rows: product(turn, rows) * flips
         if cloud.normals is not None:
-            changes["normals"] = (cloud.normals @ matrix.T).astype(np.float32)
+            maps["normals"] = lambda rows: rows @ matrix.T
         if cloud.radiance is not None and cloud.sh_degree:
             # Rounding removes the solver's 1e-16 beside the exact 0 and ±1 of a flip, so that flips stay bit-exact.
             transform = np.round(sh_transform(matrix, cloud.sh_degree), 14)
-            changes["radiance"] = np.einsum("jk,nkc->njc", transform, cloud.radiance, optimize=True)
-    return cloud.with_arrays(**changes)
+            signs = np.diag(transform)[:, None]
+            is_flip = np.array_equal(transform, np.diag(signs[:, 0]))  # no term mixes with others: most conversions
+            maps["radiance"] = lambda rows: rows * signs + 0.0 if is_flip else transform @ rows  # 0.0: no -0
+    arrays = {name: np.empty_like(getattr(cloud, name)) for name in maps}
+
+    def work(part: slice) -> None:
+        for name, function in maps.items():
+            arrays[name][part] = function(getattr(cloud, name)[part].astype(np.float64))
+
+    for_each_block(work, len(cloud))
+    return cloud.with_arrays(**arrays, axes=target)
