@@ -145,6 +145,7 @@ IMPORTERS: dict[str, Importer] = {
     "usd": Importer(
         name="OpenUSD (usdview, Omniverse, Houdini, Nuke)",
         axes="rub",
+        sh_degrees=(0, 4),
         suffixes=(".usd", ".usda", ".usdc", ".usdz"),
         to_do="Nothing: the file states its axes and units.",
         evidence="specification",

@@ -13,7 +13,7 @@ TALL = 1.3
 """A subject that stands is at least so many times as tall as it is wide."""
 
 STANDS = 0.1
-"""Of a subject that stands at 0, one end is at most so far from 0, in parts of the distance of the other end."""
+"""A subject stands at 0 if one end is at most so far from 0, in parts of the distance of the other end."""
 
 SAMPLE = 2**17
 """About so many Gaussians are looked at, evenly spread over the rows."""

@@ -46,7 +46,7 @@ class DrawChannel:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="ASSET", help="PLY or USD file, a folder with asset.usda, or a folder of numbered PLY files."),
+        arg(metavar="ASSET", help="File of Gaussians, a folder with asset.usda, or a folder of numbered files."),
     ]
     name: Annotated[
         Positional[str], arg(metavar="NAME", help="Array: base_color, roughness_error, observability, normals, ….")

@@ -41,7 +41,7 @@ class Evaluate:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="DIR", help="Folder with asset.usda; or a PLY or USD file, or a folder of numbered PLY files."),
+        arg(metavar="DIR", help="Folder with asset.usda; or a file of Gaussians, or a folder of numbered files."),
     ]
     truth: Annotated[Path, arg(metavar="CAPTURE", help="A capture whose test records have truth, and relit images.")]
     out: Annotated[

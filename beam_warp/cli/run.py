@@ -67,7 +67,7 @@ def run(args: Run) -> int:
     light = light_of(args.measuring, capture, args.input)
     environment = EnvironmentMap.read(light).rotated(args.measuring.rotate)
     if args.fps is not None:
-        require_number("fps", args.fps, 1e-3, 1e6)
+        require_number("frames_per_second", args.fps, 1e-3, 1e6)
 
     from beam_warp.decomposition.job import run as run_pipeline
 

@@ -42,7 +42,7 @@ class ViewCommand:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="ASSET", help="PLY or USD file, a folder with asset.usda, or a folder of numbered PLY files."),
+        arg(metavar="ASSET", help="File of Gaussians, a folder with asset.usda, or a folder of numbered files."),
     ]
     environment: Annotated[
         tuple[Path, ...],

@@ -35,6 +35,10 @@ def run_command(command: Callable[[], int], record: type | None = None) -> int:
         return 0
 
 
+SHORTER = {"sample-count": "samples", "frames-per-second": "fps", "vertical-fov": "fov"}
+"""Arguments of the library whose options have shorter names."""
+
+
 @contextmanager
 def options_named(record: type | None) -> Iterator[None]:
     """Let errors speak of options (``--source-axes``) where the library names its arguments (``source_axes``).
@@ -47,6 +51,7 @@ def options_named(record: type | None) -> Iterator[None]:
         subject, must, rest = str(error).partition(" must ")
         if record is not None and must:
             flags = {field.replace("_", "-"): flag for field, flag in flags_of(record).items()}
+            flags |= {name: f"--{option}" for name, option in SHORTER.items() if option in flags}
             words = re.split(r"(, | and )", subject.replace("_", "-"))
             if set(words[::2]) <= set(flags):
                 error.args = ("".join(flags.get(word, word) for word in words) + must + rest,)

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from beam_warp import converters
 from beam_warp.checks import require_number
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import OutputError
 from beam_warp.world.metadata import LOW_PASS_RANGE
 
@@ -46,7 +47,7 @@ class ReadingFlags:
     antialiased: Antialiased = None
     low_pass: LowPass = None
     source_axes: SourceAxes = None
-    meters_per_unit: MetersPerUnit = None
+    meters_per_unit: Annotated[MetersPerUnit, SECOND_PAGE] = None
     drop_invalid: DropInvalid = False
 
     def read(self, path: Path) -> GaussianSequence:
