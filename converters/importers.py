@@ -113,9 +113,9 @@ IMPORTERS: dict[str, Importer] = {
         was_run=_IN_CHROMIUM,
     ),
     "babylon": Importer(
-        name="Babylon.js 8",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz", ".glb"),
-        to_do="Nothing.",
+        name="Babylon.js 9",
+        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".glb"),
+        to_do="Nothing. An SPZ would stand on its head: its numbers are taken as RDF.",
         evidence="source, npm 8.56.2: y is negated, in a left-handed world with y up",
         was_run=_IN_CHROMIUM,
     ),

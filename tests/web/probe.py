@@ -72,11 +72,22 @@ def tripod() -> GaussianCloud:
     )
 
 
-def mood() -> NDArray[np.float64]:
-    """Return the colour of the fifth ball's middle in the picture: 0.5 - 0.4 d, if it is seen in direction d."""
+def color_error(picture: NDArray[np.uint8], *, harmonics: bool) -> float:
+    """Return how far the middle of the fifth ball is from its colour in a picture, the largest of three channels.
+
+    Seen in direction d, the ball has the colour 0.5 - 0.4 d; without harmonics, as in a .splat, it is grey.
+    """
+    column, row = camera().project([MOOD_RING])[0, :2].astype(int)
     direction = np.subtract(MOOD_RING, EYE)
-    color = 0.5 - 0.4 * direction / np.linalg.norm(direction)
-    return OPACITY * color + (1.0 - OPACITY) * BACKGROUND
+    color = 0.5 - 0.4 * harmonics * direction / np.linalg.norm(direction)
+    wanted = OPACITY * color + (1.0 - OPACITY) * BACKGROUND
+    return float(np.abs(picture[row, column] / 255.0 - wanted).max())
+
+
+def shifts(picture: NDArray[np.uint8]) -> dict[str, float]:
+    """Return how far the middle of each ball is from where the camera projects it [pixel]; NaN where it is missing."""
+    found = blobs(picture)
+    return {name: float(np.linalg.norm(found[name] - place)) for name, place in pixels().items()}
 
 
 def pixels() -> dict[str, NDArray[np.float64]]:

@@ -4,7 +4,7 @@ import npm_packages
 import numpy as np
 import pytest
 from web import probe
-from web.viewers import CHROMIUM, VIEWERS, chromium, photograph, write_probes, written
+from web.viewers import CHROMIUM, VIEWERS, chromium, photograph, write_probe
 
 from beam_warp import rasterize
 
@@ -12,8 +12,9 @@ pytest.importorskip("playwright.sync_api")
 
 needs_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed (set BEAM_CHROMIUM)")
 
-CLOSE = 1.0
-"""Largest distance of a ball's middle from where it must be [pixel]; the nearest two balls are 70 apart."""
+CLOSE = 2.0
+"""Largest distance of a ball's middle from where it must be [pixel]. A ball's standard deviation is 6 to 9, the nearest
+two balls are 70 apart, and a mirrored or upturned tripod is off by 40."""
 
 ALIKE = 0.06
 """Largest error of the fifth ball's colour: of five bits of harmonics, as SPZ has them. An axis that is flipped for the
@@ -21,25 +22,13 @@ directions and not for the harmonics, or the reverse, changes a channel by 0.19 
 
 
 @pytest.fixture(scope="module")
-def probes(tmp_path_factory):
+def browser():
     try:
         npm_packages.packages()
     except npm_packages.MissingPackagesError as error:
         pytest.skip(f"viewers cannot be had: {error}")
-    folder = tmp_path_factory.mktemp("probes")
-    write_probes(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def browser():
     with chromium() as opened:
         yield opened
-
-
-def shift_of_balls(picture):
-    found = probe.blobs(picture)
-    return {name: float(np.linalg.norm(found[name] - place)) for name, place in probe.pixels().items()}
 
 
 def test_the_camera_separates_the_balls_and_a_mirrored_or_upturned_tripod_is_told():
@@ -58,19 +47,18 @@ def test_balls_are_found_where_our_own_rasteriser_draws_them():
     seen = rasterize(probe.tripod(), probe.camera(), channels=["radiance"], device="cpu")
     display = seen.channels["radiance"] * seen.alpha[..., None] + probe.BACKGROUND * (1.0 - seen.alpha[..., None])
     picture = np.rint(255.0 * np.clip(display, 0.0, 1.0)).astype(np.uint8)
-    assert max(shift_of_balls(picture).values()) < CLOSE
+    assert max(probe.shifts(picture).values()) < CLOSE
+    assert probe.color_error(picture, harmonics=True) < 0.01
 
 
 @pytest.mark.slow
 @needs_a_browser
 @pytest.mark.parametrize(
-    ("page", "ending"),
-    [(page, ending) for page, viewer in VIEWERS.items() for ending in viewer.reads if ending in written()],
+    ("name", "ending"), [(name, ending) for name, viewer in VIEWERS.items() for ending in viewer.endings()]
 )
-def test_a_viewer_shows_the_tripod_as_it_is(page, ending, probes, browser):
-    picture = photograph(browser, VIEWERS[page], probes / f"tripod{ending}")
-    shifts = shift_of_balls(picture)
+def test_a_viewer_shows_what_is_written_for_it_as_it_is(name, ending, browser, tmp_path):
+    picture = photograph(browser, VIEWERS[name], write_probe(tmp_path, VIEWERS[name], ending))
+    shifts = probe.shifts(picture)
     assert max(shifts.values()) < CLOSE, shifts
-    column, row = probe.camera().project([probe.MOOD_RING])[0, :2].astype(int)
-    wanted = probe.mood() if ending != ".splat" else np.full(3, 0.5)  # .splat has no harmonics
-    assert np.abs(picture[row, column] / 255.0 - wanted).max() < ALIKE
+    if ending not in VIEWERS[name].colors_wrong:
+        assert probe.color_error(picture, harmonics=ending != ".splat") < ALIKE

@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from web.probe import EYE, FIELD_OF_VIEW, SIDE, TARGET, tripod
 
-from beam_warp.converters import write
-from beam_warp.converters.formats import FORMATS
-from beam_warp.world.axes import axes_matrix, change_axes
+from beam_warp.converters import WriteOptions, write
+from beam_warp.converters.formats import FORMATS, suffix_of
+from beam_warp.converters.importers import IMPORTERS
+from beam_warp.world.axes import axes_matrix
 from beam_warp.world.gaussians import GaussianSequence
 
 CHROMIUM = os.environ.get("BEAM_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -35,7 +36,7 @@ FLAGS = (
     *("--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
 HERE = "http://localhost/"
-PATIENCE = 90.0
+PATIENCE = 180.0
 """Longest that a viewer may take to load a file and draw it [s]."""
 
 
@@ -60,64 +61,69 @@ class Viewer:
         name: What people call it.
         package: Its package of npm.
         page: The page that opens it, beside this file.
-        reads: Ending of a file → how it stands. Files hold x right, y down, z forward, unless their format says
-            otherwise.
+        importer: Its name for ``--for``, in `beam_warp.converters.importers.IMPORTERS`, which says what it reads.
+        placement: How a file that is written for it stands.
+        others: The same for endings of files that stand otherwise.
+        colors_wrong: Endings of which it shows view-dependent colour wrongly, whoever wrote the file.
     """
 
     name: str
     package: str
     page: str
-    reads: Mapping[str, Placement]
+    importer: str
+    placement: Placement
+    others: Mapping[str, Placement] = field(default_factory=dict)
+    colors_wrong: frozenset[str] = frozenset()
+
+    def endings(self) -> list[str]:
+        """Return the endings that we write for it."""
+        return [end for end in IMPORTERS[self.importer].suffixes if end in FORMATS and FORMATS[end].writer]
 
 
 VIEWERS = {
-    viewer.page.removesuffix(".html"): viewer
+    viewer.importer: viewer
     for viewer in (
         Viewer(
             "PlayCanvas",
             "playcanvas",
             "playcanvas.html",
-            # The manual turns splats half a turn about z: they stand upright, with their back to the viewer's front.
-            dict.fromkeys((".ply", ".compressed.ply", ".sog"), Placement("luf", turned=True)),
+            "playcanvas",
+            Placement("luf", turned=True),  # half a turn about z, by the manual: upright, with its back to the front
         ),
         Viewer(
             "Spark",
             "@sparkjsdev/spark",
             "spark.html",
-            # The manual turns splats half a turn about x; SPZ has y up by itself.
-            dict.fromkeys((".ply", ".compressed.ply", ".splat", ".sog"), Placement("rub", turned=True))
-            | {".spz": Placement("rub")},
+            "spark",
+            Placement("rub", turned=True),  # half a turn about x, by the manual
+            {".spz": Placement("rub")},  # which has y up by itself
         ),
         Viewer(
             "GaussianSplats3D",
             "@mkkellogg/gaussian-splats-3d",
             "gaussian_splats_3d.html",
-            # The manual leaves splats as they are, and tells the camera that up is -y.
-            dict.fromkeys((".ply", ".splat"), Placement("rdf")),
+            "mkkellogg",
+            Placement("rdf"),  # the manual leaves splats as they are, and tells the camera that up is -y
         ),
         Viewer(
             "Babylon.js",
             "babylonjs",
             "babylon.html",
-            # The loader flips y by itself; the world is left-handed.
-            dict.fromkeys((".ply", ".compressed.ply", ".splat", ".sog", ".spz", ".glb"), Placement("ruf")),
+            "babylon",
+            Placement("ruf"),  # the loader flips y by itself, into a left-handed world
+            {".glb": Placement("lub")},
+            colors_wrong=frozenset({".sog"}),
         ),
     )
 }
-"""Viewers by the names of their pages."""
+"""Viewers by their names for ``--for``."""
 
 
-def written() -> list[str]:
-    """Return the endings that we write and a viewer reads."""
-    read = dict.fromkeys(ending for viewer in VIEWERS.values() for ending in viewer.reads)
-    return [ending for ending in read if ending in FORMATS and FORMATS[ending].writer]
-
-
-def write_probes(folder: Path) -> None:
-    """Write the tripod in every format that a viewer reads: x right, y down, z forward, unless the format decides."""
-    sequence = GaussianSequence.from_clouds([change_axes(tripod(), "rdf")])
-    for ending in written():
-        write(sequence, folder / f"tripod{ending}")
+def write_probe(folder: Path, viewer: Viewer, ending: str) -> Path:
+    """Write the tripod for a viewer, as ``beam-convert --for`` does; returns the file."""
+    path = folder / f"tripod_{viewer.importer}{ending}"
+    write(GaussianSequence.from_clouds([tripod()]), path, WriteOptions(target=viewer.importer))
+    return path
 
 
 @contextmanager
@@ -137,7 +143,7 @@ def photograph(browser: Any, viewer: Viewer, file: Path) -> NDArray[np.uint8]:
     Raises:
         RuntimeError: The viewer refuses the file, or has not drawn it in time.
     """
-    placement = next(viewer.reads[ending] for ending in _longest_first(viewer.reads) if file.name.endswith(ending))
+    placement = viewer.others.get(suffix_of(file.name), viewer.placement)
     to_viewer = axes_matrix("rfu", placement.axes)
     asked = {
         "file": f"/files/{file.name}",
@@ -148,14 +154,12 @@ def photograph(browser: Any, viewer: Viewer, file: Path) -> NDArray[np.uint8]:
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
     try:
         page.route("**/*", _answers(file.parent))
-        page.goto(f"{HERE}{viewer.page}?" + "&".join(f"{name}={value}" for name, value in asked.items()))
+        page.goto(
+            f"{HERE}{viewer.page}?" + "&".join(f"{name}={value}" for name, value in asked.items()), wait_until="commit"
+        )
         return _settled(page, f"{viewer.name} and {file.name}")
     finally:
         page.close()
-
-
-def _longest_first(endings: Mapping[str, Placement]) -> list[str]:
-    return sorted(endings, key=len, reverse=True)
 
 
 def _listed(values: ArrayLike) -> str:
