@@ -173,14 +173,15 @@ def formats(bench: Bench) -> list[Row]:
         {
             "name": ending,
             "format": FORMATS[ending].name if ending in FORMATS else None,
-            "ours": [bool(ending in FORMATS and role) for role in _roles(ending)],
+            "ours": [bool(ending in FORMATS and role) for role in roles(ending)],
             "theirs": [ending in bench.reads, ending in bench.writes],
         }
         for ending in dict.fromkeys([*FORMATS, *sorted((bench.reads | bench.writes) - not_splats)])
     ]
 
 
-def _roles(ending: str) -> tuple[Any, Any]:
+def roles(ending: str) -> tuple[Any, Any]:
+    """Return our reader and our writer of an ending, None where there is none."""
     form = FORMATS.get(ending)
     return (form.reader, form.writer) if form else (None, None)
 
@@ -224,7 +225,7 @@ def made_file(bench: Bench, ending: str, source: Path) -> Path | None:
         write_ksplat(source, path, level=1)
     elif ending in bench.writes:
         run(theirs(bench, source, path))
-    elif _roles(ending)[1]:
+    elif roles(ending)[1]:
         run(ours(source, path))
     return path if path.is_file() else None
 
@@ -236,49 +237,51 @@ def write_ksplat(source: Path, path: Path, level: int) -> None:
     run([npm_packages.node(), str(script), str(module), str(source), str(path), str(level), "2"])
 
 
-def conversions(bench: Bench) -> Iterator[tuple[str, Path, str]]:
-    """Yield what is timed: a title, the input and the ending of the output."""
+def conversions(bench: Bench) -> Iterator[tuple[int, Path, str]]:
+    """Yield what is timed: how many Gaussians, the input, and the ending of the output."""
     for ending in (*ONE_FILE, ".usdc"):
-        source = source_file(bench, bench.sog_count if ending == ".sog" else bench.count)
-        size = f"{source.stem.partition('_')[2]}"
-        if _roles(ending)[1]:
-            yield f"{size} .ply → {ending}", source, ending
-        if ending != ".ply" and _roles(ending)[0] and (made := made_file(bench, ending, source)):
-            yield f"{size} {ending} → .ply", made, ".ply"
+        count = bench.sog_count if ending == ".sog" else bench.count
+        source = source_file(bench, count)
+        if roles(ending)[1]:
+            yield count, source, ending
+        if ending != ".ply" and roles(ending)[0] and (made := made_file(bench, ending, source)):
+            yield count, made, ".ply"
 
 
 def speed(bench: Bench) -> Iterator[Row]:
     """Time every conversion that we do."""
     rows: list[Row] = []
-    for title, source, ending in conversions(bench):
-        target = bench.folder / f"converted{ending}"
-        commands = {"ours": ours(source, target)}
-        if suffix_of(source.name) in bench.reads and ending in bench.writes:
-            commands["theirs"] = theirs(bench, source, target)
-        runs: dict[str, list[Run]] = {who: [] for who in commands}
-        sizes: dict[str, int] = {}
-        for repeat in range(-1, bench.repeats):
-            for who in commands if repeat % 2 else reversed(commands):
-                target.unlink(missing_ok=True)
-                done = run(commands[who])
-                sizes[who] = target.stat().st_size
-                if repeat >= 0:
-                    runs[who].append(done)
-        row: Row = {"name": title, "ending": ending}
-        for who, found in runs.items():
-            row[who] = {
-                "seconds": spread(np.array([one.seconds for one in found])),
-                "cpu_seconds": spread(np.array([one.cpu_seconds for one in found])),
-                "mib": spread(np.array([one.mib for one in found])),
-                "bytes": sizes[who],
-            }
-        if "theirs" in runs:
-            pairs = list(zip(runs["ours"], runs["theirs"], strict=True))
-            row["time_ratio"] = spread(np.array([us.seconds / them.seconds for us, them in pairs]))
-            row["memory_ratio"] = spread(np.array([us.mib / them.mib for us, them in pairs]))
-        rows.append(row)
-        bench.say(f"{title}: {row['ours']['seconds']['median']:.2f} s")
-        yield {"gaussians": bench.count, "rows": rows}
+    for count, source, ending in conversions(bench):
+        row = {"gaussians": count, "from": suffix_of(source.name), "to": ending, **timed(bench, source, ending)}
+        rows.append({"name": f"{row['from'][1:]} to {ending[1:]}", **row})
+        bench.say(f"{rows[-1]['name']}: {row['ours']['seconds']['median']:.2f} s")
+        yield {"rows": rows}
+
+
+def timed(bench: Bench, source: Path, ending: str) -> Row:
+    """Return what a conversion costs each program that does it; they take turns, after one unmeasured round."""
+    target = bench.folder / f"converted{ending}"
+    commands = {"ours": ours(source, target)}
+    if suffix_of(source.name) in bench.reads and ending in bench.writes:
+        commands["theirs"] = theirs(bench, source, target)
+    runs: dict[str, list[Run]] = {who: [] for who in commands}
+    sizes: dict[str, int] = {}
+    for repeat in range(-1, bench.repeats):
+        for who in commands if repeat % 2 else reversed(commands):
+            target.unlink(missing_ok=True)
+            done = run(commands[who])
+            sizes[who] = target.stat().st_size
+            if repeat >= 0:
+                runs[who].append(done)
+    row: Row = {}
+    for who, found in runs.items():
+        costs = {name: spread(np.array([getattr(one, name) for one in found])) for name in Run.__dataclass_fields__}
+        row[who] = {**costs, "bytes": sizes[who]}
+    if "theirs" in runs:
+        pairs = list(zip(runs["ours"], runs["theirs"], strict=True))
+        row["time_ratio"] = spread(np.array([us.seconds / them.seconds for us, them in pairs]))
+        row["memory_ratio"] = spread(np.array([us.mib / them.mib for us, them in pairs]))
+    return row
 
 
 def their_reading(bench: Bench, path: Path) -> Looks:
@@ -320,9 +323,9 @@ def errors(bench: Bench) -> Iterator[Row]:
 def _files_of_both(bench: Bench, source: Path) -> Iterator[tuple[str, Path, str | None]]:
     """Yield files that hold what a PLY does: a name, the file, and its axes where it does not state them."""
     for ending in ONE_FILE:
-        if not _roles(ending)[0]:
+        if not roles(ending)[0]:
             continue
-        if _roles(ending)[1]:
+        if roles(ending)[1]:
             path = bench.folder / f"ours{ending}"
             write(read(source), path)
             yield f"{ending}, ours", path, None
