@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tables import Row, Rows, cell, number, table
+from tables import Row, Rows, cell, table
 
 CONVERT = "convert_cpu.json"
 VIEWERS = "viewers_chromium.json"
@@ -16,6 +16,11 @@ HEADS = {
     "opacity": "opacity",
     "color": "colour",
 }
+
+
+def _rows(result: Row, part: str) -> list[Row]:
+    """Return the rows of a part; none if it was not measured."""
+    return result.get(part, {}).get("rows", [])
 
 
 @table("convert_formats", CONVERT)
@@ -38,7 +43,7 @@ def convert_speed(result: Row) -> Rows:
     """Return times and peak memory of conversions; programs took turns."""
     head = ["Gaussians", "from", "to", "beam-convert [s]", "splat-transform [s]", "time", "[MiB]", "[MiB]", "memory"]
     rows: list[list[Any]] = [head]
-    for row in result["speed"]["rows"]:
+    for row in _rows(result, "speed"):
         ours, theirs = row["ours"], row.get("theirs", {})
         rows.append(
             [
@@ -60,14 +65,18 @@ def _times(ratio: Any) -> str:
     return f"{cell(ratio['median'], '.2f')} ×" if ratio else ""
 
 
+def _size(error: float) -> str:
+    return cell(error, ".1e") if error else "0"
+
+
 @table("convert_readings", CONVERT)
 def convert_readings(result: Row) -> Rows:
     """Return the largest difference of both readings of each file."""
     rows: list[list[Any]] = [["file", "Gaussians", *HEADS.values()]]
-    for row in [*result["errors"]["rows"], *result.get("files", {}).get("rows", [])]:
+    for row in [*_rows(result, "errors"), *_rows(result, "files")]:
         name, found = row["name"].replace(", theirs", ", by splat-transform"), row.get("readings")
         if found:
-            sizes = (cell(found[look]["largest"], ".1e") for look in LOOKS)
+            sizes = (_size(found[look]["largest"]) for look in LOOKS)
             rows.append([name, f"{found['gaussians']:,}", *sizes])
         elif "ours_refuses" in row or "theirs_refuses" in row:
             who = " and ".join(
@@ -81,18 +90,11 @@ def convert_readings(result: Row) -> Rows:
 def convert_written(result: Row) -> Rows:
     """Return how far each written file is from what was to be written, root mean square, and its size."""
     rows: list[list[Any]] = [["file", "bytes a Gaussian", *HEADS.values()]]
-    for row in result["errors"]["rows"]:
+    for row in _rows(result, "errors"):
         name, found = row["name"].replace(", theirs", ", by splat-transform"), row["written"]
         size = f"{row['bytes'] / found['gaussians']:.1f}"
-        rows.append([name, size, *(cell(found[look]["rms"], ".1e") for look in LOOKS)])
+        rows.append([name, size, *(_size(found[look]["rms"]) for look in LOOKS)])
     return rows
-
-
-@number("convert_readings_largest", CONVERT)
-def convert_readings_largest(result: Row) -> float:
-    """The largest difference between both readings of a file of another producer, of all measures."""
-    found = [row["readings"] for row in result["files"]["rows"] if "readings" in row]
-    return max(one[look]["largest"] for one in found for look in LOOKS)
 
 
 @table("convert_sequence", CONVERT)
@@ -100,7 +102,7 @@ def convert_sequence(result: Row) -> Rows:
     """Return what writing a relightable sequence, and reading its frames at random, costs."""
     head = ["file", "written [s]", "memory for it [MiB]", "size [MB]", "frame by OpenUSD [ms]", "frame by `read` [ms]"]
     keys = ("write_seconds", "write_mib", "megabytes", "usd_frame_ms", "beam_frame_ms")
-    return [head, *([f"`{row['name']}`", *(row[key] for key in keys)] for row in result["sequence"]["rows"])]
+    return [head, *([f"`{row['name']}`", *(row[key] for key in keys)] for row in _rows(result, "sequence"))]
 
 
 @table("viewers", VIEWERS)
