@@ -27,8 +27,7 @@ BALL_SIGMAS = (0.04, 0.05, 0.06)
 """Standard deviations of a ball along its axes [m]."""
 
 BALL_TURN = Rotation.from_euler("xyz", (20.0, 40.0, 70.0), degrees=True)
-"""Orientation of a ball. GaussianSplats3D 0.4.7 draws a line of what is round on the screen, or upright there; nothing
-here is."""
+"""Orientation of a ball, so that none is round or upright on the screen, which hides what a viewer turns."""
 
 OPACITY = 0.98
 SIDE, FIELD_OF_VIEW = 320, 45.0
