@@ -63,8 +63,8 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
         ("ball.ply --environment none.exr", "must be a readable file, got"),
         ("ball.ply --environment square.exr", "twice as wide as high"),
         ("ball.ply --environment sky.exr --roughness r.png", "roughness-mesh must be given"),
-        ("ball.ply --environment sky.exr --samples 0", "sample_count must be"),
-        ("ball.ply --environment sky.exr --fps 0", "frames_per_second must be"),
+        ("ball.ply --environment sky.exr --samples 0", "--samples must be"),
+        ("ball.ply --environment sky.exr --fps 0", "--fps must be"),
         ("ball.ply --environment sky.exr --out missing/out", "out must be a folder that can be made"),
     ],
 )
