@@ -129,6 +129,8 @@ def convert(command: ConvertCommand) -> int:
     notes = notes_of(sequence)
     if form.name == "PLY" and command.profile == "standard" and first.base_color is not None:
         notes.append("materials are not in a standard PLY: --profile beam keeps them")
+    if form.name == "splat" and (first.sh_degree or first.base_color is not None):
+        notes.append("a .splat holds neither materials nor view-dependent colour: they are left out")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
