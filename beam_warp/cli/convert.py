@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.cli.common.console import print_json, print_notes, progress, run_command
+from beam_warp.cli.common.console import options_named, print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.converters.formats import FORMATS, format_of
@@ -95,6 +95,7 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
         )
 
 
+@options_named(ConvertCommand)
 def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
@@ -156,6 +157,7 @@ def convert(command: ConvertCommand) -> int:
     return 0
 
 
+@options_named(InspectCommand)
 def inspect(command: InspectCommand) -> int:
     """Print what a file holds."""
     found = converters.inspect(command.input)
@@ -174,6 +176,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[:1] == ["inspect"]:
         asked = parse(InspectCommand, words[1:], "beam-convert inspect")
-        return run_command(lambda: inspect(asked), InspectCommand)
+        return run_command(lambda: inspect(asked))
     command = parse(ConvertCommand, words, "beam-convert")
-    return run_command(lambda: convert(command), ConvertCommand)
+    return run_command(lambda: convert(command))
