@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import NDArray
 
 from beam_warp.checks import require_choice, require_number
 from beam_warp.converters.frame_files import FrameToWrite
@@ -40,7 +39,7 @@ STATEMENTS: dict[str, Callable[[Any], Any]] = {
 }
 """What a file may state about itself, and its check."""
 
-MAX_FREE_BYTES, MAX_RATIO = 128 * 2**20, 8
+MAX_FREE_BYTES, MAX_RATIO = 64 * 2**20, 8
 """Arrays of a frame may take so many bytes, and so many more for each byte of the file; compressed zeros take more."""
 
 
@@ -48,7 +47,11 @@ MAX_FRAMES = 100_000
 """Most frames of a file, an hour at 30 a second."""
 
 
-def probe(path: Path) -> dict[str, tuple[zipfile.ZipInfo, Any]]:
+Header = tuple[tuple[int, ...], np.dtype[Any]]
+"""Shape and type of an array."""
+
+
+def probe(path: Path) -> dict[str, tuple[zipfile.ZipInfo, Header]]:
     """Return the entry and the header ``(shape, dtype)`` of each array of an ``.npz`` file that we know.
 
     Raises:
@@ -65,7 +68,7 @@ def probe(path: Path) -> dict[str, tuple[zipfile.ZipInfo, Any]]:
     except _BROKEN as error:
         raise _malformed(path, "must be an .npz file with arrays of numbers", str(error)) from error
     _require_arrays(path, found)
-    _require_small(path, sum(entry.file_size for entry, _ in found.values()))
+    _require_frame(path, {name: header for name, (_, header) in found.items() if name in ATTRIBUTES})
     return found
 
 
@@ -87,7 +90,7 @@ def _malformed(path: Path, contract: str, got: str) -> AssetFormatError:
     return AssetFormatError(f"{path.name} {contract}, got {got}. See docs/formats.md for the names and shapes.")
 
 
-def _header(stream: Any, size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _header(stream: Any, size: int) -> Header:
     """Return shape and type of an array, after checking that its data are as long as they say."""
     version = npy.read_magic(stream)
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(stream)
@@ -101,7 +104,13 @@ def _require_arrays(path: Path, names: Mapping[str, Any]) -> None:
         raise _malformed(path, f"must have the arrays {', '.join(REQUIRED)}", f"none named {', '.join(missing)}")
 
 
-def _require_small(path: Path, size: int) -> None:
+def _require_frame(path: Path, headers: Mapping[str, Header]) -> None:
+    """Refuse arrays of a frame that do not go together or are very large, by their shapes and types alone."""
+    rows = headers["positions"][0][:1]
+    for name, (shape, _) in headers.items():
+        if shape[:1] != rows:
+            raise _malformed(path, f"must have as many rows in {name} as in positions", f"shape {shape}")
+    size = sum(math.prod(shape) * dtype.itemsize for shape, dtype in headers.values())
     limit = MAX_FREE_BYTES + MAX_RATIO * path.stat().st_size
     if size > limit:
         raise _malformed(path, f"must hold at most {limit >> 20} MiB a frame for its size", f"{size >> 20} MiB")
@@ -186,15 +195,17 @@ def _layout(path: Path) -> list[dict[str, Place]]:
     try:
         with h5py.File(path, "r") as file:
             root = _datasets(path, file)
-            groups = sorted((name for name in file if file.get(name, getclass=True) is h5py.Group), key=_by_number)
+            groups = [str(name) for name in file if file.get(name, getclass=True) is h5py.Group]
+            groups.sort(key=_by_number)
+            frames: list[dict[str, Place]]
             lengths = {name: file[name].shape[0] for name in root if file[name].ndim == _dimensions(name) + 1}
             if len(set(lengths.values())) > 1 or (lengths and groups):
                 got = ", ".join(f"{name} {length}" for name, length in lengths.items())
                 raise _malformed(path, "must have one number of frames", f"{got} beside {len(groups)} groups")
             if groups:
+                shared: dict[str, Place] = {name: (name, None) for name in root}
                 frames = [
-                    {name: (name, None) for name in root}
-                    | {name: (f"{group}/{name}", None) for name in _datasets(path, file[group])}
+                    shared | {name: (f"{group}/{name}", None) for name in _datasets(path, file[group])}
                     for group in groups
                 ]
             else:
@@ -233,6 +244,8 @@ def _datasets(path: Path, group: Any) -> list[str]:
         link = isinstance(group.get(name, getlink=True), h5py.HardLink)
         if not link or not isinstance(group[name], h5py.Dataset) or group[name].external or group[name].is_virtual:
             raise _malformed(path, "must hold its arrays itself", f"{name} as a group or link")
+        if group[name].chunks is None and group[name].id.get_storage_size() < group[name].nbytes:
+            raise _malformed(path, "must hold its arrays whole", f"{name} without its data")
         if group[name].dtype.kind not in "fiu" or group[name].ndim not in (_dimensions(name), _dimensions(name) + 1):
             got = f"{group[name].dtype} of shape {group[name].shape}"
             raise _malformed(path, f"must have numbers with {_dimensions(name)} axes in {name}", got)
@@ -243,19 +256,16 @@ def _h5_frame(path: Path, places: Mapping[str, Place]) -> DecodedFrame:
     """Read one frame."""
     import h5py
 
-    def shape(dataset: Any, row: int | None) -> tuple[int, ...]:
-        return dataset.shape if row is None else dataset.shape[1:]
-
     try:
         with h5py.File(path, "r") as file:
             _require_arrays(path, places)
-            found = {name: (file[place], row) for name, (place, row) in places.items()}
-            _require_small(path, sum(math.prod(shape(*it)) * it[0].dtype.itemsize for it in found.values()))
-            fields: dict[str, NDArray[Any]] = {
-                name: dataset[()] if row is None else dataset[row] for name, (dataset, row) in found.items()
-            }
+            found: dict[str, tuple[Any, int | None]] = {name: (file[at], row) for name, (at, row) in places.items()}
+            shapes = {name: it.shape if row is None else it.shape[1:] for name, (it, row) in found.items()}
+            _require_frame(path, {name: (shapes[name], it.dtype) for name, (it, _) in found.items()})
+            fields = {name: it[() if row is None else row] for name, (it, row) in found.items()}
             said = {name: file.attrs[name] for name in STATEMENTS if name in file.attrs}
-            left_out = [name for name in file if isinstance(file.get(name), h5py.Dataset) and name not in ATTRIBUTES]
+            names = [str(name) for name in file if name not in ATTRIBUTES]
+            left_out = [name for name in names if isinstance(file.get(name), h5py.Dataset)]
     except _BROKEN as error:
         if isinstance(error, BeamError):
             raise

@@ -150,11 +150,18 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
         AssetFormatError: It is malformed, or a quaternion is zero.
     """
     layout = probe(path)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is infinite or NaN, which a cloud refuses
+        return _frame(layout, options)
+
+
+def _frame(layout: _Layout, options: ReadOptions) -> DecodedFrame:
+    """Return what the sections hold."""
+    path = layout.path
     degree = max((int(section.header["degree"]) for section in layout.sections), default=0)
     parts = [dict(_decoded(layout, section, degree)) for section in layout.sections]
     empty = {"positions": (0, 3), "orientations": (0, 4), "scales": (0, 3), "opacities": (0,), "radiance": (0, 1, 3)}
     fields = {name: np.concatenate([part[name] for part in parts] or [np.empty(empty[name])]) for name in empty}
-    length = np.linalg.norm(fields["orientations"], axis=1, keepdims=True)
+    length = np.linalg.norm(fields["orientations"].astype(np.float64), axis=1, keepdims=True)
     bad = ~((length[:, 0] > 0.0) & (length[:, 0] < np.inf))
     if bad.any() and not options.drop_invalid:
         raise AssetFormatError(

@@ -30,7 +30,7 @@ def numbered_path(path: Path, frame: int) -> Path:
 
 def _split(name: str) -> tuple[str, str]:
     """Split a file name before the suffix that tells its format."""
-    place = len(name) - len(suffix_of(name))
+    place = len(name) - len(suffix_of(name) or Path(name).suffix)
     return name[:place], name[place:]
 
 

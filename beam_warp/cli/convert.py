@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
-from beam_warp.cli.common.console import escaped, print_json, print_notes, progress, run_command
+from beam_warp.cli.common.console import escaped, options_named, print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.converters.formats import FORMATS, format_of
@@ -99,6 +99,7 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
         )
 
 
+@options_named(ConvertCommand)
 def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
@@ -135,6 +136,8 @@ def convert(command: ConvertCommand) -> int:
     notes = notes_of(sequence)
     if form.name == "PLY" and command.profile == "standard" and first.base_color is not None:
         notes.append("materials are not in a standard PLY: --profile beam keeps them")
+    if form.name == "splat" and (first.sh_degree or first.base_color is not None):
+        notes.append("a .splat holds neither materials nor view-dependent colour: they are left out")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
@@ -160,6 +163,7 @@ def convert(command: ConvertCommand) -> int:
     return 0
 
 
+@options_named(InspectCommand)
 def inspect(command: InspectCommand) -> int:
     """Print what a file holds."""
     found = converters.inspect(command.input)
@@ -178,6 +182,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[:1] == ["inspect"]:
         asked = parse(InspectCommand, words[1:], "beam-convert inspect")
-        return run_command(lambda: inspect(asked), InspectCommand)
+        return run_command(lambda: inspect(asked))
     command = parse(ConvertCommand, words, "beam-convert")
-    return run_command(lambda: convert(command), ConvertCommand)
+    return run_command(lambda: convert(command))

@@ -132,7 +132,10 @@ def test_hdf5_that_reaches_outside_or_disagrees_is_refused(tmp_path):
     def write(**changes):
         with h5py.File(path, "w") as file:
             for name, value in (MINIMAL | changes).items():
-                file[name] = value
+                if value is None:  # nothing is stored of what is never written
+                    file.create_dataset(name, (10**9, 3), "f4")
+                else:
+                    file[name] = value
 
     for changes, message in (
         ({"positions": h5py.ExternalLink("other.h5", "positions")}, "must hold its arrays itself, got positions as"),
@@ -140,7 +143,8 @@ def test_hdf5_that_reaches_outside_or_disagrees_is_refused(tmp_path):
         ({"positions": [b"a", b"b"]}, "must have numbers with 2 axes in positions"),
         ({"positions": np.zeros((3, 2, 3)), "scales": np.zeros((4, 2, 3))}, "must have one number of frames"),
         ({"positions": np.zeros((0, 2, 3))}, "must have 1 to 100000 frames, got 0"),
-        ({"positions": np.zeros((3, 3))}, "must have as many rows as positions"),
+        ({"positions": None}, "must hold its arrays whole, got positions without its data"),
+        ({"positions": np.zeros((3, 3))}, "must have as many rows in opacities as in positions"),
     ):
         write(**changes)
         with pytest.raises(AssetFormatError, match=message):

@@ -14,19 +14,14 @@ from beam_warp.errors import BeamError
 from beam_warp.jobs.listeners import NotedProgress
 
 
-def run_command(command: Callable[[], int], record: type | None = None) -> int:
+def run_command(command: Callable[[], int]) -> int:
     """Run a command; a caller's mistake becomes one line on stderr and exit code 2, never a traceback.
 
     What the system refuses, and names that no file can have, are the caller's to mend as well. Whoever knows more of
     such an error has said so before; here it only becomes a line.
-
-    Args:
-        command: What runs, and returns the exit code.
-        record: Dataclass of its options, by which errors name them.
     """
     try:
-        with options_named(record):
-            return command()
+        return command()
     except BrokenPipeError:
         sys.stderr.close()
         return 0
@@ -54,29 +49,6 @@ def _in_words(error: Exception) -> str:
 def escaped(text: str) -> str:
     """Return one line that a terminal can only show: what does not print, such as ESC and newlines, is escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
-
-
-SHORTER = {"sample-count": "samples", "frames-per-second": "fps", "vertical-fov": "fov"}
-"""Arguments of the library whose options have shorter names."""
-
-
-@contextmanager
-def options_named(record: type | None) -> Iterator[None]:
-    """Let errors speak of options (``--source-axes``) where the library names its arguments (``source_axes``).
-
-    Only what an error is about is replaced: the words before "must".
-    """
-    try:
-        yield
-    except BeamError as error:
-        subject, must, rest = str(error).partition(" must ")
-        if record is not None and must:
-            flags = {field.replace("_", "-"): flag for field, flag in flags_of(record).items()}
-            flags |= {name: f"--{option}" for name, option in SHORTER.items() if option in flags}
-            words = re.split(r"(, | and )", subject.replace("_", "-"))
-            if set(words[::2]) <= set(flags):
-                error.args = ("".join(flags.get(word, word) for word in words) + must + rest,)
-        raise
 
 
 def print_json(value: Any) -> None:
@@ -146,3 +118,29 @@ def progress(quiet: bool, *, compiles: bool = True) -> Iterator[NotedProgress]:
 
         with compilation_heard(compiling):
             yield update
+
+
+SHORTER = {"sample-count": "samples", "frames-per-second": "fps", "vertical-fov": "fov"}
+"""Arguments of the library whose options have shorter names."""
+
+
+@contextmanager
+def options_named(record: type) -> Iterator[None]:
+    """Let errors speak of options (``--source-axes``) where the library names its arguments (``source_axes``).
+
+    Only what an error is about is replaced: the words before "must".
+
+    Args:
+        record: Dataclass of the command's options.
+    """
+    try:
+        yield
+    except BeamError as error:
+        subject, must, rest = str(error).partition(" must ")
+        if must:
+            flags = {field.replace("_", "-"): flag for field, flag in flags_of(record).items()}
+            flags |= {name: f"--{option}" for name, option in SHORTER.items() if option in flags}
+            words = re.split(r"(, | and )", subject.replace("_", "-"))
+            if set(words[::2]) <= set(flags):
+                error.args = ("".join(flags.get(word, word) for word in words) + must + rest,)
+        raise

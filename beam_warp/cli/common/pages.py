@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeGuard, TypeVar, get_args, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
@@ -76,12 +76,17 @@ def flags_of(record: type) -> dict[str, str]:
     hints = get_type_hints(record, include_extras=True)
     for field in dataclasses.fields(record):
         marks = getattr(hints[field.name], "__metadata__", ())
-        if inner := [kind for kind in _types_in(hints[field.name]) if dataclasses.is_dataclass(kind)]:
+        if inner := [kind for kind in _types_in(hints[field.name]) if _is_record(kind)]:
             flags |= {name: flag for kind in inner for name, flag in flags_of(kind).items()}
         elif not set(marks).intersection(_POSITIONAL):
             named = next((mark.name for mark in marks if getattr(mark, "name", None)), field.name)
             flags[field.name] = f"--{named.replace('_', '-')}"
     return flags
+
+
+def _is_record(kind: Any) -> TypeGuard[type]:
+    """Return True for a dataclass, not for an object of one."""
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def _types_in(hint: Any) -> Iterator[Any]:
