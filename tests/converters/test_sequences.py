@@ -100,7 +100,9 @@ def test_output_folders(walk, tmp_path):
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(OutputError, match="output must be a file, got the folder"):
         converters.write(walk, tmp_path / "folder.ply")
-    with pytest.raises(InvalidOptionError, match=r"must end in one of .*, got a\.compressed\.ply: compressed PLY is only read"):
+    with pytest.raises(
+        InvalidOptionError, match=r"must end in one of .*, got a\.compressed\.ply: compressed PLY is only read"
+    ):
         converters.write(walk, tmp_path / "a.compressed.ply")
 
 
