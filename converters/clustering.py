@@ -5,11 +5,13 @@ All results are determined by the input: the same values give the same codebook.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
 
 _SEED = 0
 
@@ -103,6 +105,12 @@ def palette(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32
     """
     if len(vectors) <= size:
         return vectors, np.arange(len(vectors))
+    with threadpool_limits(1, "blas"):  # many small products: threads inside of each cost more than they save
+        return _divided(vectors, size)
+
+
+def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Divide the vectors into groups, and these into entries."""
     rng = np.random.default_rng(_SEED)
     coarse = max(1, round(np.sqrt(size)))
     sample = vectors[rng.choice(len(vectors), min(_SAMPLE, len(vectors)), replace=False)]
@@ -110,20 +118,18 @@ def palette(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32
     groups, distances = _nearest(vectors, centers)
     order = np.argsort(groups, kind="stable")
     ends = np.cumsum(np.bincount(groups, minlength=coarse))
-    entries: list[NDArray[np.float32]] = []
-    labels = np.empty(len(vectors), np.intp)
     shares = _shares(np.bincount(groups, np.sqrt(distances), minlength=coarse), np.diff(ends, prepend=0), size)
-    taken = 0
-    for rows, share in zip(np.split(order, ends[:-1]), shares, strict=True):
-        if not share:
-            continue
-        members = vectors[rows]
-        start = members[rng.choice(len(members), share, replace=False)]
-        found, labels[rows] = _means(members, start)
-        labels[rows] += taken
-        entries.append(found)
-        taken += share
-    return np.concatenate(entries), labels
+    rows = np.split(order, ends[:-1])
+    starts = [vectors[rng.choice(part, share, replace=False)] for part, share in zip(rows, shares, strict=True)]
+    labels, entries = np.empty(len(vectors), np.intp), np.empty((size, vectors.shape[1]), np.float32)
+
+    def divide(rows: NDArray[np.intp], start: NDArray[np.float32], first: int) -> None:
+        entries[first : first + len(start)], own = _means(vectors[rows], start)
+        labels[rows] = first + own
+
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(divide, rows, starts, np.cumsum(shares) - shares))
+    return entries, labels
 
 
 def _shares(weights: NDArray[np.float64], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:

@@ -48,6 +48,11 @@ class SogFiles:
     place: zipfile.ZipFile | Path
     meta_name: str = META
 
+    @property
+    def is_folder(self) -> bool:
+        """True if the files lie in a folder."""
+        return isinstance(self.place, Path)
+
     def meta(self) -> dict[str, Any]:
         """Return the description of the SOG.
 

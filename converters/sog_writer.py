@@ -50,12 +50,14 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
         )
     if len(cloud) > MAX_SIDE**2:
         raise OutputError(f"a SOG must have at most {MAX_SIDE**2} Gaussians, got {len(cloud)}. Write another format.")
-    radiance = resize_bands(display_radiance(cloud)[0], options.sh_degree)
+    shown, meaning = display_radiance(cloud)
+    radiance = resize_bands(shown, options.sh_degree)
     if radiance.shape[1] - 1 not in (0, *COEFFICIENTS.values()):
         raise InvalidOptionError("sh_degree must be at most 3 for SOG, got 4. Pass --sh-degree 3.")
     codes, log_bounds = _position_codes(cloud.positions)
     order = np.argsort(_morton_keys(codes), kind="stable")
     textures, meta = _textures(cloud, radiance, codes, log_bounds, order)
+    meta["beam"] = {"axes": cloud.axes, "framesPerSecond": frame.frames_per_second, "radianceMeaning": meaning}
     if frame.raster is not None and frame.raster[0]:
         meta["model"] = "antialiased"
     _write_bundle(path, meta, textures)

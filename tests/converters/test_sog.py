@@ -320,6 +320,11 @@ MALFORMED = {
     "absolute": (put(["/etc/passwd"], "quats", "files"), r"quats\.files must be 1 plain file names"),
     "one name of two": (put(["means_l.webp"], "means", "files"), r"means\.files must be 2 plain file names"),
     "escape codes": (put(["\x1b[2J"], "sh0", "files"), r"sh0\.files must be 1 plain file names, got \['\\x1b"),
+    "own axes": (put({"axes": "xyz"}, "beam"), r"beam must state axes"),
+    "own rate": (
+        put({"axes": "rdf", "radianceMeaning": "none", "framesPerSecond": 0}, "beam"),
+        r"beam\.framesPerSecond must lie in",
+    ),
     "bands": (put(4, "shN", "bands"), r"spherical harmonics must have degree 1 to 3, got shN\.bands 4"),
     "other bands": (put(3, "shN", "bands"), r"palette of 70 rows of degree 3 must be 960 px wide.* 512 x 2 px"),
     "short palette": (put(129, "shN", "count"), r"palette of 129 rows"),

@@ -16,7 +16,7 @@ from beam_warp._version import __version__
 from beam_warp.converters import WriteOptions
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import raster_metadata, stated_raster
 
 EPSILON = float(np.finfo(np.float32).eps)
@@ -45,7 +45,7 @@ def morton(codes):
 
 
 def rows_of(got, wanted):
-    """For each row of ``got`` the row of ``wanted`` with its opacity; opacities are distinct bytes."""
+    """Rows of ``wanted`` whose opacities are those of ``got``; opacities are distinct bytes."""
     return np.argsort(wanted)[np.searchsorted(np.sort(wanted), got - 0.5 / 255)]
 
 
@@ -113,6 +113,7 @@ def test_what_meta_says(make_cloud, tmp_path):
     meta, textures = opened(written(cloud, tmp_path / "a.sog", **raster_metadata(True, 0.3)))
     assert meta["version"] == 2
     assert meta["asset"] == {"generator": f"beam-warp {__version__}"}
+    assert meta["beam"] == {"axes": "rdf", "framesPerSecond": 30.0, "radianceMeaning": "captured"}
     assert (meta["count"], meta["model"], meta["shN"]["bands"]) == (70, "antialiased", 3)
     assert meta["shN"]["count"] == 64
     assert {name: pixels.shape for name, pixels in textures.items()} == {
@@ -154,13 +155,28 @@ def test_axes_and_colours_are_those_of_the_usual_ply(make_cloud, tmp_path):
     cloud = make_cloud(40, 3, materials=True, axes="rub")
     sequence = GaussianSequence.from_clouds([cloud])
     converters.write(sequence, tmp_path / "a.sog")
-    back = converters.read(tmp_path / "a.sog")[0]
+    sequence = converters.read(tmp_path / "a.sog")
+    back = sequence[0]
     assert back.axes == "rdf"
+    assert "notes" not in sequence.metadata
     assert np.allclose(np.sort(back.positions[:, 1]), np.sort(-cloud.positions[:, 1]), atol=1e-3)
     linear = make_cloud(40, 0, radiance_color_space=LINEAR_REC709)
     shown = written(linear, tmp_path / "b.sog"), written(linear, tmp_path / "b.ply")
     colors = [np.sort(converters.read(path)[0].radiance[:, 0], axis=0) for path in shown]
     assert np.array_equal(*colors)
+
+
+def test_what_colour_means_and_the_rate_come_back(make_cloud, tmp_path):
+    cloud = make_cloud(20, 0, materials=True)
+    fields = {name: array for name, array in cloud.arrays().items() if name != "radiance"}
+    for without, meaning in (((), "baseColorOnly"), (("base_color",), None)):
+        kept = {name: array for name, array in fields.items() if name not in without}
+        sequence = GaussianSequence.from_clouds([GaussianCloud(**kept, axes="rdf")] * 2, frames_per_second=24.0)
+        converters.write(sequence, tmp_path / "walk.sog")
+        back = converters.read(tmp_path)
+        assert back.frames_per_second == 24.0
+        assert back.metadata.get("radiance_meaning") == meaning
+        assert (back[1].radiance is None) == (meaning is None)
 
 
 def test_sequences_bands_and_what_does_not_fit(make_cloud, tmp_path):
