@@ -291,18 +291,21 @@ def _fields(files: SogFiles, header: SogHeader, options: ReadOptions) -> dict[st
         name = header.names[group][index]
         return files.texture(name, header.sizes[name], channels)[: header.count]
 
+    positions = _positions(pixels("means"), pixels("means", 1), header.log_bounds)
+    orientations = _orientations(files, header.names["quats"][0], pixels("quats", channels=4), options)
+    scales = _looked_up(exp_scale(header.log_scales), pixels("scales"))
     colors = pixels("sh0", channels=4)
     if header.rest is None:
         radiance = np.empty((header.count, 1, 3), np.float32)
-    else:
+    else:  # by far the largest array: after all that can be refused
         name = header.names["shN"][0]
         palette = _palette(header.rest, files.texture(name, header.sizes[name], 3), header.sizes[name][0])
         radiance = palette[_labels(files, header, pixels("shN", 1))]
     radiance[:, 0] = _looked_up(header.colors, colors[:, :3])
     return {
-        "positions": _positions(pixels("means"), pixels("means", 1), header.log_bounds),
-        "orientations": _orientations(files, header.names["quats"][0], pixels("quats", channels=4), options),
-        "scales": _looked_up(exp_scale(header.log_scales), pixels("scales")),
+        "positions": positions,
+        "orientations": orientations,
+        "scales": scales,
         "opacities": header.opacities.astype(np.float32)[colors[:, 3]],
         "radiance": radiance,
         "radiance_color_space": DISPLAY_SRGB,

@@ -180,6 +180,8 @@ def open_sog(path: Path) -> Iterator[SogFiles]:
         try:
             _require_small_directory(path)
             archive = zipfile.ZipFile(path)
+        except AssetFormatError:
+            raise
         except OSError as error:
             raise MissingFileError(f"input must be an existing file, got {path} ({error.strerror}).") from error
         except (ValueError, NotImplementedError, struct.error, zipfile.BadZipFile) as error:
