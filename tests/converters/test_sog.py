@@ -343,7 +343,7 @@ MALFORMED = {
         lambda files: files.update(
             {n: vast(1000, 1000) for n in files if n not in ("meta.json", "shN_centroids.webp")}
         ),
-        r"sh0\.webp must be an intact picture",
+        r"means_l\.webp must be an intact picture",
     ),
 }
 
@@ -373,9 +373,7 @@ def test_tricks_of_archives(tmp_path):
     with pytest.raises(AssetFormatError, match=r"scales\.webp must unpack to at most \d+ bytes, got more"):
         converters.read(path)
     bundle(random_sog() | {f"{number}" * 9: b"" for number in range(2000)}, path)
-    with pytest.raises(
-        AssetFormatError, match=r"^a\.sog: a SOG bundle must list its eight files, got a directory of \d+ bytes"
-    ):
+    with pytest.raises(AssetFormatError, match=r"^a\.sog: a SOG bundle must list its eight files, got a directory of"):
         converters.read(path)
     content = bytearray(bundle(random_sog(), path).read_bytes())
     content[content.index(b"RIFF") + 40] ^= 255
