@@ -5,13 +5,18 @@ All results are determined by the input: the same values give the same codebook.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
 
 _SEED = 0
 
-_ROUNDS_OF_NUMBERS = 200
+_ROUNDS_OF_SHARING = 8
+_ROUNDS_OF_NUMBERS = 100
 _ROUNDS_OF_VECTORS = 8
 
 _SAMPLE = 2**16
@@ -21,37 +26,69 @@ _SAMPLE = 2**16
 def codebook(values: NDArray[np.floating], size: int = 256) -> NDArray[np.float32]:
     """Return ``size`` ascending numbers that stand for many.
 
-    Up to ``size`` different values are kept exactly. Others are the means of their neighbourhoods (Lloyd 1982), which
-    are found on sorted values from prefix sums; the start has the density^(1/3) that is best in the limit of many
-    codes (Panter and Dite 1951).
+    Up to ``size`` different values are kept exactly. Others are the means of their neighbourhoods (Lloyd 1982), found
+    on sorted values from prefix sums. The start has neighbourhoods of equal squared error, which is best in the limit
+    of many codes (Panter and Dite 1951); a code that stands for nothing later moves to where the error is greatest.
 
     Args:
         values: Finite numbers of any shape.
         size: Number of codes.
     """
-    ordered = np.sort(values, axis=None).astype(np.float32)
-    different = ordered[np.flatnonzero(np.diff(ordered, prepend=np.float32(-np.inf)))]
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    different = ordered[np.flatnonzero(np.diff(ordered, prepend=-np.inf))]
     if len(different) <= size:
-        last = different[-1:] if len(different) else np.zeros(1, np.float32)
-        return np.concatenate([different, np.repeat(last, size - len(different))])
-    sums = np.concatenate([[0.0], np.cumsum(ordered, dtype=np.float64)])
-    codes = _start(ordered, size)
+        last = different[-1:] if len(different) else np.zeros(1)
+        return np.concatenate([different, np.repeat(last, size - len(different))]).astype(np.float32)
+    cells = _Cells.of(ordered)
+    ends = np.rint(np.linspace(0, len(ordered), size + 1)).astype(np.intp)
+    for _ in range(_ROUNDS_OF_SHARING):
+        mass = np.concatenate([[0.0], np.cumsum(np.cbrt(cells.errors(ends)))])
+        ends = np.rint(np.interp(np.linspace(0.0, mass[-1], size + 1), mass, ends)).astype(np.intp)
+    codes = cells.means(ends, ordered[np.minimum(ends[:-1], len(ordered) - 1)] - cells.middle)
     for _ in range(_ROUNDS_OF_NUMBERS):
-        ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2.0)
+        ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2.0 + cells.middle)
         ends = np.concatenate([[0], ends, [len(ordered)]])
-        counts = np.diff(ends)
-        moved = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), codes)
+        moved = cells.means(ends, codes)
+        if (empty := np.diff(ends) == 0).any():
+            errors = cells.errors(ends)
+            worst = np.argsort(-errors, kind="stable")[: np.count_nonzero(empty)]
+            moved[empty] = moved[worst] + np.sqrt(errors[worst] / np.maximum(np.diff(ends)[worst], 1))
+            moved.sort()
         if np.array_equal(moved, codes):
             break
         codes = moved
-    return np.sort(codes).astype(np.float32)
+    return (codes + cells.middle).astype(np.float32)
 
 
-def _start(ordered: NDArray[np.float32], size: int) -> NDArray[np.float64]:
-    """Return codes whose density is the cube root of that of the values."""
-    counts, edges = np.histogram(ordered, bins=16 * size)
-    mass = np.concatenate([[0.0], np.cumsum(np.cbrt(counts))])
-    return np.interp((np.arange(size) + 0.5) / size * mass[-1], mass, edges)
+@dataclass(frozen=True)
+class _Cells:
+    """Sums of sorted values between any two ranks, from prefix sums about their mean.
+
+    Attributes:
+        middle: Mean of the values.
+        sums: Sum of the values before each rank, less their mean.
+        squares: Sum of the squares of the same.
+    """
+
+    middle: float
+    sums: NDArray[np.float64]
+    squares: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, ordered: NDArray[np.float64]) -> _Cells:
+        centered = ordered - ordered.mean()
+        prefixes = (np.concatenate([[0.0], np.cumsum(terms)]) for terms in (centered, centered**2))
+        return cls(float(ordered.mean()), *prefixes)
+
+    def means(self, ends: NDArray[np.intp], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean of each cell, and a given number for those without values."""
+        counts = np.diff(ends)
+        return np.where(counts > 0, np.diff(self.sums[ends]) / np.maximum(counts, 1), otherwise)
+
+    def errors(self, ends: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the sum of squared distances from the mean of each cell."""
+        sums = np.diff(self.sums[ends])
+        return np.maximum(np.diff(self.squares[ends]) - sums * sums / np.maximum(np.diff(ends), 1), 0.0)
 
 
 def nearest_codes(codes: NDArray[np.float32], values: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -68,6 +105,12 @@ def palette(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32
     """
     if len(vectors) <= size:
         return vectors, np.arange(len(vectors))
+    with threadpool_limits(1, "blas"):  # many small products: threads inside of each cost more than they save
+        return _divided(vectors, size)
+
+
+def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Divide the vectors into groups, and these into entries."""
     rng = np.random.default_rng(_SEED)
     coarse = max(1, round(np.sqrt(size)))
     sample = vectors[rng.choice(len(vectors), min(_SAMPLE, len(vectors)), replace=False)]
@@ -75,20 +118,18 @@ def palette(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32
     groups, distances = _nearest(vectors, centers)
     order = np.argsort(groups, kind="stable")
     ends = np.cumsum(np.bincount(groups, minlength=coarse))
-    entries: list[NDArray[np.float32]] = []
-    labels = np.empty(len(vectors), np.intp)
     shares = _shares(np.bincount(groups, np.sqrt(distances), minlength=coarse), np.diff(ends, prepend=0), size)
-    taken = 0
-    for rows, share in zip(np.split(order, ends[:-1]), shares, strict=True):
-        if not share:
-            continue
-        members = vectors[rows]
-        start = members[rng.choice(len(members), share, replace=False)]
-        found, labels[rows] = _means(members, start)
-        labels[rows] += taken
-        entries.append(found)
-        taken += share
-    return np.concatenate(entries), labels
+    rows = np.split(order, ends[:-1])
+    starts = [vectors[rng.choice(part, share, replace=False)] for part, share in zip(rows, shares, strict=True)]
+    labels, entries = np.empty(len(vectors), np.intp), np.empty((size, vectors.shape[1]), np.float32)
+
+    def divide(rows: NDArray[np.intp], start: NDArray[np.float32], first: int) -> None:
+        entries[first : first + len(start)], own = _means(vectors[rows], start)
+        labels[rows] = first + own
+
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(divide, rows, starts, np.cumsum(shares) - shares))
+    return entries, labels
 
 
 def _shares(weights: NDArray[np.float64], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:

@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import rows_at
 from beam_warp.converters.activations import LOG_SCALE_LIMITS, exp_scale, sigmoid
+from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.options import ReadOptions
 from beam_warp.converters.rotations import SMALLER_LIMIT, from_smaller
 from beam_warp.converters.sog_files import SogFiles, open_sog
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.axes import AXIS_CODES
 from beam_warp.world.metadata import UNSTATED_RASTER
 
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
@@ -101,24 +103,34 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
         MissingFileError: There is nothing at ``path``.
         AssetFormatError: The SOG is malformed; the message names the file in it.
     """
+    notes: list[str] = []
     with open_sog(path) as files:
         header = _read_header(files)
+        said = _own_statements(files, header.meta)
         fields = _fields(files, header, options)
-    meta, notes = header.meta, []
-    model = meta.get("model", "antialiased" if meta.get("antialias") is True else None)
+    model = _model(header.meta, notes)
     if model == "2dgs":
         fields["scales"][:, 2] = 0.0
-        notes.append("model 2dgs: read as 2D Gaussians of thickness 0")
-    elif model not in (None, "default", "antialiased"):
-        notes.append(f"model {str(model)[:40]!r} is unknown: read as the usual one")
-    version = 1 if header.meta.get("version", 1) == 1 else 2
+    if said.get("radiance_meaning") == NO_COLOR:
+        del fields["radiance"], fields["radiance_color_space"]
     return DecodedFrame(
         fields=fields,
-        format=f"SOG version {version}, {'bundle' if path.suffix.lower() == '.sog' else 'folder'}",
-        producer=_producer(meta),
+        format=f"SOG version {header.meta.get('version', 1)}, {'folder' if files.is_folder else 'bundle'}",
+        producer=_producer(header.meta),
         raster=(True, UNSTATED_RASTER[1]) if model == "antialiased" else None,
         notes=tuple(notes),
+        **said,
     )
+
+
+def _model(meta: Mapping[str, Any], notes: list[str]) -> object:
+    """Return how splats are to be drawn, in the word of the file, and note what that changes."""
+    model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
+    if model == "2dgs":
+        notes.append("model 2dgs: read as 2D Gaussians of thickness 0")
+    elif model not in ("default", "antialiased"):
+        notes.append(f"model {str(model)[:40]!r} is unknown: read as the usual one")
+    return model
 
 
 def _producer(meta: Mapping[str, Any]) -> str:
@@ -128,6 +140,19 @@ def _producer(meta: Mapping[str, Any]) -> str:
         return "unknown"
     printable = "".join(letter if letter.isprintable() else "?" for letter in generator[:80])
     return f"{printable}, by its meta.json"
+
+
+def _own_statements(files: SogFiles, meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what our own writer adds to meta.json, checked."""
+    if not isinstance(said := meta.get("beam"), dict):
+        return {}
+    axes, rate, meaning = (said.get(key) for key in ("axes", "framesPerSecond", "radianceMeaning"))
+    if axes not in AXIS_CODES or meaning not in (CAPTURED, BASE_COLOR_ONLY, NO_COLOR):
+        raise files.malformed("beam must state axes and a meaning of colour", repr(said)[:80])
+    rate = float(_numbers(files, "beam.framesPerSecond", rate, 1)[0])
+    if not 1e-3 <= rate <= 1e6:
+        raise files.malformed("beam.framesPerSecond must lie in [0.001, 1e+06]", f"{rate:g}")
+    return {"axes": axes, "frames_per_second": rate, "radiance_meaning": meaning, "color_space_is_stated": True}
 
 
 def _read_header(files: SogFiles) -> SogHeader:
@@ -266,18 +291,21 @@ def _fields(files: SogFiles, header: SogHeader, options: ReadOptions) -> dict[st
         name = header.names[group][index]
         return files.texture(name, header.sizes[name], channels)[: header.count]
 
+    positions = _positions(pixels("means"), pixels("means", 1), header.log_bounds)
+    orientations = _orientations(files, header.names["quats"][0], pixels("quats", channels=4), options)
+    scales = _looked_up(exp_scale(header.log_scales), pixels("scales"))
     colors = pixels("sh0", channels=4)
     if header.rest is None:
         radiance = np.empty((header.count, 1, 3), np.float32)
-    else:
+    else:  # by far the largest array: after all that can be refused
         name = header.names["shN"][0]
         palette = _palette(header.rest, files.texture(name, header.sizes[name], 3), header.sizes[name][0])
         radiance = palette[_labels(files, header, pixels("shN", 1))]
     radiance[:, 0] = _looked_up(header.colors, colors[:, :3])
     return {
-        "positions": _positions(pixels("means"), pixels("means", 1), header.log_bounds),
-        "orientations": _orientations(files, header.names["quats"][0], pixels("quats", channels=4), options),
-        "scales": _looked_up(exp_scale(header.log_scales), pixels("scales")),
+        "positions": positions,
+        "orientations": orientations,
+        "scales": scales,
         "opacities": header.opacities.astype(np.float32)[colors[:, 3]],
         "radiance": radiance,
         "radiance_color_space": DISPLAY_SRGB,

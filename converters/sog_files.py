@@ -48,6 +48,11 @@ class SogFiles:
     place: zipfile.ZipFile | Path
     meta_name: str = META
 
+    @property
+    def is_folder(self) -> bool:
+        """True if the files lie in a folder."""
+        return isinstance(self.place, Path)
+
     def meta(self) -> dict[str, Any]:
         """Return the description of the SOG.
 
@@ -175,6 +180,8 @@ def open_sog(path: Path) -> Iterator[SogFiles]:
         try:
             _require_small_directory(path)
             archive = zipfile.ZipFile(path)
+        except AssetFormatError:
+            raise
         except OSError as error:
             raise MissingFileError(f"input must be an existing file, got {path} ({error.strerror}).") from error
         except (ValueError, NotImplementedError, struct.error, zipfile.BadZipFile) as error:

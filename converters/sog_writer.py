@@ -32,9 +32,6 @@ from beam_warp.world.gaussians import GaussianCloud
 MAX_SIDE = 16_380
 """Largest side of a texture [px]: WebP ends at 16,383, and ours are multiples of 4."""
 
-_MEMBERS_OF_ENTRY = 2
-"""Gaussians for every entry of the palette, in the mean, where its limit allows as many entries."""
-
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes; it is the first that zip knows."""
 
@@ -53,12 +50,14 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
         )
     if len(cloud) > MAX_SIDE**2:
         raise OutputError(f"a SOG must have at most {MAX_SIDE**2} Gaussians, got {len(cloud)}. Write another format.")
-    radiance = resize_bands(display_radiance(cloud)[0], options.sh_degree)
+    shown, meaning = display_radiance(cloud)
+    radiance = resize_bands(shown, options.sh_degree)
     if radiance.shape[1] - 1 not in (0, *COEFFICIENTS.values()):
         raise InvalidOptionError("sh_degree must be at most 3 for SOG, got 4. Pass --sh-degree 3.")
     codes, log_bounds = _position_codes(cloud.positions)
     order = np.argsort(_morton_keys(codes), kind="stable")
     textures, meta = _textures(cloud, radiance, codes, log_bounds, order)
+    meta["beam"] = {"axes": cloud.axes, "framesPerSecond": frame.frames_per_second, "radianceMeaning": meaning}
     if frame.raster is not None and frame.raster[0]:
         meta["model"] = "antialiased"
     _write_bundle(path, meta, textures)
@@ -130,8 +129,8 @@ def _rotation_codes(orientations: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _bands(rest: NDArray[np.float32]) -> tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the statements on higher bands ``(N, K, 3)``, the texture of their palette, and the labels' codes."""
     coefficients = rest.shape[1]
-    size = min(PALETTE_LIMIT, PALETTE_COLUMNS * -(-len(rest) // (_MEMBERS_OF_ENTRY * PALETTE_COLUMNS)))
-    entries, labels = palette(rest.reshape(len(rest), -1), size)
+    size = min(PALETTE_LIMIT, max(PALETTE_COLUMNS, 1 << len(rest).bit_length() >> 1))  # half of the Gaussians, or more
+    entries, labels = palette(rest.reshape(len(rest), 3 * coefficients), size)
     codes = codebook(entries)
     rows = max(1, -(-len(entries) // PALETTE_COLUMNS))
     texture = np.zeros((rows * PALETTE_COLUMNS, coefficients, 3), np.uint8)
@@ -160,7 +159,7 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()  # exact: colour is kept where alpha is 0
-    Image.fromarray(pixels).save(stream, format="WEBP", lossless=True, exact=True, quality=0, method=4)
+    Image.fromarray(pixels).save(stream, format="WEBP", lossless=True, exact=True, quality=0, method=2)
     return stream.getvalue()
 
 
