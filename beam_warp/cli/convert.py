@@ -16,6 +16,7 @@ from beam_warp import __version__, converters
 from beam_warp.cli.common.console import print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, Quiet, notes_of
 from beam_warp.cli.common.pages import parse
+from beam_warp.converters.formats import format_of
 from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
@@ -23,16 +24,16 @@ from beam_warp.world.gaussians import GaussianCloud
 
 @dataclass(frozen=True)
 class ConvertCommand:
-    """Convert Gaussians between PLY and USD, axes, units and profiles.
+    """Convert Gaussians between PLY, USD, SPZ and glTF, axes, units and profiles.
 
     Example: beam-convert person.compressed.ply person.ply --target unity --sh-degree 3
 
-    A folder of numbered PLY files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
+    A folder of numbered files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
     `beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the version.
     """
 
-    input: Annotated[Positional[Path], arg(metavar="IN", help="PLY or USD file, or a folder of numbered PLY files.")]
-    output: Annotated[Positional[Path], arg(metavar="OUT", help="File to write: .ply, .usd, .usda, .usdc or .usdz.")]
+    input: Annotated[Positional[Path], arg(metavar="IN", help="File of any format, or a folder of numbered files.")]
+    output: Annotated[Positional[Path], arg(metavar="OUT", help="File to write: .ply, .usd*, .spz, .gltf or .glb.")]
     target: Annotated[Target | None, arg(help="Whose axes and units to write; by default a PLY keeps its own.")] = None
     source_axes: Annotated[
         str | None, arg(metavar="CODE", help="Where the input's x, y, z point, e.g. rdf; else its word, else rdf.")
@@ -40,9 +41,9 @@ class ConvertCommand:
     meters_per_unit: Annotated[
         float | None, arg(metavar="X", help="Length of the input's unit in metres; else its word, else 1.")
     ] = None
-    profile: Annotated[Profile, arg(help="PLY: standard for every importer, beam to append the materials.")] = (
-        "standard"
-    )
+    profile: Annotated[
+        Profile, arg(help="PLY and glTF: standard for every importer, beam to append the materials.")
+    ] = "standard"
     sh_degree: Annotated[int | None, arg(metavar="0..3", help="Pad or cut spherical harmonics to this degree.")] = None
     spz_version: Annotated[int, arg(metavar="3|4", help="SPZ: 3 for nearly every reader, 4 for smaller files.")] = 3
     activation: Annotated[
@@ -59,12 +60,12 @@ class ConvertCommand:
 
 @dataclass(frozen=True)
 class InspectCommand:
-    """Say what a file or a folder of numbered PLY files holds, who wrote it and what it leaves open.
+    """Say what a file or a folder of numbered files holds, who wrote it and what it leaves open.
 
     Example: beam-convert inspect person.compressed.ply --json
     """
 
-    input: Annotated[Positional[Path], arg(metavar="FILE", help="PLY or USD file, or a folder of numbered PLY files.")]
+    input: Annotated[Positional[Path], arg(metavar="FILE", help="File of any format, or a folder of numbered files.")]
     json: Json = False
 
 
@@ -98,8 +99,8 @@ def convert(command: ConvertCommand) -> int:
         activation=command.activation,
         drop_invalid=command.drop_invalid,
     )
-    is_ply = command.output.suffix.lower() == ".ply"
-    _require_apart(command.input, command.output, len(sequence) if is_ply else 1)
+    is_numbered = len(sequence) > 1 and not format_of(command.output).holds_sequences
+    _require_apart(command.input, command.output, len(sequence) if is_numbered else 1)
     first = sequence[0]
     with progress(command.quiet or command.json, compiles=False) as report:
 
@@ -111,8 +112,9 @@ def convert(command: ConvertCommand) -> int:
         paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
 
     notes = notes_of(sequence)
-    if is_ply and command.profile == "standard" and first.base_color is not None:
-        notes.append("materials are not in a standard PLY: --profile beam keeps them")
+    keeps_materials = format_of(command.output).holds_sequences or command.profile == "beam"
+    if not keeps_materials and first.base_color is not None:
+        notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
     seconds = time.perf_counter() - started
     if command.json:
         print_json(
@@ -127,8 +129,8 @@ def convert(command: ConvertCommand) -> int:
         )
     elif not command.quiet:
         print_notes(notes)
-        if is_ply:
-            files = f"{paths[0]}" + (f" … {paths[-1].name}" if len(paths) > 1 else "")
+        if is_numbered:
+            files = f"{paths[0]} … {paths[len(sequence) - 1].name}"
         else:
             files = f"{command.output}" + (f" and {len(paths) - 1} more beside it" if len(paths) > 1 else "")
         frames = f"{len(sequence)} frames, " if len(sequence) > 1 else ""

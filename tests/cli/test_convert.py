@@ -51,7 +51,7 @@ def test_a_file(person, capsys):
     code, out, err = run(person / "person.ply", person / "out" / "a.ply", "--target", "unity", capsys=capsys)
     assert code == 0
     assert out.startswith(f"wrote {person / 'out' / 'a.ply'}: 9 Gaussians, ")
-    assert err == "note: materials are not in a standard PLY: --profile beam keeps them\n"
+    assert err == "note: materials are left out: --profile beam keeps them in PLY and glTF\n"
     assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
 
 
@@ -64,7 +64,7 @@ def test_a_sequence_quietly_and_as_json(person, capsys):
     assert code == 0
     assert (result["frame_count"], result["gaussian_count"], result["source_axes"]) == (3, 9, "rfu")
     assert len(result["outputs"]) == 3
-    assert result["notes"] == ["materials are not in a standard PLY: --profile beam keeps them"]
+    assert result["notes"] == ["materials are left out: --profile beam keeps them in PLY and glTF"]
 
 
 def test_every_option_reaches_the_reader_and_the_writer(person, capsys):
