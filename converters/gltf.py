@@ -235,7 +235,7 @@ def _part(file: GltfFile, splats: _Splats, notes: list[str]) -> dict[str, NDArra
 def _unpacked(file: GltfFile, form: dict[str, Any], notes: list[str]) -> dict[str, NDArray[Any]]:
     """Return the arrays of splats that are stored as SPZ."""
     content, _ = file.view(form.get("bufferView"))
-    fields = dict(spz.unpack(io.BytesIO(content), file.path).fields)
+    fields = dict(spz.unpack(io.BytesIO(content.tobytes()), file.path).fields)
     del fields["radiance_color_space"]
     notes.append("SPZ is taken as stored, as CesiumJS does; the draft asks for half a turn: --source-axes luf")
     return fields
