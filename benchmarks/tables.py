@@ -121,8 +121,8 @@ def filled(page: Path, text: str) -> str:
         rows = [[cell(value) for value in row] for row in function(*map(result, files))]
         lines = ["| " + " | ".join(row) + " |" for row in rows]
         lines.insert(1, "|" + "---|" * len(rows[0]))
-        lines += ["", *(f"*Source: [{file}]({to_results}/{file}), {source(file)}.*  " for file in files)]
-        lines[-1] = lines[-1].rstrip()
+        sources = [f"*Source: [{file}]({to_results}/{file}), {source(file)}.*  " for file in files]
+        lines += ["", *sources[:-1], sources[-1].rstrip()] if sources else []
         return match[1] + "\n" + "\n".join(lines) + "\n\n" + match[3]
 
     def write_number(match: re.Match[str]) -> str:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beam_warp.converters.formats import FORMATS, format_of
+from beam_warp.converters.formats import FORMATS, decode, format_of, probe, suffix_of
 from beam_warp.converters.frame_files import write_frames
 from beam_warp.converters.frames import sequence_of
-from beam_warp.converters.numbering import numbered_files, require_no_stale_frames
+from beam_warp.converters.importers import IMPORTERS
+from beam_warp.converters.numbering import files_at, require_no_stale_frames
 from beam_warp.converters.numbering import numbered_path as numbered_path
 from beam_warp.converters.options import Activation, MaterialActivation, ReadOptions
 from beam_warp.converters.options import WriteOptions as WriteOptions
-from beam_warp.converters.staging import require_writable
+from beam_warp.converters.staging import folders_made, require_writable
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -29,15 +30,15 @@ def read(
     activation: Activation | None = None,
     drop_invalid: bool = False,
 ) -> GaussianSequence:
-    """Read Gaussians: a PLY or USD file, or a folder of numbered PLY files.
+    """Read Gaussians: a file in one of `FORMATS`, or a folder with an asset, a SOG or numbered files of any format.
 
     What the reader had to assume or leave out is in ``sequence.metadata["notes"]``, one line each; who wrote the
     file, as far as it tells, in ``sequence.metadata["producer"]``.
 
     Args:
-        path: File, or folder of numbered files; frames of a folder are read when they are asked for.
-        source_axes: Axes of a PLY (see `beam_warp.world.axes`); None takes the file's word, else ``rdf``.
-        meters_per_unit: Length of a PLY's unit [m]; None takes the file's word, else 1.
+        path: File or folder; frames of a sequence are read when they are asked for.
+        source_axes: Axes of the file (see `beam_warp.world.axes`); None takes the file's word, else ``rdf``.
+        meters_per_unit: Length of the file's unit [m]; None takes the file's word, else 1.
         material_activation: Whose material channels a PLY holds; None reads only those that state their form.
         activation: ``linear`` for a PLY with linear scales and opacities, ``log`` to accept one that looks so.
         drop_invalid: Leave out rows with non-finite values or zero quaternions instead of refusing the file.
@@ -58,22 +59,26 @@ def read(
         material_activation=material_activation,
         drop_invalid=drop_invalid,
     )
-    paths = numbered_files(source) if source.is_dir() else [source]
+    paths = files_at(source)
     form = format_of(paths[0])
     if not paths[0].is_file():
         raise MissingFileError(f"input must be an existing file or folder, got {source}. Check the path.")
-    form.require_meaningful(options, source)
+    for other in dict.fromkeys(map(format_of, paths)):
+        other.require_meaningful(options, source)
     if form.holds_sequences:
-        return form.of_reader("read")(source, options)
-    return sequence_of(paths, form.of_reader("decode"), form.of_reader("probe"), options)
+        return form.of_reader("read")(paths[0], options)
+    for other in paths[1:]:  # so that a truncated file is found before any work is done
+        probe(other)
+    names = [file.name for file in paths]
+    return sequence_of(names[0], names, lambda frame: decode(paths[frame], options), options)
 
 
-def require_output(path: Path) -> None:
+def require_output(path: Path, options: WriteOptions = WriteOptions()) -> None:  # noqa: B008
     """Refuse an output that cannot be written, before any input is read.
 
     Raises:
-        InvalidOptionError: The suffix is none that we write.
-        OutputError: The folder is missing or closed.
+        InvalidOptionError: The suffix is none that we write, or does not go with the importer or the axes.
+        OutputError: The folder is closed, or cannot be made.
     """
     form = format_of(path)
     if form.writer is None:
@@ -81,7 +86,13 @@ def require_output(path: Path) -> None:
         raise InvalidOptionError(
             f"output's name must end in one of {written}, got {path.name}: {form.name} is only read. Choose another."
         )
-    require_writable(path)
+    if options.target is not None:
+        IMPORTERS[options.target].require_reads(path, suffix_of(path.name))
+    if form.axes is not None and options.axes not in (None, form.axes):
+        raise InvalidOptionError(
+            f"axes must be {form.axes} for {form.name}, which fixes them, got {options.axes}. Leave them out."
+        )
+    require_writable(path, is_made=True)
 
 
 def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = WriteOptions()) -> list[Path]:  # noqa: B008
@@ -89,24 +100,25 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
 
     Args:
         sequence: What to write, in metres; its frames are read one at a time.
-        path: ``.ply`` or ``.usd``, ``.usda``, ``.usdc``, ``.usdz``, in a folder that exists.
-        options: Target, profile, bands, precision.
+        path: A name that ends in one of `FORMATS`. Folders that do not exist are made.
+        options: Importer, axes, profile, bands, precision.
 
     Returns:
         The files that were written. They appear whole or not at all.
 
     Raises:
         InvalidOptionError: The suffix or an option does not fit.
-        OutputError: The folder is missing or closed, a file would be too large, or older frames are in the way.
+        OutputError: The folder is closed, a file would be too large, or older frames are in the way.
     """
     final = Path(path)
-    require_output(final)
+    require_output(final, options)
     form = format_of(final)
-    if form.holds_sequences:
-        return form.of_writer("write")(sequence, final, options)
-    if len(sequence) > 1:
-        require_no_stale_frames(final, len(sequence))
-    return write_frames(sequence, final, options, form.of_writer("encode"), form.axes)
+    with folders_made(final.parent):
+        if form.holds_sequences:
+            return form.of_writer("write")(sequence, final, options)
+        if len(sequence) > 1:
+            require_no_stale_frames(final, len(sequence))
+        return write_frames(sequence, final, options, form)
 
 
 def inspect(path: str | Path) -> Inspection:

@@ -32,6 +32,7 @@ class Format:
         writer: Module of this package that writes it; None if it is only read.
         holds_sequences: True if one file holds all frames.
         axes: Axes that the format fixes, for the writer; None if a file may have any.
+        keeps_axes: True if a file states its axes and no viewer reads it, so that it is written in those of the cloud.
         read_options: Options of `ReadOptions` that mean something for it.
     """
 
@@ -40,6 +41,7 @@ class Format:
     writer: str | None = None
     holds_sequences: bool = False
     axes: str | None = None
+    keeps_axes: bool = False
     read_options: frozenset[str] = OF_ANY_FORMAT
 
     def of_reader(self, function: str) -> Callable[..., Any]:
@@ -60,12 +62,20 @@ class Format:
         given = [f.name for f in dataclasses.fields(options) if getattr(options, f.name) != getattr(defaults, f.name)]
         if without := [name for name in given if name not in self.read_options]:
             raise InvalidOptionError(
-                f"{', '.join(without)} must be left out for {self.name}, which states it, got {path.name}. "
+                f"{', '.join(without)} must be left out for {self.name}, where it means nothing, got {path.name}. "
                 "Drop the option."
             )
 
 
-_USD = Format(name="USD", reader="usd", writer="usd", holds_sequences=True, axes="rub", read_options=frozenset())
+_USD = Format(
+    name="USD",
+    reader="usd",
+    writer="usd",
+    holds_sequences=True,
+    axes="rub",
+    read_options=OF_ANY_FORMAT - {"drop_invalid"},
+)
+_H5 = Format(name="HDF5", reader="arrays", holds_sequences=True)
 
 FORMATS: dict[str, Format] = {
     ".ply": Format(
@@ -77,6 +87,16 @@ FORMATS: dict[str, Format] = {
     ".compressed.ply": Format(name="compressed PLY", reader="ply"),
     ".spz": Format(name="SPZ", reader="spz", writer="spz", axes="rub"),
     **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf", writer="gltf_writer", axes="rub")),
+    ".splat": Format(name="splat", reader="splat", writer="splat"),
+    ".ksplat": Format(name="ksplat", reader="ksplat"),
+    ".npz": Format(name="NumPy", reader="arrays", writer="arrays", keeps_axes=True),
+    **dict.fromkeys((".h5", ".hdf5"), _H5),
+    ".zip": Format(
+        name="zipped frames",
+        reader="zipped",
+        holds_sequences=True,
+        read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
+    ),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""
@@ -98,3 +118,13 @@ def format_of(path: Path) -> Format:
     raise InvalidOptionError(
         f"file name must end in one of {', '.join(FORMATS)}, got {path.name}. Rename it or convert it elsewhere."
     )
+
+
+def decode(path: Path, options: ReadOptions) -> Any:
+    """Read a file that holds one frame by the module of its format; a `beam_warp.converters.frames.DecodedFrame`."""
+    return format_of(path).of_reader("decode")(path, options)
+
+
+def probe(path: Path) -> None:
+    """Refuse a file that holds one frame and is malformed, as far as its header tells."""
+    format_of(path).of_reader("probe")(path)

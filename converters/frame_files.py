@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from beam_warp.converters.formats import Format
+from beam_warp.converters.importers import IMPORTERS, RDF
 from beam_warp.converters.numbering import numbered_path
 from beam_warp.converters.options import WriteOptions
 from beam_warp.image.files import replacing
-from beam_warp.world.axes import TARGETS, change_axes
+from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import stated_raster
 
@@ -42,19 +44,24 @@ Encode = Callable[[FrameToWrite, Path, WriteOptions], None]
 """Writes one frame to a file, whose place is temporary."""
 
 
-def write_frames(
-    sequence: GaussianSequence, path: Path, options: WriteOptions, encode: Encode, fixed_axes: str | None
-) -> list[Path]:
+def write_frames(sequence: GaussianSequence, path: Path, options: WriteOptions, form: Format) -> list[Path]:
     """Write one file, or one for each frame numbered from the given name.
+
+    Axes are those asked for, else the format's, else the importer's, else `RDF`, which viewers assume of a file that
+    no importer is named for; so the picture stands upright there.
 
     Raises:
         InvalidOptionError: The metadata that state how the Gaussians are to be drawn break the contract of
-            `beam_warp.world.metadata`, or what ``encode`` refuses.
+            `beam_warp.world.metadata`, or the importer or the format refuses an option.
         OutputError: A file cannot be written; nothing of the call is left behind.
     """
     count = len(sequence)
     paths = [path] if count == 1 else [numbered_path(path, frame) for frame in range(count)]
     raster, others = stated_raster(sequence.metadata), list[Path]()
+    importer = IMPORTERS[options.target] if options.target is not None else None
+    axes = options.axes or form.axes or (importer.axes if importer else None if form.keeps_axes else RDF)
+    units_per_meter = importer.units_per_meter if importer else 1.0
+    encode: Encode = form.of_writer("encode")
     with ExitStack() as outputs:
 
         def beside(name: str) -> Path:
@@ -62,12 +69,8 @@ def write_frames(
             return outputs.enter_context(replacing(others[-1]))
 
         for number, final in enumerate(paths):
-            cloud, units_per_meter = sequence[number], 1.0
-            if fixed_axes is not None:
-                cloud = change_axes(cloud, fixed_axes)
-            elif options.target is not None:
-                axes, units_per_meter = TARGETS[options.target]
-                cloud = change_axes(cloud, axes, scale=units_per_meter)
+            cloud = sequence[number]
+            cloud = change_axes(cloud, axes or cloud.axes, scale=units_per_meter)
             frame = FrameToWrite(
                 name=final.stem,
                 cloud=cloud,
@@ -77,5 +80,6 @@ def write_frames(
                 raster=raster,
                 beside=beside,
             )
-            encode(frame, outputs.enter_context(replacing(final)), options)
+            degree = importer.sh_degree(cloud.sh_degree or 0, options.sh_degree) if importer else options.sh_degree
+            encode(frame, outputs.enter_context(replacing(final)), replace(options, sh_degree=degree))
     return paths + others

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beam_warp.converters.colors import CAPTURED
+from beam_warp.converters.importers import RDF
 from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.vertical import contradictions
 from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import raster_metadata
 
-DEFAULT_AXES = "rdf"
-"""Axes of a file that does not state any: those of COLMAP, in which 3DGS is trained."""
+ASSUMED_AXES = "axes are not stated"
+"""Beginning of the note on axes that neither the file nor the caller states."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +52,6 @@ class DecodedFrame:
     notes: tuple[str, ...] = field(default=())
 
 
-Decode = Callable[[Path, ReadOptions], DecodedFrame]
-"""Reads a file whole."""
-
-Probe = Callable[[Path], Any]
-"""Reads a file's header and refuses one that is malformed or truncated, at the cost of no more than its header."""
-
-
 @dataclass(frozen=True)
 class ReadFrame:
     """A frame in metres, with its provenance and notes."""
@@ -66,6 +60,23 @@ class ReadFrame:
     frames_per_second: float
     provenance: dict[str, str]
     notes: tuple[str, ...]
+
+
+def overruled(options: ReadOptions, axes: str | None, meters_per_unit: float | None) -> list[str]:
+    """Return notes on what a caller states otherwise than the file.
+
+    Args:
+        options: What the caller states.
+        axes: Axes that the file states or that its format fixes; None if neither.
+        meters_per_unit: Length of its unit [m]; None if it states none.
+    """
+    notes = []
+    if options.source_axes is not None and axes not in (None, options.source_axes):
+        notes.append(f"axes are taken as {options.source_axes}, by --source-axes; the file says {axes}")
+    if options.meters_per_unit is not None and meters_per_unit not in (None, options.meters_per_unit):
+        said = f"by --meters-per-unit; the file says {meters_per_unit:g} m"
+        notes.append(f"one unit is taken as {options.meters_per_unit:g} m, {said}")
+    return notes
 
 
 def cloud_of(decoded: DecodedFrame, name: str, options: ReadOptions) -> ReadFrame:
@@ -79,7 +90,7 @@ def cloud_of(decoded: DecodedFrame, name: str, options: ReadOptions) -> ReadFram
     Raises:
         AssetFormatError: Values are outside their contract; the message names file and row.
     """
-    fields, notes = dict(decoded.fields), list(decoded.notes)
+    fields, notes = dict(decoded.fields), [*decoded.notes, *overruled(options, decoded.axes, decoded.meters_per_unit)]
     units = decoded.meters_per_unit if options.meters_per_unit is None else options.meters_per_unit
     if units != 1.0:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is infinite, which a cloud refuses
@@ -87,8 +98,8 @@ def cloud_of(decoded: DecodedFrame, name: str, options: ReadOptions) -> ReadFram
                 fields[array] = fields[array] * units
     axes = options.source_axes or decoded.axes
     if axes is None:
-        axes = DEFAULT_AXES
-        notes.append(f"axes are not stated: taken as {axes} (3DGS training); pass --source-axes if they are others")
+        axes = RDF
+        notes.append(f"{ASSUMED_AXES}: taken as {axes} (3DGS training); pass --source-axes if they are others")
     try:
         if options.drop_invalid:
             cloud, invalid = GaussianCloud.leaving_out_invalid(**fields, axes=axes)
@@ -100,6 +111,8 @@ def cloud_of(decoded: DecodedFrame, name: str, options: ReadOptions) -> ReadFram
         raise AssetFormatError(f"{name}: {error}") from error
     if not len(cloud):
         notes.append("holds no Gaussians")
+    elif (options.source_axes or decoded.axes) is None:
+        notes += contradictions(cloud)
     provenance = {"source_axes": axes, "source_units": "m" if units == 1.0 else f"{units:g} m"}
     if decoded.raster is not None:
         provenance |= raster_metadata(*decoded.raster)
@@ -108,28 +121,30 @@ def cloud_of(decoded: DecodedFrame, name: str, options: ReadOptions) -> ReadFram
     return ReadFrame(cloud, decoded.frames_per_second, provenance, tuple(notes))
 
 
-def sequence_of(paths: Sequence[Path], decode: Decode, probe: Probe, options: ReadOptions) -> GaussianSequence:
-    """Make a sequence of files, each of which is read when its frame is asked for.
+def sequence_of(
+    source: str, names: Sequence[str], decode: Callable[[int], DecodedFrame], options: ReadOptions
+) -> GaussianSequence:
+    """Make a sequence of frames, each of which is read when it is asked for; the first one is read at once.
 
-    All headers are checked at once, so that a truncated file is found before any work is done.
+    Args:
+        source: Name of the file or folder.
+        names: Name of each frame, for errors.
+        decode: Reads the frame of a number.
+        options: What the caller states.
 
     Raises:
-        AssetFormatError, MissingFileError: A header or the first frame is refused.
+        AssetFormatError, MissingFileError: The first frame is refused.
     """
-    for path in paths[1:]:
-        probe(path)
-    decoded = decode(paths[0], options)
-    first = cloud_of(decoded, paths[0].name, options)
+    decoded = decode(0)
+    first = cloud_of(decoded, names[0], options)
     return GaussianSequence(
-        frame_count=len(paths),
-        read_frame=lambda frame: (
-            cloud_of(decode(paths[frame], options), paths[frame].name, options).cloud if frame else first.cloud
-        ),
+        frame_count=len(names),
+        read_frame=lambda frame: cloud_of(decode(frame), names[frame], options).cloud if frame else first.cloud,
         frames_per_second=first.frames_per_second,
-        constant=frozenset(first.cloud.arrays()) if len(paths) == 1 else frozenset(),
-        topology="constant" if len(paths) == 1 else "perFrame",  # rows of separate files have no identity
+        constant=frozenset(first.cloud.arrays()) if len(names) == 1 else frozenset(),
+        topology="constant" if len(names) == 1 else "perFrame",  # rows of separate files have no identity
         metadata={
-            "source": paths[0].name,
+            "source": source,
             "producer": decoded.producer,
             **first.provenance,
             **({"notes": "\n".join(first.notes)} if first.notes else {}),

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from beam_warp.converters.formats import format_of
-from beam_warp.converters.frames import DecodedFrame
-from beam_warp.converters.numbering import numbered_files
+from beam_warp.converters.frames import ASSUMED_AXES, DecodedFrame
+from beam_warp.converters.importers import RDF
+from beam_warp.converters.numbering import files_at
 from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.vertical import CONTRADICTION, likely_axes, vertical_of
 from beam_warp.world.axes import handedness
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud, GaussianSequence
 
@@ -111,26 +113,25 @@ def inspect(sequence: GaussianSequence, path: Path) -> Inspection:
     Raises:
         AssetFormatError: The first frame is malformed.
     """
-    first = numbered_files(path)[0] if path.is_dir() else path
-    form = format_of(first)
-    decoded = None if form.holds_sequences else form.of_reader("decode")(first, ReadOptions())
+    files = files_at(path)
+    form = format_of(files[0])
+    decoded = None if form.holds_sequences else form.of_reader("decode")(files[0], ReadOptions())
     cloud = sequence[0]
-    notes = [line for line in sequence.metadata.get("notes", "").splitlines() if not line.startswith("axes are")]
-    unstated = decoded is not None and decoded.axes is None
-    if unstated:
+    said = sequence.metadata.get("notes", "").splitlines()
+    notes = [line for line in said if not line.startswith((ASSUMED_AXES, CONTRADICTION))]
+    assumed = any(line.startswith(ASSUMED_AXES) for line in said)
+    if assumed:
         notes.append("one unit is taken as 1 m; pass --meters-per-unit when converting if it is another")
-    kind = f"{form.name} ({path.suffix.lower()})" if decoded is None else decoded.format
+    kind = f"{form.name} ({files[0].suffix.lower()})" if decoded is None else decoded.format
     return Inspection(
         name=path.name,
-        format=f"{kind}, one file per frame" if path.is_dir() else kind,
+        format=f"{kind}, one file per frame" if len(files) > 1 else kind,
         producer=sequence.metadata.get("producer", "unknown"),
         frame_count=len(sequence),
         frames_per_second=sequence.frames_per_second,
         gaussian_count=len(cloud),
         axes=cloud.axes,
-        axes_evidence=_axes_evidence(cloud)
-        if decoded is not None and decoded.axes is None
-        else ("stated by the file",),
+        axes_evidence=_axes_evidence(cloud) if assumed else ("stated by the file",),
         bounds=_bounds(cloud),
         scales=_value_range(cloud.scales),
         opacities=_value_range(cloud.opacities),
@@ -163,25 +164,23 @@ def _color_state(cloud: GaussianCloud, decoded: DecodedFrame | None) -> str:
 
 def _axes_evidence(cloud: GaussianCloud) -> tuple[str, ...]:
     """Return what the shape tells about the vertical: the tallest axis, and which of its ends is at the origin."""
-    lines = ["not stated by the file: rdf is what 3DGS training writes; pass --source-axes to say otherwise"]
-    if len(cloud) < 2:
+    lines = [f"not stated by the file: {RDF} is what 3DGS training writes; pass --source-axes to say otherwise"]
+    vertical = vertical_of(cloud)
+    if vertical is None:
         return tuple(lines)
-    low, high = np.quantile(cloud.positions.astype(np.float64), [0.01, 0.99], axis=0)
-    size = high - low
-    tallest = int(np.argmax(size))
-    others = np.delete(size, tallest)
-    extents = " × ".join(f"{value:.2f}" for value in size)
-    if not size[tallest] > 1.3 * others.max():
+    extents = " × ".join(f"{high - low:.2f}" for low, high in zip(vertical.low, vertical.high, strict=True))
+    if vertical.axis is None:
         lines.append(f"the shape has no tall axis (98 % within {extents}): it says nothing of the vertical")
         return tuple(lines)
-    name = "xyz"[tallest]
+    name = "xyz"[vertical.axis]
     lines.append(f"tallest along {name} (98 % within {extents}): {name} is the vertical if the subject stands")
-    near, far = sorted((abs(low[tallest]), abs(high[tallest])))
-    if near < 0.1 * far:
-        up = "down" if abs(high[tallest]) == near else "up"
-        lines.append(f"it spans {low[tallest]:.2f} … {high[tallest]:.2f}: {name} points {up} if it stands at 0")
-        agrees = cloud.axes[tallest] == up[0]
-        lines.append(f"which {'agrees with' if agrees else 'contradicts'} {cloud.axes}")
+    if vertical.points is not None:
+        low, high = vertical.low[vertical.axis], vertical.high[vertical.axis]
+        way = "up" if vertical.points == "u" else "down"
+        lines.append(f"it spans {low:.2f} … {high:.2f}: {name} points {way} if it stands at 0")
+        agrees = cloud.axes[vertical.axis] == vertical.points
+        remedy = "" if agrees else f": pass --source-axes {likely_axes(vertical)}"
+        lines.append(f"which {'agrees with' if agrees else 'contradicts'} {cloud.axes}{remedy}")
     return tuple(lines)
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from beam_warp.checks import require_choice, require_count, require_number
-from beam_warp.world.axes import TARGETS, require_axes
+from beam_warp.converters.importers import IMPORTERS
+from beam_warp.world.axes import require_axes
 
 Activation = Literal["log", "linear"]
 MaterialActivation = Literal["linear", "r3dg", "gsir", "irgs"]
-Target = Literal["usd", "unity", "unreal"]
 Profile = Literal["standard", "beam"]
 
 
@@ -53,7 +53,9 @@ class WriteOptions:
     """Options of a writer.
 
     Attributes:
-        target: Consumer whose axes and units to write; None keeps the cloud's axes in metres (USD is always ``usd``).
+        target: Importer that the file is for, by its name in `beam_warp.converters.importers.IMPORTERS`: its axes,
+            units and spherical harmonics are written. None writes ``rdf`` in metres, unless the format fixes its axes.
+        axes: Axis code to write, whatever the importer; None for the importer's.
         profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
         spz_version: SPZ only. 3 is read by nearly everything; 4 is smaller and also holds degree 4.
@@ -63,7 +65,8 @@ class WriteOptions:
         InvalidOptionError: A value is outside its contract.
     """
 
-    target: Target | None = None
+    target: str | None = None
+    axes: str | None = None
     profile: Profile = "standard"
     sh_degree: int | None = None
     spz_version: int = 3
@@ -72,7 +75,9 @@ class WriteOptions:
     def __post_init__(self) -> None:
         """Check each option."""
         if self.target is not None:
-            require_choice("target", self.target, tuple(TARGETS))
+            require_choice("target", self.target, tuple(IMPORTERS))
+        if self.axes is not None:
+            require_axes("axes", self.axes)
         require_choice("profile", self.profile, ("standard", "beam"))
         if self.sh_degree is not None:
             require_count("sh_degree", self.sh_degree, 0, 3)

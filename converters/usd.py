@@ -6,31 +6,56 @@ import dataclasses
 from pathlib import Path
 
 from beam_warp.converters.colors import resize_bands
+from beam_warp.converters.frames import overruled
+from beam_warp.converters.importers import IMPORTERS
 from beam_warp.converters.options import ReadOptions, WriteOptions
-from beam_warp.errors import InvalidOptionError
+from beam_warp.schema.files import unaligned_files
 from beam_warp.schema.reader import read_asset
+from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters
 from beam_warp.schema.writer import write_asset
-from beam_warp.world.axes import TARGETS, change_axes
+from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 
 def read(path: Path, options: ReadOptions) -> GaussianSequence:
-    """Read an asset; a stage states its own axes, units and activations."""
-    del options  # none means anything here
-    return read_asset(path)
+    """Read an asset; axes and units that the caller states outrank those of the stage, with a note."""
+    sequence = read_asset(path)
+    notes = sequence.metadata.get("notes", "").splitlines()
+    if path.suffix.lower() == ".usdz" and (unaligned := unaligned_files(path)):
+        notes.append(f"{len(unaligned)} files of the package are not 64-byte aligned, as USDZ demands: read anyway")
+    read_frame = sequence.read_frame
+    if options.source_axes is not None or options.meters_per_unit is not None:
+        source, stage = open_asset(path, trusted=True)
+        axes, meters = stage_axes(stage, source), stage_meters(stage, source)
+        notes += overruled(options, axes, meters)
+        read_frame = _Overruled(sequence, options.source_axes or axes, (options.meters_per_unit or meters) / meters)
+    metadata = {**sequence.metadata, "notes": "\n".join(notes)} if notes else sequence.metadata
+    return dataclasses.replace(sequence, read_frame=read_frame, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Overruled:
+    """Reads frames of an asset whose axes and units the caller states.
+
+    Attributes:
+        sequence: The asset as it states itself.
+        axes: Axes in which its coordinates are taken.
+        scale: Length of the caller's unit in that of the asset.
+    """
+
+    sequence: GaussianSequence
+    axes: str
+    scale: float
+
+    def __call__(self, frame: int) -> GaussianCloud:
+        """Return one frame."""
+        cloud = self.sequence[frame]
+        return change_axes(cloud, cloud.axes, scale=self.scale).with_arrays(axes=self.axes)
 
 
 def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list[Path]:
-    """Write an asset, y up and in metres.
-
-    Raises:
-        InvalidOptionError: The axes of another target are requested.
-    """
-    if options.target not in (None, "usd"):
-        raise InvalidOptionError(
-            f"target must be usd for a USD output, got {options.target}. Write PLY for {options.target}."
-        )
-    axes, _ = TARGETS["usd"]
+    """Write an asset, y up and in metres."""
+    axes = IMPORTERS["usd"].axes
 
     def prepared(frame: int) -> GaussianCloud:
         cloud = change_axes(sequence[frame], axes)

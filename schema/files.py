@@ -13,6 +13,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 from beam_warp.errors import AssetFormatError, MissingFileError
 
@@ -113,7 +114,7 @@ def run_child(module: str, path: Path, seconds: float) -> dict[str, object]:
 
 
 def _require_whole_package(path: Path) -> None:
-    """Refuse a package that is cut short, compressed or misaligned, or that names files outside itself."""
+    """Refuse a package that is cut short or compressed, or that names files outside itself."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -131,13 +132,29 @@ def _require_whole_package(path: Path) -> None:
             names.add(entry.filename)
             if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
                 raise _broken(path, "must store its files as they are", f"{entry.filename!r} compressed or encrypted")
-            stream.seek(entry.header_offset)
-            header = stream.read(30)
-            if len(header) < 30 or header[:4] != b"PK\x03\x04":
+            start = _start_of(stream, entry)
+            if start is None:
                 raise _broken(path, "must hold a local header of every file", f"none of {entry.filename!r}")
-            start = entry.header_offset + 30 + sum(struct.unpack("<HH", header[26:30]))
-            if start % ZIP_ALIGNMENT or start + entry.file_size > size:
-                raise _broken(path, "must hold every file whole, 64-byte aligned", f"{entry.filename!r} at {start}")
+            if start + entry.file_size > size:
+                raise _broken(path, "must hold every file whole", f"{entry.filename!r} at {start}")
+
+
+def _start_of(stream: BinaryIO, entry: zipfile.ZipInfo) -> int | None:
+    """Return the byte at which the data of a zip's entry begins, or None without a local header."""
+    stream.seek(entry.header_offset)
+    header = stream.read(30)
+    if len(header) < 30 or header[:4] != b"PK\x03\x04":
+        return None
+    return entry.header_offset + 30 + sum(struct.unpack("<HH", header[26:30]))
+
+
+def unaligned_files(path: Path) -> list[str]:
+    """Return the files of a USDZ whose data do not start at a multiple of 64 bytes, which the format demands.
+
+    OpenUSD opens such a package; readers that map its files may not.
+    """
+    with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+        return [entry.filename for entry in archive.infolist() if (_start_of(stream, entry) or 1) % ZIP_ALIGNMENT]
 
 
 def _broken(path: Path, contract: str, got: str) -> AssetFormatError:

@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_choice, require_count
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, asset_in, notes_of
+from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, notes_of
 from beam_warp.cli.drawing.checks import kind_of, require_capture_folder, require_one_camera, require_place
 from beam_warp.cli.drawing.flags import StillCameraFlags
 from beam_warp.cli.drawing.views import PlannedView, capture_views, still_camera
@@ -46,7 +46,7 @@ class DrawChannel:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="ASSET", help="PLY or USD file, a folder with asset.usda, or a folder of numbered PLY files."),
+        arg(metavar="ASSET", help="File of Gaussians, a folder with asset.usda, or a folder of numbered files."),
     ]
     name: Annotated[
         Positional[str], arg(metavar="NAME", help="Array: base_color, roughness_error, observability, normals, ….")
@@ -71,7 +71,7 @@ def channel(args: DrawChannel) -> int:
     _require_consistent(args)
     started = time.perf_counter()
     capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
-    sequence = args.reading.read(asset_in(args.asset))
+    sequence = args.reading.read(args.asset)
     options = args.reading.raster(sequence)
     notes = notes_of(sequence)
     if capture is None:

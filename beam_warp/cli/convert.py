@@ -14,33 +14,49 @@ from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
 from beam_warp.cli.common.console import print_json, print_notes, progress, run_command
-from beam_warp.cli.common.flags import Json, Quiet, notes_of
+from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
-from beam_warp.converters.formats import format_of
-from beam_warp.converters.options import Activation, MaterialActivation, Profile, Target
+from beam_warp.converters.formats import FORMATS, format_of
+from beam_warp.converters.importers import IMPORTERS
+from beam_warp.converters.numbering import numbered_path
+from beam_warp.converters.options import Activation, MaterialActivation, Profile
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
+
+READ = f"File ({', '.join(FORMATS)}), or a folder with asset.usda, meta.json or numbered files."
+"""What is read, in words."""
+
+WRITTEN = f"File to write: {', '.join(suffix for suffix, form in FORMATS.items() if form.writer)}."
+"""What is written, in words."""
 
 
 @dataclass(frozen=True)
 class ConvertCommand:
-    """Convert Gaussians between PLY, USD, SPZ and glTF, axes, units and profiles.
+    """Convert Gaussians between file formats, axes, units and profiles.
 
-    Example: beam-convert person.compressed.ply person.ply --target unity --sh-degree 3
+    Example: beam-convert person.compressed.ply person.ply --for aras-p
 
-    A folder of numbered files is a sequence; several frames written to walk.ply become walk000000.ply and so on.
-    `beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the version.
+    A folder of numbered files is a sequence, also if it is zipped; several frames written to walk.ply become
+    walk000000.ply and so on. `beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the
+    version.
     """
 
-    input: Annotated[Positional[Path], arg(metavar="IN", help="File of any format, or a folder of numbered files.")]
-    output: Annotated[Positional[Path], arg(metavar="OUT", help="File to write: .ply, .usd*, .spz, .gltf or .glb.")]
-    target: Annotated[Target | None, arg(help="Whose axes and units to write; by default a PLY keeps its own.")] = None
-    source_axes: Annotated[
-        str | None, arg(metavar="CODE", help="Where the input's x, y, z point, e.g. rdf; else its word, else rdf.")
+    input: Annotated[Positional[Path], arg(metavar="IN", help=READ)]
+    output: Annotated[Positional[Path], arg(metavar="OUT", help=WRITTEN)]
+    target: Annotated[
+        str | None,
+        arg(
+            name="for",
+            aliases=("--target",),
+            metavar="IMPORTER",
+            help=f"Write what an importer reads: its axes, units, harmonics. One of {', '.join(IMPORTERS)}.",
+        ),
     ] = None
-    meters_per_unit: Annotated[
-        float | None, arg(metavar="X", help="Length of the input's unit in metres; else its word, else 1.")
+    axes: Annotated[
+        str | None, arg(metavar="CODE", help="Where x, y, z of the output point; by default rdf, as viewers assume.")
     ] = None
+    source_axes: SourceAxes = None
+    meters_per_unit: MetersPerUnit = None
     profile: Annotated[
         Profile, arg(help="PLY and glTF: standard for every importer, beam to append the materials.")
     ] = "standard"
@@ -65,14 +81,14 @@ class InspectCommand:
     Example: beam-convert inspect person.compressed.ply --json
     """
 
-    input: Annotated[Positional[Path], arg(metavar="FILE", help="File of any format, or a folder of numbered files.")]
+    input: Annotated[Positional[Path], arg(metavar="FILE", help=READ)]
     json: Json = False
 
 
 def _require_apart(source: Path, output: Path, frame_count: int) -> None:
     """Refuse to write over the input: a conversion that goes wrong must not cost the original."""
     taken = {path.resolve() for path in (source.iterdir() if source.is_dir() else [source])}
-    planned = [output] if frame_count == 1 else [converters.numbered_path(output, n) for n in range(frame_count)]
+    planned = [output] if frame_count == 1 else [numbered_path(output, n) for n in range(frame_count)]
     clash = next((path for path in planned if path.resolve() in taken), None)
     if clash is not None:
         raise InvalidOptionError(
@@ -85,12 +101,13 @@ def convert(command: ConvertCommand) -> int:
     started = time.perf_counter()
     options = converters.WriteOptions(
         target=command.target,
+        axes=command.axes,
         profile=command.profile,
         sh_degree=command.sh_degree,
         spz_version=command.spz_version,
         full_float=command.full_float,
     )
-    converters.require_output(command.output)
+    converters.require_output(command.output, options)
     sequence = converters.read(
         command.input,
         source_axes=command.source_axes,
@@ -99,7 +116,8 @@ def convert(command: ConvertCommand) -> int:
         activation=command.activation,
         drop_invalid=command.drop_invalid,
     )
-    is_numbered = len(sequence) > 1 and not format_of(command.output).holds_sequences
+    form = format_of(command.output)
+    is_numbered = len(sequence) > 1 and not form.holds_sequences
     _require_apart(command.input, command.output, len(sequence) if is_numbered else 1)
     first = sequence[0]
     with progress(command.quiet or command.json, compiles=False) as report:
@@ -112,9 +130,17 @@ def convert(command: ConvertCommand) -> int:
         paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
 
     notes = notes_of(sequence)
-    keeps_materials = format_of(command.output).holds_sequences or command.profile == "beam"
-    if not keeps_materials and first.base_color is not None:
+    if form.name == "splat" and (first.sh_degree or first.base_color is not None):
+        notes.append("a .splat holds neither materials nor view-dependent colour: they are left out")
+    elif (
+        not form.holds_sequences
+        and form.name != "NumPy"
+        and command.profile == "standard"
+        and first.base_color is not None
+    ):
         notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
+    if command.target is not None:
+        notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
     if command.json:
         print_json(
@@ -156,6 +182,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[:1] == ["inspect"]:
         asked = parse(InspectCommand, words[1:], "beam-convert inspect")
-        return run_command(lambda: inspect(asked))
+        return run_command(lambda: inspect(asked), InspectCommand)
     command = parse(ConvertCommand, words, "beam-convert")
-    return run_command(lambda: convert(command))
+    return run_command(lambda: convert(command), ConvertCommand)

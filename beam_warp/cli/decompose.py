@@ -77,9 +77,7 @@ class Decompose:
     Example: beam decompose walker/gaussians.usda --capture captures/walker --preset paper --out walker_paper
     """
 
-    sequence: Annotated[
-        Positional[Path], arg(metavar="SEQ", help="PLY or USD file, or a folder of numbered PLY files.")
-    ]
+    sequence: Annotated[Positional[Path], arg(metavar="SEQ", help="File of Gaussians, or a folder of numbered files.")]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     capture: Annotated[
         Path | None, arg(metavar="CAPTURE", help="Folder of the capture that SEQ was reconstructed from.")

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, DropInvalid, Json, Quiet, SourceAxes, asset_in, notes_of, raster_options
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, Quiet, SourceAxes, notes_of, raster_options
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.asset import Evaluation
@@ -41,7 +41,7 @@ class Evaluate:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="DIR", help="Folder with asset.usda; or a PLY or USD file, or a folder of numbered PLY files."),
+        arg(metavar="DIR", help="Folder with asset.usda; or a file of Gaussians, or a folder of numbered files."),
     ]
     truth: Annotated[Path, arg(metavar="CAPTURE", help="A capture whose test records have truth, and relit images.")]
     out: Annotated[
@@ -76,7 +76,7 @@ class Evaluate:
 def evaluate(args: Evaluate) -> int:
     """Score the asset and say what was found."""
     capture = Capture.read(args.truth)
-    sequence = converters.read(asset_in(args.asset), source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+    sequence = converters.read(args.asset, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
 
     from beam_warp.evaluate.asset import evaluate_asset
     from beam_warp.evaluate.materials import EvaluateOptions

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from beam_warp._version import __version__
-from beam_warp.cli.common.console import run_command
+from beam_warp.cli.common.console import options_named, run_command
 from beam_warp.cli.common.pages import parse
 from beam_warp.errors import InvalidOptionError
 
@@ -80,4 +80,5 @@ def _run(word: str, words: list[str]) -> int:
         if word == command and any(given.split("=")[0] == option for given in words):
             raise InvalidOptionError(f"{option[2:]} must be drawn by a command of its own. Use {now}.")
     record, function = COMMANDS[word].load(word)
-    return function(parse(record, words, f"beam {word}"))
+    with options_named(record):
+        return function(parse(record, words, f"beam {word}"))

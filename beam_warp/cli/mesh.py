@@ -52,7 +52,7 @@ class Mesh:
     """
 
     sequence: Annotated[
-        Positional[Path], arg(metavar="SEQUENCE", help="PLY or USD file, or a folder of numbered PLY files.")
+        Positional[Path], arg(metavar="SEQUENCE", help="File of Gaussians, or a folder of numbered files.")
     ]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the meshes; made if its parent exists.")]
     capture: Annotated[

@@ -13,10 +13,11 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, DropInvalid, Json, Quiet, Seed, SourceAxes
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit, Quiet, Seed, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
+from beam_warp.converters.numbering import SOG_NAME, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.world.environment import EnvironmentMap
@@ -40,12 +41,13 @@ class Run:
 
     input: Annotated[
         Positional[Path],
-        arg(metavar="INPUT", help="PLY or USD file, a folder of numbered PLY files, or the folder of a capture."),
+        arg(metavar="INPUT", help="File of Gaussians, a folder of numbered files, or the folder of a capture."),
     ]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
     measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
     source_axes: Annotated[SourceAxes, SECOND_PAGE] = None
+    meters_per_unit: Annotated[MetersPerUnit, SECOND_PAGE] = None
     persistent: Annotated[
         bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames."), SECOND_PAGE
     ] = False
@@ -76,7 +78,12 @@ def run(args: Run) -> int:
     with progress(args.quiet or args.json) as report:
         found = None if capture is None else _reconstruct(args, capture, report)
         if found is None:
-            sequence = converters.read(args.input, source_axes=args.source_axes, drop_invalid=args.drop_invalid)
+            sequence = converters.read(
+                args.input,
+                source_axes=args.source_axes,
+                meters_per_unit=args.meters_per_unit,
+                drop_invalid=args.drop_invalid,
+            )
         else:
             sequence = found.sequence
         if args.fps is not None:
@@ -96,12 +103,12 @@ def run(args: Run) -> int:
 
 def capture_at(path: Path) -> Capture | None:
     """Return the capture at a path; None if there is none, but perhaps Gaussians."""
-    if not (path.is_dir() or path.suffix == ".json"):
+    if not (path.is_dir() or path.suffix == ".json") or path.name == SOG_NAME:
         return None
     try:
         return Capture.read(path)
     except MissingFileError:
-        if any(path.glob("*.ply")) and not (path / "transforms.json").exists():
+        if holds_gaussians(path) and not (path / "transforms.json").exists():
             return None
         raise
 
@@ -113,10 +120,11 @@ def _check_words(args: Run, capture: Capture | None) -> None:
             "gaussians, target-psnr, preset, segment-length and frames must be left out unless the input is a "
             f"capture, got {args.input}. Drop them."
         )
-    if capture is not None and (args.source_axes is not None or args.drop_invalid or args.persistent):
+    of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
+    if capture is not None and any(value is not None for value in of_files):
         raise InvalidOptionError(
-            "source-axes, drop-invalid and persistent must be left out for a capture, whose Gaussians are made here, "
-            f"got {args.input}. Drop them."
+            "source-axes, meters-per-unit, drop-invalid and persistent must be left out for a capture, whose Gaussians "
+            f"are made here, got {args.input}. Drop them."
         )
 
 

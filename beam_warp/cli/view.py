@@ -15,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, Quiet, ReadingFlags, asset_in, notes_of
+from beam_warp.cli.common.flags import Device, Quiet, ReadingFlags, notes_of
 from beam_warp.demo.lights import stage, studio, sunset
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
@@ -42,7 +42,7 @@ class ViewCommand:
 
     asset: Annotated[
         Positional[Path],
-        arg(metavar="ASSET", help="PLY or USD file, a folder with asset.usda, or a folder of numbered PLY files."),
+        arg(metavar="ASSET", help="File of Gaussians, a folder with asset.usda, or a folder of numbered files."),
     ]
     environment: Annotated[
         tuple[Path, ...],
@@ -67,7 +67,7 @@ def view(args: ViewCommand) -> int:
     require_number("rate", args.rate, 0.1, 240.0)
     require_count("longest", args.longest, 64, 8192)
     lights = environments(args.environment)
-    sequence = args.reading.read(asset_in(args.asset))
+    sequence = args.reading.read(args.asset)
 
     from beam_warp.view.viewer import Viewer, ViewOptions
 

@@ -23,6 +23,7 @@ from typing import Any
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.converters.numbering import ASSET_NAME
 from beam_warp.decomposition.archive import FrameArchive
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.decomposition.capture_light import light_findings, prepare_light
@@ -44,8 +45,6 @@ from beam_warp.materials.direct import ColorEvidence
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
-
-ASSET_NAME = "asset.usda"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from beam_warp import converters
 from beam_warp.checks import require_number
-from beam_warp.converters.numbering import numbered_files
+from beam_warp.converters.numbering import SOG_NAME, files_at
 from beam_warp.errors import AssetFormatError, SchemaVersionError
 from beam_warp.stage.assets import StageAsset, placement_of
 from beam_warp.stage.camera_paths import (
@@ -100,8 +100,8 @@ def read_stage_asset(
     """Read an asset and put it on a stage.
 
     Args:
-        path: A PLY or USD file, or a folder of numbered PLY files.
-        source_axes: Axes of a PLY that does not state them.
+        path: A file or folder of Gaussians, as `beam_warp.converters.read` takes it.
+        source_axes: Axes of the file; None takes its word.
         drop_invalid: Leave out rows that are no Gaussians.
         name: Name of the asset in messages; the file's name if None.
         place: Further attributes of a `StageAsset`.
@@ -115,13 +115,14 @@ def read_stage_asset(
 
 def source_files(path: Path) -> tuple[tuple[Path, ...], ...]:
     """Return the files that decide each frame of an asset: numbered ones, or once the layers of a USD stage."""
-    if path.is_dir():
-        return tuple((file,) for file in numbered_files(path))
-    if path.suffix.lower() in USD_SUFFIXES:
+    files = files_at(path)
+    if len(files) == 1 and files[0].suffix.lower() in USD_SUFFIXES:
         from beam_warp.schema.stage_queries import layer_files  # brings OpenUSD along
 
-        return (tuple(layer_files(path)),)
-    return ((path,),)
+        return (tuple(layer_files(files[0])),)
+    if files[0].name == SOG_NAME:
+        return (tuple(sorted(file for file in files[0].parent.iterdir() if file.is_file())),)
+    return tuple((file,) for file in files)
 
 
 def _asset(record: Any, where: str, folder: Path) -> StageAsset:

@@ -104,7 +104,7 @@ class Stage:
         """Put assets on a stage without a file.
 
         Args:
-            paths: PLY or USD files, or folders of numbered PLY files.
+            paths: Files or folders of Gaussians, as `beam_warp.converters.read` takes them.
             spacing: Put the assets in a row along x, this far apart [m], each centred.
             centered: Put the middle of every asset over the origin.
             source_axes: Axes of PLY files that do not state them.

@@ -33,9 +33,6 @@ _DIRECTIONS = {
 AXIS_CODES = tuple("".join(code) for pairs in permutations(("rl", "ud", "fb")) for code in cartesian(*pairs))
 """All 48 codes."""
 
-TARGETS = {"usd": ("rub", 1.0), "unity": ("ruf", 1.0), "unreal": ("fru", 100.0)}
-"""Axes and units per metre that each consumer expects."""
-
 
 def require_axes(name: str, code: str) -> str:
     """Return an axis code after checking it.

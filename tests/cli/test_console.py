@@ -1,13 +1,17 @@
-"""What commands print on a terminal while they work: stages, and kernels that are compiled."""
+"""What commands print: stages, kernels that are compiled, and errors in the words of the command line."""
 
 import io
+from dataclasses import dataclass
+from typing import Annotated
 
 import pytest
 import warp as wp
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp.cli.common.console import COMPILING, progress, rate_in_words
+from beam_warp.cli.common.console import COMPILING, options_named, progress, rate_in_words
 from beam_warp.device.arrays import resolve_device
 from beam_warp.device.compilation import compilation_heard
+from beam_warp.errors import InvalidOptionError
 
 
 def fresh_kernel():
@@ -81,3 +85,35 @@ def test_rates():
     assert rate_in_words(None) == rate_in_words(0.0) == ""
     assert rate_in_words(12.34) == "12.3/s"
     assert rate_in_words(0.125) == "8.0 s each"
+
+
+@dataclass
+class Inner:
+    """Options of a group."""
+
+    sh_degree: int = 0
+    fps: float = 0.0
+
+
+@dataclass
+class Words:
+    """Options of a command."""
+
+    asset: Positional[str]
+    inner: OmitArgPrefixes[Inner]
+    target: Annotated[str | None, arg(name="for")] = None
+
+
+def test_errors_name_the_options_that_they_are_about():
+    for said, shown in (
+        ("sh_degree must be 3, got sh_degree 1. Mend it.", "--sh-degree must be 3, got sh_degree 1. Mend it."),
+        ("frames_per_second must be positive.", "--fps must be positive."),
+        ("sh-degree, target and fps must go.", "--sh-degree, --for and --fps must go."),
+        ("asset must be a file.", "asset must be a file."),  # no option sets it
+        ("sh_degree and depth must go.", "sh_degree and depth must go."),
+        ("a.ply: sh_degree must be 3.", "a.ply: sh_degree must be 3."),  # a file's own word
+        ("no contract", "no contract"),
+    ):
+        with pytest.raises(InvalidOptionError) as error, options_named(Words):
+            raise InvalidOptionError(said)
+        assert str(error.value) == shown

@@ -176,7 +176,7 @@ def test_the_image_path_refuses_what_it_does_not_have(figure, small, tmp_path, r
         ("none.usda --capture {small}", "none.usda"),
         ("{figure} --capture none", "none"),
         ("{figure} --capture {small} --roughness rough.png", "roughness-mesh must be given with a roughness texture"),
-        ("{figure} --capture {small} --samples 1", "sample_count must be"),
+        ("{figure} --capture {small} --samples 1", "--samples must be"),
         ("{figure} --capture {small} --samples 4 --exposure 99", "exposure must be"),
         ("{other} --capture {small} --roughness 0.5", "got none of frame 7"),
     ],

@@ -8,9 +8,12 @@ from support.commands import beam
 from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp import GaussianSequence, write
+from beam_warp.cli.convert import main as convert
+from beam_warp.cli.run import capture_at
 from beam_warp.cli.validate import main as validate
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import write_exr
+from beam_warp.stage.files import source_files
 
 
 @pytest.fixture
@@ -50,8 +53,13 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
     assert "note: axes" in said.err or "note" not in said.err
     shown = tmp_path / "shown.png"
     plain = ("--width", 32, "--environment-shadows", 0, "--bounces", 0, "--quiet")
-    assert beam("render", out / "asset.usda", "--environment", sky, "--out", shown, *plain) == 0
+    assert beam("render", out, "--environment", sky, "--out", shown, *plain) == 0  # the folder is the asset
     assert shown.is_file()
+    assert source_files(out) == source_files(out / "asset.usda")
+    assert convert(["inspect", str(out)]) == 0
+    assert "USD (.usda)" in capsys.readouterr().out
+    assert convert([str(out), str(tmp_path / "new" / "ball.splat"), "--quiet"]) == 0
+    assert capture_at(out) is None
     assert validate([str(out / "asset.usda"), "--quiet"]) == 0
 
 
@@ -63,8 +71,8 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
         ("ball.ply --environment none.exr", "must be a readable file, got"),
         ("ball.ply --environment square.exr", "twice as wide as high"),
         ("ball.ply --environment sky.exr --roughness r.png", "roughness-mesh must be given"),
-        ("ball.ply --environment sky.exr --samples 0", "sample_count must be"),
-        ("ball.ply --environment sky.exr --fps 0", "frames_per_second must be"),
+        ("ball.ply --environment sky.exr --samples 0", "--samples must be"),
+        ("ball.ply --environment sky.exr --fps 0", "--fps must be"),
         ("ball.ply --environment sky.exr --out missing/out", "out must be a folder that can be made"),
     ],
 )

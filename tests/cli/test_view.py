@@ -65,16 +65,16 @@ def test_a_taken_port_is_one_clear_line(asset, refused):
         holder.bind(("127.0.0.1", 0))
         holder.listen()
         port = holder.getsockname()[1]
-        refused("view", asset, "--port", port, "--no-open", says=f"error: port must be free at 127.0.0.1, got {port}")
+        refused("view", asset, "--port", port, "--no-open", says=f"error: --port must be free at 127.0.0.1, got {port}")
 
 
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["--open", "--no-open"], "error: open must be given once"),
-        (["--rate", "0"], "error: rate must be a number in"),
-        (["--longest", "3"], "error: longest must be an integer in"),
-        (["--environment", "nowhere.hdr"], "error: environment must be a file or a folder, got nowhere.hdr"),
+        (["--open", "--no-open"], "error: --open must be given once"),
+        (["--rate", "0"], "error: --rate must be a number in"),
+        (["--longest", "3"], "error: --longest must be an integer in"),
+        (["--environment", "nowhere.hdr"], "error: --environment must be a file or a folder, got nowhere.hdr"),
         (["--port", "0", "--no-open"], "error: "),
     ],
 )

@@ -13,7 +13,6 @@ from beam_warp.converters import WriteOptions
 from beam_warp.converters.activations import LOGIT_LIMIT
 from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, SchemaVersionError
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.world.axes import axes_matrix
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -31,6 +30,8 @@ def notes_of(sequence):
 
 
 def write(cloud, path, **options):
+    if "target" not in options:
+        options = {"axes": cloud.axes} | options
     return converters.write(GaussianSequence.from_clouds([cloud]), path, WriteOptions(**options))
 
 
@@ -214,19 +215,19 @@ def test_no_gaussians(columns, ply_file, tmp_path):
     assert converters.inspect(tmp_path / "b.ply").bounds is None
 
 
-def test_axes_and_units_of_the_file_and_of_the_caller(make_cloud, tmp_path):
-    cloud = make_cloud(axes="rub")
-    write(cloud, tmp_path / "unreal.ply", target="unreal")
-    sequence = converters.read(tmp_path / "unreal.ply")  # the header says fru and 0.01 m
-    back = sequence[0]
-    assert (back.axes, sequence.metadata["source_units"]) == ("fru", "0.01 m")
-    expected = cloud.positions @ axes_matrix("rub", "fru").T
-    assert np.allclose(back.positions, expected, rtol=3 * EPSILON, atol=0)
-    sequence = converters.read(tmp_path / "unreal.ply", source_axes="rdf", meters_per_unit=1.0)
-    raw = sequence[0]
-    assert (raw.axes, sequence.metadata["source_units"]) == ("rdf", "m")
-    assert np.allclose(raw.positions, 100.0 * expected, rtol=3 * EPSILON, atol=0)
-    assert np.allclose(raw.scales, 100.0 * cloud.scales, rtol=12 * EPSILON, atol=0)
+def test_axes_and_units_of_the_file_and_of_the_caller(make_cloud, columns, ply_file):
+    path = ply_file(columns, comments=["beam_axes fru", "beam_meters_per_unit 0.01"])
+    sequence = converters.read(path)
+    raw = np.column_stack([columns[axis] for axis in "xyz"])
+    assert (sequence[0].axes, sequence.metadata["source_units"]) == ("fru", "0.01 m")
+    assert np.allclose(sequence[0].positions, 0.01 * raw, rtol=3 * EPSILON, atol=0)
+    sequence = converters.read(path, source_axes="rdf", meters_per_unit=1.0)
+    assert (sequence[0].axes, sequence.metadata["source_units"]) == ("rdf", "m")
+    assert np.array_equal(sequence[0].positions, raw.astype(np.float32))
+    assert notes_of(sequence) == [
+        "axes are taken as rdf, by --source-axes; the file says fru",
+        "one unit is taken as 1 m, by --meters-per-unit; the file says 0.01 m",
+    ]
 
 
 def test_bands_are_padded_and_cut(make_cloud, tmp_path):
@@ -409,7 +410,7 @@ def test_sixteen_thousand_row_blocks_join_without_a_seam(make_cloud, tmp_path):
 def test_options_are_checked():
     with pytest.raises(InvalidOptionError, match="sh_degree must be an integer in"):
         WriteOptions(sh_degree=4)
-    with pytest.raises(InvalidOptionError, match="target must be one of usd, unity, unreal, got 'maya'"):
+    with pytest.raises(InvalidOptionError, match=r"target must be one of supersplat, .*, got 'maya'"):
         WriteOptions(target="maya")
     with pytest.raises(InvalidOptionError, match="meters_per_unit must be a number in"):
         converters.read("a.ply", meters_per_unit=0.0)

@@ -1,6 +1,7 @@
 """Folders of numbered files, USD as a row of the table, and what an inspection says."""
 
 import json
+import zipfile
 from dataclasses import asdict
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
+from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianSequence
 
 
@@ -27,7 +29,7 @@ def test_frames_are_numbered_and_come_back_in_order(walk, tmp_path):
     assert back.frames_per_second == 24.0
     assert back.topology == "perFrame"
     for frame, cloud in enumerate(walk):
-        assert np.array_equal(back[frame].positions, cloud.positions)
+        assert np.array_equal(back[frame].positions, change_axes(cloud, "rdf").positions)
 
 
 def test_frames_are_read_when_asked_for(walk, tmp_path):
@@ -59,7 +61,7 @@ def test_natural_order_any_start_and_the_packed_suffix(columns, ply_bytes, tmp_p
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ([], r"must hold numbered files \(walk000000\.ply, walk000001\.ply, …\), got none"),
+        ([], r"must hold asset\.usda, meta\.json or numbered files \(walk000000\.ply, walk000001\.ply, …\), got none"),
         (["a0.ply", "a1.ply", "b0.ply"], r"must hold one sequence, got 2 prefixes \('a', 'b'\)"),
         (["a0.ply", "a2.ply"], r"must hold every frame, got none between a0\.ply and a2\.ply. Add the missing frames"),
         (["a1.ply", "a01.ply"], r"must hold each frame once, got a01\.ply and a1\.ply. Remove one"),
@@ -94,16 +96,30 @@ def test_frames_of_an_older_longer_take_are_in_the_way(walk, tmp_path, make_clou
     assert len(converters.read(tmp_path)) == 12
 
 
-def test_output_folders(walk, tmp_path):
-    with pytest.raises(OutputError, match=r"output folder must exist, got .*nowhere for a\.ply. Create it first"):
-        converters.write(walk, tmp_path / "nowhere" / "a.ply")
+def test_output_folders_are_made_and_removed_again_when_the_work_fails(walk, tmp_path):
+    converters.write(walk, tmp_path / "some" / "where" / "a.ply")
+    assert len(converters.read(tmp_path / "some" / "where")) == 12
+    with pytest.raises(InvalidOptionError, match="profile beam must have a material channel"):
+        converters.write(walk, tmp_path / "other" / "place" / "a.ply", WriteOptions(profile="beam"))
+    assert [path.name for path in tmp_path.iterdir()] == ["some"]
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(OutputError, match="output must be a file, got the folder"):
         converters.write(walk, tmp_path / "folder.ply")
-    with pytest.raises(
-        InvalidOptionError, match=r"must end in one of .*, got a\.compressed\.ply: compressed PLY is only read"
-    ):
-        converters.write(walk, tmp_path / "a.compressed.ply")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OutputError, match=r"output folder must exist, got .*file for a\.ply"):
+        converters.write(walk, tmp_path / "file" / "a.ply")
+
+
+def test_what_is_only_read_is_not_written(walk, tmp_path):
+    with pytest.raises(InvalidOptionError, match=r"must end in one of .*, got a\.ksplat: ksplat is only read"):
+        converters.write(walk, tmp_path / "a.ksplat")
+
+
+def test_a_folder_with_an_asset_is_that_asset(make_cloud, walk, tmp_path, trusted_files):
+    converters.write(walk, tmp_path / "walk.ply")
+    converters.write(GaussianSequence.from_clouds([make_cloud(3)]), tmp_path / "asset.usda")
+    assert len(converters.read(tmp_path)) == 1
+    assert converters.inspect(tmp_path).format == "USD (.usda)"
 
 
 def test_usd_gets_y_up_metres_and_the_asked_bands(make_cloud, tmp_path):
@@ -119,13 +135,65 @@ def test_usd_gets_y_up_metres_and_the_asked_bands(make_cloud, tmp_path):
     assert "notes" not in back.metadata
 
 
-def test_usd_states_its_own_axes(make_cloud, tmp_path):
-    (tmp_path / "a.usdc").write_bytes(b"")
-    with pytest.raises(InvalidOptionError, match=r"source_axes must be left out for USD, which states it, got a\.usdc"):
-        converters.read(tmp_path / "a.usdc", source_axes="rdf")
-    sequence = GaussianSequence.from_clouds([make_cloud()])
-    with pytest.raises(InvalidOptionError, match=r"must be usd for a USD output, got unity\. Write PLY for unity"):
-        converters.write(sequence, tmp_path / "b.usda", WriteOptions(target="unity"))
+def test_what_the_caller_states_outranks_a_stage_with_a_note(make_cloud, tmp_path, trusted_files):
+    cloud = make_cloud(axes="rub", degree=1)
+    converters.write(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usda", WriteOptions(full_float=True))
+    sequence = converters.read(tmp_path / "a.usda", source_axes="rdf", meters_per_unit=0.5)
+    assert sequence[0].axes == "rdf"
+    assert np.array_equal(sequence[0].positions, 0.5 * cloud.positions)
+    assert np.array_equal(sequence[0].scales, 0.5 * cloud.scales)
+    assert np.array_equal(sequence[0].radiance, cloud.radiance)
+    assert sequence.metadata["notes"].splitlines() == [
+        "axes are taken as rdf, by --source-axes; the file says rub",
+        "one unit is taken as 0.5 m, by --meters-per-unit; the file says 1 m",
+    ]
+    with pytest.raises(
+        InvalidOptionError, match=r"activation must be left out for USD, where it means nothing, got a\.usda"
+    ):
+        converters.read(tmp_path / "a.usda", activation="log")
+
+
+def test_a_package_that_is_not_aligned_is_read_with_a_note(make_cloud, tmp_path, trusted_files):
+    cloud = make_cloud(axes="rub")
+    converters.write(GaussianSequence.from_clouds([cloud]), tmp_path / "a.usdc", WriteOptions(full_float=True))
+    with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:  # data begin after a header of 36 bytes
+        archive.write(tmp_path / "a.usdc", "a.usdc")
+    sequence = converters.read(tmp_path / "a.usdz")
+    assert np.array_equal(sequence[0].positions, cloud.positions)
+    assert "1 files of the package are not 64-byte aligned" in sequence.metadata["notes"]
+    converters.write(GaussianSequence.from_clouds([cloud]), tmp_path / "b.usdz")
+    assert "notes" not in converters.read(tmp_path / "b.usdz").metadata
+
+
+@pytest.mark.parametrize(
+    ("axis", "low", "high", "note"),
+    [
+        (
+            "y",
+            0.0,
+            1.8,
+            "it is tallest along y, from 0.02 to 1.78, so y points up if it stands at 0; pass --source-axes rub",
+        ),
+        ("z", 0.0, 1.8, "so z points up if it stands at 0; pass --source-axes rfu if it does"),
+        ("z", -1.8, 0.0, "so z points down if it stands at 0; pass --source-axes"),
+        ("x", 0.0, 1.8, "so x points up if it stands at 0; pass --source-axes u"),
+        ("y", -1.8, 0.0, None),  # as assumed
+        ("y", -0.9, 0.9, None),  # it does not stand at 0
+        ("y", 0.0, 0.3, None),  # it is not tall
+    ],
+)
+def test_a_shape_that_contradicts_the_assumed_axes_is_told(columns, ply_file, axis, low, high, note):
+    rng = np.random.default_rng(5)
+    many = {name: np.resize(values, 1000) for name, values in columns.items()}
+    many |= {other: rng.uniform(-0.2, 0.2, 1000) for other in "xyz"} | {axis: np.linspace(low, high, 1000)}
+    path = ply_file(many)
+    told = [line for line in converters.read(path).metadata["notes"].splitlines() if "contradicts" in line]
+    assert bool(told) == (note is not None)
+    if note is not None:
+        assert note in told[0]
+        axes = told[0].partition("--source-axes ")[2][:3]
+        assert "contradicts" not in converters.read(path, source_axes=axes).metadata.get("notes", "")
+        assert converters.inspect(path).axes_evidence[-1] == f"which contradicts rdf: pass --source-axes {axes}"
 
 
 def test_inspection_of_a_person(data_dir):

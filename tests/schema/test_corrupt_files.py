@@ -105,11 +105,10 @@ def test_a_crash_of_the_child_is_one_error(tmp_path, sequence, monkeypatch):
 def test_packages_that_reach_outside_are_refused(tmp_path):
     import zipfile
 
-    for name, match in (("../a.usda", "distinct names inside itself"), ("a.usda", "64-byte aligned")):
-        with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
-            archive.writestr(name, "#usda 1.0\n")
-        with pytest.raises(AssetFormatError, match=match):
-            read_asset(tmp_path / "a.usdz")
+    with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
+        archive.writestr("../a.usda", "#usda 1.0\n")
+    with pytest.raises(AssetFormatError, match="distinct names inside itself"):
+        read_asset(tmp_path / "a.usdz")
     with zipfile.ZipFile(tmp_path / "a.usdz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.usda", "#usda 1.0\n" * 100)
     with pytest.raises(AssetFormatError, match="store its files as they are"):

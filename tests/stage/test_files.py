@@ -217,7 +217,7 @@ class TestMistakes:
             (("assets", 1, "blend"), "x", "assets[1].blend must be one of identified, rows, nearest, got 'x'."),
             (("assets", 0, "source_axes"), "xyz", "assets[0].source_axes must be three letters, one each of"),
             (("assets", 0, "path"), "box.ply", "assets[0]: "),
-            (("assets", 0, "path"), "sky.exr", "assets[0]: file name must end in one of .ply, .usd,"),
+            (("assets", 0, "path"), "sky.exr", "assets[0]: file name must end in one of .ply, "),
             (("meshes", 1, "path"), "sky.exr", "meshes[1]: mesh must be readable, got"),
             (("meshes", 1, "base_color"), [1, 2, 3], "meshes[1].base_color must lie in [0, 1], got 2"),
             (("meshes", 1, "roughness"), 2, "meshes[1].roughness must be a number in [0, 1], got 2.0."),

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from beam_warp.cli.common.pages import flags_of
 from beam_warp.errors import BeamError
 from beam_warp.jobs.listeners import NotedProgress
 
 
-def run_command(command: Callable[[], int]) -> int:
-    """Run a command; a caller's mistake becomes one line on stderr and exit code 2, never a traceback."""
+def run_command(command: Callable[[], int], record: type | None = None) -> int:
+    """Run a command; a caller's mistake becomes one line on stderr and exit code 2, never a traceback.
+
+    Args:
+        command: What runs, and returns the exit code.
+        record: Dataclass of its options, by which errors name them.
+    """
     try:
-        return command()
+        with options_named(record):
+            return command()
     except BeamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -25,6 +33,29 @@ def run_command(command: Callable[[], int]) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+
+
+SHORTER = {"sample-count": "samples", "frames-per-second": "fps", "vertical-fov": "fov"}
+"""Arguments of the library whose options have shorter names."""
+
+
+@contextmanager
+def options_named(record: type | None) -> Iterator[None]:
+    """Let errors speak of options (``--source-axes``) where the library names its arguments (``source_axes``).
+
+    Only what an error is about is replaced: the words before "must".
+    """
+    try:
+        yield
+    except BeamError as error:
+        subject, must, rest = str(error).partition(" must ")
+        if record is not None and must:
+            flags = {field.replace("_", "-"): flag for field, flag in flags_of(record).items()}
+            flags |= {name: f"--{option}" for name, option in SHORTER.items() if option in flags}
+            words = re.split(r"(, | and )", subject.replace("_", "-"))
+            if set(words[::2]) <= set(flags):
+                error.args = ("".join(flags.get(word, word) for word in words) + must + rest,)
+        raise
 
 
 def print_json(value: Any) -> None:

@@ -11,15 +11,13 @@ from tyro.conf import arg
 
 from beam_warp import converters
 from beam_warp.checks import require_number
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import OutputError
 from beam_warp.world.metadata import LOW_PASS_RANGE
 
 if TYPE_CHECKING:
     from beam_warp.raster.records import RasterOptions
     from beam_warp.world.gaussians import GaussianSequence
-
-ASSET_NAME = "asset.usda"
-"""Name that `beam run` gives to its result."""
 
 Antialiased = Annotated[
     Literal["yes", "no"] | None,
@@ -29,7 +27,12 @@ LowPass = Annotated[
     float | None,
     arg(metavar="PX2", help="Variance of the pixel filter; by default as the asset says, 0.3 if it says nothing."),
 ]
-SourceAxes = Annotated[str | None, arg(metavar="CODE", help="Axes of a PLY that does not state them.")]
+SourceAxes = Annotated[
+    str | None, arg(metavar="CODE", help="Where the input's x, y, z point, e.g. rdf; else its word, else rdf.")
+]
+MetersPerUnit = Annotated[
+    float | None, arg(metavar="X", help="Length of the input's unit in metres; else its word, else 1.")
+]
 DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")]
 Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
 Device = Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")]
@@ -44,21 +47,18 @@ class ReadingFlags:
     antialiased: Antialiased = None
     low_pass: LowPass = None
     source_axes: SourceAxes = None
+    meters_per_unit: Annotated[MetersPerUnit, SECOND_PAGE] = None
     drop_invalid: DropInvalid = False
 
     def read(self, path: Path) -> GaussianSequence:
         """Read an asset."""
-        return converters.read(path, source_axes=self.source_axes, drop_invalid=self.drop_invalid)
+        return converters.read(
+            path, source_axes=self.source_axes, meters_per_unit=self.meters_per_unit, drop_invalid=self.drop_invalid
+        )
 
     def raster(self, sequence: GaussianSequence) -> RasterOptions:
         """Return how a sequence is drawn; see `raster_options`."""
         return raster_options(sequence.metadata, self.antialiased, self.low_pass)
-
-
-def asset_in(path: Path) -> Path:
-    """Return the asset in a folder that `beam run` wrote; any other path as it is."""
-    inner = path / ASSET_NAME
-    return inner if inner.is_file() else path
 
 
 def make_folder(folder: Path) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TypeVar, get_type_hints
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeGuard, TypeVar, get_args, get_type_hints
 
 import tyro
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import FlagCreatePairsOff, Positional
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 FIRST, ALL = ("-h", "--help"), "--help-all"
@@ -65,3 +65,35 @@ def parse(record: type[Record], words: Sequence[str], prog: str) -> Record:
         if left_out and not stopped.code:
             print(MORE)
         raise
+
+
+def flags_of(record: type) -> dict[str, str]:
+    """Return by the name of each field the option that sets it, also of the records in a record.
+
+    Fields whose value stands on the command line without an option are left out.
+    """
+    flags: dict[str, str] = {}
+    hints = get_type_hints(record, include_extras=True)
+    for field in dataclasses.fields(record):
+        marks = getattr(hints[field.name], "__metadata__", ())
+        if inner := [kind for kind in _types_in(hints[field.name]) if _is_record(kind)]:
+            flags |= {name: flag for kind in inner for name, flag in flags_of(kind).items()}
+        elif not set(marks).intersection(_POSITIONAL):
+            named = next((mark.name for mark in marks if getattr(mark, "name", None)), field.name)
+            flags[field.name] = f"--{named.replace('_', '-')}"
+    return flags
+
+
+def _is_record(kind: Any) -> TypeGuard[type]:
+    """Return True for a dataclass, not for an object of one."""
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+def _types_in(hint: Any) -> Iterator[Any]:
+    """Yield the types of which a hint consists: members of a union, without their marks."""
+    inner = get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint)
+    yield from (kind for part in inner for kind in _types_in(part)) if inner else [hint]
+
+
+_POSITIONAL = getattr(Positional[int], "__metadata__", ())
+"""Marks of a field that no option sets."""

@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
+from beam_warp.converters.numbering import SOG_NAME
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class AssetFlags:
 
     asset: Annotated[
         Positional[tuple[Path, ...]],
-        arg(metavar="ASSET ...", help="PLY or USD files, folders of numbered PLY files; or one stage as .json."),
+        arg(metavar="ASSET ...", help="Files or folders of Gaussians; or one stage as .json."),
     ]
     ground: Annotated[
         Literal["plain", "shadows"] | None, arg(help="A floor under the assets, or only the shadows on it.")
@@ -230,4 +231,5 @@ class Render:
     @property
     def is_stage(self) -> bool:
         """Whether one stage is rendered, and not assets."""
-        return len(self.assets.asset) == 1 and self.assets.asset[0].suffix.lower() == ".json"
+        path = self.assets.asset[0]
+        return len(self.assets.asset) == 1 and path.suffix.lower() == ".json" and path.name != SOG_NAME
