@@ -74,8 +74,8 @@ def test_spz_and_gltf(person, capsys):
     assert said.startswith(f"wrote {out / 'b000000.glb'} … b000002.glb: 3 frames, 9 Gaussians, ")
     assert converters.read(out / "b000001.glb")[0].base_color is not None
     for words, wanted in (
-        (("c.spz", "--spz-version", "2"), "spz_version"),
-        (("c.spz", "--profile", "beam"), "profile"),
+        (("c.spz", "--spz-version", "2"), "--spz-version"),
+        (("c.spz", "--profile", "beam"), "--profile"),
     ):
         code, _, err = run(person / "person.ply", out / words[0], *words[1:], capsys=capsys)
         assert code == 2
