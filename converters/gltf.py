@@ -66,8 +66,8 @@ _KNOWN = (EXTENSION, *_SPZ, _OLDER_SPZ, "KHR_mesh_quantization")
 _UNIT_ROUNDING = 1e-6
 """Largest difference of a length from 1 that is float32 rounding; such quaternions are kept bit for bit."""
 
-_MOST_PRIMITIVES, _MOST_REPEATED = 1000, 1 << 20
-"""Most primitives that a scene may place, and Gaussians that it may have if they are more than the file's bytes."""
+_MOST_NODES, _MOST_PRIMITIVES, _MOST_REPEATED = 10_000, 1000, 1 << 20
+"""Most nodes and primitives of a scene, and Gaussians that it may have if they are more than the file's bytes."""
 
 
 def harmonic(degree: int, order: int) -> str:
@@ -169,10 +169,14 @@ def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, NDArray[np.float64]]]:
         node = file.item("nodes", number)
         if number in seen:
             raise file.error("a node must have one parent", f"several for node {number}")
+        if len(seen) == _MOST_NODES:
+            raise file.error(f"a scene must have at most {_MOST_NODES} nodes", "more", "Export the splats alone.")
         seen.add(number)
-        with np.errstate(all="ignore"):  # what overflows is no placement
+        with np.errstate(all="ignore"):  # what overflows is refused at a mesh
             matrix = _transform(file, node) @ parent
         if "mesh" in node:
+            if not (np.abs(matrix) < 1e30).all():
+                raise file.error("transforms must stay below 1e30", f"more at node {number}")
             yield file.number(node, "mesh"), matrix
         waiting += [(child, matrix) for child in reversed(file.items(node, "children"))]
 
@@ -183,12 +187,13 @@ def _transform(file: GltfFile, node: Mapping[str, Any]) -> NDArray[np.float64]:
     if "matrix" in node:
         return file.vector(holder, "matrix", (0.0,) * 16).reshape(4, 4)
     matrix = np.eye(4)
-    rotation = file.vector(holder, "rotation", (0.0, 0.0, 0.0, 1.0))
-    if not np.linalg.norm(rotation) > 1e-6:
-        raise file.error("rotation must be a quaternion", repr(node["rotation"]))
-    scales = file.vector(holder, "scale", (1.0, 1.0, 1.0))
-    matrix[:3, :3] = scales[:, None] * rotation_matrices(rotation).T
     matrix[3, :3] = file.vector(holder, "translation", (0.0, 0.0, 0.0))
+    if "rotation" in node:
+        rotation = file.vector(holder, "rotation", (0.0,) * 4)
+        if not np.linalg.norm(rotation) > 1e-6:
+            raise file.error("rotation must be a quaternion", repr(node["rotation"]))
+        matrix[:3, :3] = rotation_matrices(rotation).T
+    matrix[:3, :3] *= file.vector(holder, "scale", (1.0, 1.0, 1.0))[:, None]
     return matrix
 
 
@@ -230,7 +235,7 @@ def _part(file: GltfFile, splats: _Splats, notes: list[str]) -> dict[str, NDArra
 def _unpacked(file: GltfFile, form: dict[str, Any], notes: list[str]) -> dict[str, NDArray[Any]]:
     """Return the arrays of splats that are stored as SPZ."""
     content, _ = file.view(form.get("bufferView"))
-    fields = dict(spz.unpack(io.BytesIO(content), file.path).fields)
+    fields = dict(spz.unpack(io.BytesIO(content.tobytes()), file.path).fields)
     del fields["radiance_color_space"]
     notes.append("SPZ is taken as stored, as CesiumJS does; the draft asks for half a turn: --source-axes luf")
     return fields

@@ -87,7 +87,7 @@ _NANOGS = Importer(
 IMPORTERS: dict[str, Importer] = {
     "supersplat": Importer(
         name="SuperSplat",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
+        suffixes=(".ply", ".compressed.ply", ".splat", ".sog"),  # of SPZ it takes rdf, against the format
         to_do="Nothing.",
         evidence="source, cc6e86a: a PLY is turned by 180° about z when it is loaded",
     ),

@@ -57,9 +57,9 @@ class ConvertCommand:
     ] = None
     source_axes: SourceAxes = None
     meters_per_unit: MetersPerUnit = None
-    profile: Annotated[Profile, arg(help="PLY: standard for every importer, beam to append the materials.")] = (
-        "standard"
-    )
+    profile: Annotated[
+        Profile, arg(help="PLY and glTF: standard for every importer, beam to append the materials.")
+    ] = "standard"
     sh_degree: Annotated[int | None, arg(metavar="0..3", help="Pad or cut spherical harmonics to this degree.")] = None
     spz_version: Annotated[int, arg(metavar="3|4", help="SPZ: 3 for nearly every reader, 4 for smaller files.")] = 3
     activation: Annotated[
@@ -122,7 +122,8 @@ def convert(command: ConvertCommand) -> int:
         drop_invalid=command.drop_invalid,
     )
     form = format_of(command.output)
-    _require_apart(command.input, command.output, 1 if form.holds_sequences else len(sequence))
+    is_numbered = len(sequence) > 1 and not form.holds_sequences
+    _require_apart(command.input, command.output, len(sequence) if is_numbered else 1)
     first = sequence[0]
     with progress(command.quiet or command.json, compiles=False) as report:
 
@@ -134,10 +135,15 @@ def convert(command: ConvertCommand) -> int:
         paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
 
     notes = notes_of(sequence)
-    if form.name == "PLY" and command.profile == "standard" and first.base_color is not None:
-        notes.append("materials are not in a standard PLY: --profile beam keeps them")
     if form.name == "splat" and (first.sh_degree or first.base_color is not None):
         notes.append("a .splat holds neither materials nor view-dependent colour: they are left out")
+    elif (
+        not form.holds_sequences
+        and form.name != "NumPy"
+        and command.profile == "standard"
+        and first.base_color is not None
+    ):
+        notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
@@ -154,8 +160,8 @@ def convert(command: ConvertCommand) -> int:
         )
     elif not command.quiet:
         print_notes(notes)
-        if not form.holds_sequences:
-            files = f"{paths[0]}" + (f" … {paths[-1].name}" if len(paths) > 1 else "")
+        if is_numbered:
+            files = f"{paths[0]} … {paths[len(sequence) - 1].name}"
         else:
             files = f"{command.output}" + (f" and {len(paths) - 1} more beside it" if len(paths) > 1 else "")
         frames = f"{len(sequence)} frames, " if len(sequence) > 1 else ""

@@ -54,10 +54,33 @@ def test_a_file(person, capsys, word, name):
     assert code == 0
     assert out.startswith(f"wrote {person / 'out' / 'a.ply'}: 9 Gaussians, ")
     assert err.splitlines() == [
-        "note: materials are not in a standard PLY: --profile beam keeps them",
+        "note: materials are left out: --profile beam keeps them in PLY and glTF",
         f"note: in aras-p UnityGaussianSplatting: {IMPORTERS['aras-p'].to_do}",
     ]
     assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
+
+
+def test_spz_and_gltf(person, capsys):
+    out = person / "out"
+    code, said, err = run(person / "person.ply", out / "a.spz", "--spz-version", "4", "--sh-degree", 0, capsys=capsys)
+    assert (code, (out / "a.spz").read_bytes()[:5]) == (0, b"NGSP\x04")
+    assert err == "note: materials are left out: --profile beam keeps them in PLY and glTF\n"
+    code, said, err = run(out / "a.spz", out / "a.gltf", capsys=capsys)
+    assert code == 0
+    assert said.startswith(f"wrote {out / 'a.gltf'} and 1 more beside it: 9 Gaussians, ")
+    assert err.startswith("note: axes of SPZ are rub, ")
+    code, said, err = run(person / "take", out / "b.glb", "--profile", "beam", capsys=capsys)
+    assert (code, err) == (0, "")
+    assert said.startswith(f"wrote {out / 'b000000.glb'} … b000002.glb: 3 frames, 9 Gaussians, ")
+    assert converters.read(out / "b000001.glb")[0].base_color is not None
+    for words, wanted in (
+        (("c.spz", "--spz-version", "2"), "--spz-version"),
+        (("c.spz", "--profile", "beam"), "--profile"),
+    ):
+        code, _, err = run(person / "person.ply", out / words[0], *words[1:], capsys=capsys)
+        assert code == 2
+        assert wanted in err
+        assert not (out / "c.spz").exists()
 
 
 def test_a_sequence_quietly_and_as_json(person, capsys):
@@ -69,7 +92,7 @@ def test_a_sequence_quietly_and_as_json(person, capsys):
     assert code == 0
     assert (result["frame_count"], result["gaussian_count"], result["source_axes"]) == (3, 9, "rdf")
     assert len(result["outputs"]) == 3
-    assert result["notes"] == ["materials are not in a standard PLY: --profile beam keeps them"]
+    assert result["notes"] == ["materials are left out: --profile beam keeps them in PLY and glTF"]
 
 
 def test_every_option_reaches_the_reader_and_the_writer(person, capsys):

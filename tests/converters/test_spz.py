@@ -268,15 +268,15 @@ def test_no_gaussians(make_cloud, tmp_path):
 
 
 def refused(folder, content, message=""):
-    """Reading and probing refuse ``content``, in one line after the file's name, soon and with little memory."""
+    """Reading refuses ``content``, in one line after the file's name, soon and with little memory."""
     path = file_of(folder, content)
-    started = time.perf_counter()
+    started = time.process_time()
     tracemalloc.start()
     with pytest.raises(AssetFormatError) as caught:
         converters.read(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert time.perf_counter() - started < 2.0
+    assert time.process_time() - started < 2.0
     assert peak < 64 * 2**20 + 2 * len(content)
     said = str(caught.value)
     assert said.startswith("a.spz: ")
