@@ -21,7 +21,7 @@ STEPS = np.array([2047, 1023, 2047])
 
 def write(cloud, path, metadata=None, **options):
     sequence = GaussianSequence.from_clouds([cloud], metadata=metadata)
-    return converters.write(sequence, path, WriteOptions(**options))
+    return converters.write(sequence, path, WriteOptions(**{"axes": cloud.axes, **options}))
 
 
 def chunk_range(values):
@@ -129,9 +129,9 @@ def test_limits_are_finite_in_a_file(make_cloud, tmp_path):
 
 def test_what_is_stated_survives(make_cloud, tmp_path):
     stated = {"raster_antialiased": "true", "raster_low_pass": "0.1"}
-    write(make_cloud(axes="rub"), tmp_path / "a.compressed.ply", stated, target="unreal")
+    write(make_cloud(axes="rub"), tmp_path / "a.compressed.ply", stated, axes="fru")
     sequence = converters.read(tmp_path / "a.compressed.ply")
-    assert (sequence[0].axes, sequence.metadata["source_units"]) == ("fru", "0.01 m")
+    assert (sequence[0].axes, sequence.metadata["source_units"]) == ("fru", "m")
     assert sequence.metadata.items() >= stated.items()
     colourless = make_cloud(radiance=None, radiance_color_space=None)
     write(colourless, tmp_path / "b.compressed.ply")
