@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,7 +100,7 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
     return number
 
 
-def is_text(value: object) -> bool:
+def is_text(value: object) -> TypeGuard[str]:
     """Return True for a text that is not empty and can be a file's name: no null, no half of a surrogate pair."""
     return isinstance(value, str) and bool(value) and "\0" not in value and not _SURROGATE.search(value)
 

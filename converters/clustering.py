@@ -132,7 +132,7 @@ def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float3
     return entries, labels
 
 
-def _shares(weights: NDArray[np.float64], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:
+def _shares(weights: NDArray[np.number], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:
     """Divide entries among groups by weight; a group gets no more than it has members, and at least one if it has."""
     shares = np.minimum(np.maximum(1, np.floor(weights / max(weights.sum(), 1e-300) * size)), counts).astype(np.intp)
     for group in np.argsort(-weights, kind="stable"):  # what remains, or is too much by the least of one

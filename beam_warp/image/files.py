@@ -157,7 +157,7 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None, 
     if suffix == ".exr":
         return Image(path, _read_exr(path, max_pixels), color_space or LINEAR_REC709, premultiplied=True)
     if suffix == ".hdr":
-        rgb = read_radiance_hdr(path, lambda *size: _require_size(*size, max_pixels))
+        rgb = read_radiance_hdr(path, lambda file, width, height: _require_size(file, width, height, max_pixels))
         channels = {name: rgb[..., index] for index, name in enumerate("RGB")}
         return Image(path, channels, color_space or LINEAR_REC709, premultiplied=True)
     return Image(path, _read_pillow(path, max_pixels), color_space or DISPLAY_SRGB, premultiplied=False)
@@ -246,7 +246,8 @@ def _window(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first and last + 1 corner of an EXR window as (x, y), after checking its size."""
     first, last = (np.asarray(corner, np.int64) for corner in header[name])
-    _require_size(path, *(last - first + 1).tolist(), max_pixels)
+    width, height = (last - first + 1).tolist()
+    _require_size(path, width, height, max_pixels)
     return first, last + 1
 
 
