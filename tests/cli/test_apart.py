@@ -15,7 +15,7 @@ def test_a_render_does_not_replace_its_light(tmp_path, capsys):
     (tmp_path / "inner").mkdir()
     for out in (light, tmp_path / "inner" / ".." / light.name):
         assert beam("render", asset, "--environment", light, "--out", out, "--width", 8, "--device", "cpu") == 2
-        assert "error: out must be another file than those that are read" in capsys.readouterr().err
+        assert "error: --out must be another file than those that are read" in capsys.readouterr().err
     assert light.read_bytes() == before
 
 

@@ -65,8 +65,8 @@ def test_values_of_other_types_and_sizes(tmp_path, text, old, new, message):
 
 
 def test_a_version_of_many_digits(tmp_path, text):
-    with pytest.raises(SchemaVersionError, match=r"schema version 1\.1, got '1\.9{38}' at"):
-        read_all(tmp_path, text, 'beam:schemaVersion = "1.1"', f'beam:schemaVersion = "1.{5000 * "9"}"')
+    with pytest.raises(SchemaVersionError, match=r"schema version 1\.2, got '1\.9{38}' at"):
+        read_all(tmp_path, text, 'beam:schemaVersion = "1.2"', f'beam:schemaVersion = "1.{5000 * "9"}"')
 
 
 @pytest.mark.parametrize(
