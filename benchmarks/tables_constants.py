@@ -14,7 +14,7 @@ from tables import Row, Rows, number, table
 
 GPU, CPU = "constants_h200.json", "constants_cpu.json"
 
-FILES = {group: GPU if group in ("reconstruction", "tracking") else CPU for group in GROUPS}
+FILES = {group: CPU if group in ("meshing", "materials", "relighting") else GPU for group in GROUPS}
 """The result of every group."""
 
 SCORES = {
