@@ -110,7 +110,7 @@ def test_mutants_meet_the_tests_that_reach_them_first():
 
 
 def test_the_kept_run_leaves_few_bugs_and_says_why():
-    """Of 200 bugs or more, 95 % of those that have an effect are caught; the others have a reason each."""
+    """Tests catch 95 % of the bugs that have an effect, of 200 or more; each of the others has a reason."""
     kept = json.loads((Path(__file__).parent / "mutants.json").read_text(encoding="utf-8"))
     left = [mutant for mutant in kept["mutants"] if mutant["verdict"] == "survived"]
     without_effect = [mutant for mutant in left if mutant["why"].startswith("The same")]
