@@ -1,6 +1,6 @@
 """What `beam chart tracing` measures on its built-in scene: the picture of docs/charts.md is drawn from it.
 
-python benchmarks/chart.py --device cuda:0 --out benchmarks/results/chart_tracing_h200.json
+python benchmarks/chart.py --device cpu --out benchmarks/results/chart_tracing_cpu.json
 """
 
 from __future__ import annotations

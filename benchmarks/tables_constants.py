@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,10 @@ from constants_places import numbers_of, value_of
 from constants_registry import GROUPS, SIDES, UNTUNED, Constant
 from tables import Row, Rows, number, table
 
-FILE = "constants_h200.json"
+GPU, CPU = "constants_h200.json", "constants_cpu.json"
+
+FILES = {group: CPU if group in ("meshing", "materials", "relighting") else GPU for group in GROUPS}
+"""The result of every group."""
 
 SCORES = {
     "psnr": ("new views [dB]", ".2f"),
@@ -33,29 +37,37 @@ CLEAR = 3.0
 """How many times its noise a change must be to be printed bold."""
 
 
-@number("constants_measured", FILE)
-def measured(result: Row) -> str:
-    """Return how many of the constants that are varied were measured so far."""
-    found = result["constants"].values()
-    return f"{sum(bool(sides) for sides in found)} of {len(found)}"
+@number("constants_measured", GPU, CPU)
+def measured(gpu: Row, cpu: Row) -> str:
+    """Return how many of the constants that are varied were measured."""
+    varied = {c.place: FILES[group] for group, chosen in GROUPS.items() for c in chosen if not c.not_varied}
+    found = {GPU: gpu["constants"], CPU: cpu["constants"]}
+    return f"{sum(bool(found[file].get(place)) for place, file in varied.items())} of {len(varied)}"
 
 
-def noise(result: Row, group: str, capture: int, score: str) -> float:
-    """Return the standard deviation of the difference of two runs that differ by seeds alone; NaN if unknown."""
-    seeds = result["seeds"].get(FLOORS.get(group, group), {}).values()
+def noise(results: Sequence[Row], group: str, capture: int, score: str) -> float:
+    """Return the standard deviation of the difference of two runs that differ by seeds alone; NaN if unknown.
+
+    Args:
+        results: The group's result, then that of the group which tells its noise, if that is another.
+        group: Name of a group of constants.
+        capture: Number of a capture.
+        score: Name of a score.
+    """
+    seeds = results[-1]["seeds"].get(FLOORS.get(group, group), {}).values()
     values = [row[score][capture] for row in seeds if score in row]
     return math.sqrt(2.0) * float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
 
-def change(result: Row, group: str, capture: int, row: Row | None) -> str:
+def change(results: Sequence[Row], group: str, capture: int, row: Row | None) -> str:
     """Return how scores differ from the unchanged ones: bold where it is `CLEAR` of the noise."""
     if row is None or "failed" in row:
         return "" if row is None else f"fails: {row['failed'].partition(':')[0]}"
     parts = []
     for score, values in row.items():
-        difference = values[capture] - result["seeds"][group]["0"][score][capture]
+        difference = values[capture] - results[0]["seeds"][group]["0"][score][capture]
         text = f"{difference:+{SCORES[score][1]}}".replace("-", "−")
-        parts.append(f"**{text}**" if abs(difference) > CLEAR * noise(result, group, capture, score) else text)
+        parts.append(f"**{text}**" if abs(difference) > CLEAR * noise(results, group, capture, score) else text)
     return " / ".join(parts)
 
 
@@ -64,8 +76,9 @@ def written(*values: Any) -> str:
     return ", ".join(f"{number:.4g}" for number in numbers_of(values))
 
 
-def constant_rows(result: Row, *, group: str) -> Rows:
+def constant_rows(*results: Row, group: str) -> Rows:
     """Return two rows for every constant of a group that was varied: with less of it, and with more."""
+    result = results[0]
     rows: list[list[str]] = [["constant", "value", "chosen on", "tried", *result["captures"]]]
     for constant in GROUPS[group]:
         if constant.not_varied:
@@ -73,7 +86,7 @@ def constant_rows(result: Row, *, group: str) -> Rows:
         found = result["constants"].get(constant.place, {})
         for side, named in zip(SIDES, (_named(constant), [""] * 3), strict=True):
             tried = written(*(constant.tried(side, value_of(place)) for place in constant.places))
-            changes = [change(result, group, i, found.get(side)) for i in range(len(result["captures"]))]
+            changes = [change(results, group, i, found.get(side)) for i in range(len(result["captures"]))]
             rows.append([*named, tried, *changes])
     return rows
 
@@ -98,15 +111,22 @@ def fixed_rows(result: Row) -> Rows:
     return [head, *([*_named(constant), constant.not_varied] for constant in chosen)]
 
 
-def floor_rows(result: Row) -> Rows:
+def floor_rows(gpu: Row, cpu: Row) -> Rows:
     """Return the unchanged scores of every group, and their noise."""
-    rows: list[list[Any]] = [["part", "score", *result["captures"]]]
-    for group, seeds in result["seeds"].items():
-        for score, values in seeds["0"].items():
+    rows: list[list[Any]] = [["part", "score", *gpu["captures"]]]
+    found = {GPU: gpu, CPU: cpu}
+    for group in GROUPS:
+        results = [found[file] for file in files_of(group)]
+        for score, values in results[0]["seeds"].get(group, {}).get("0", {}).items():
             label, form = SCORES[score]
-            cells = [f"{value:{form}} ± {noise(result, group, i, score):.3f}" for i, value in enumerate(values)]
+            cells = [f"{value:{form}} ± {noise(results, group, i, score):.3f}" for i, value in enumerate(values)]
             rows.append([group, label, *cells])
     return rows
+
+
+def files_of(group: str) -> list[str]:
+    """Return the result of a group, and that which tells its noise if it is another."""
+    return list(dict.fromkeys((FILES[group], FILES[FLOORS.get(group, group)])))
 
 
 def untuned_rows(result: Row) -> Rows:
@@ -119,7 +139,7 @@ def untuned_rows(result: Row) -> Rows:
 
 
 for _group in GROUPS:
-    table(f"constants_{_group.replace(' ', '_')}", FILE)(partial(constant_rows, group=_group))
-table("constants_fixed", FILE)(fixed_rows)
-table("constants_noise", FILE)(floor_rows)
-table("constants_untuned", FILE)(untuned_rows)
+    table(f"constants_{_group.replace(' ', '_')}", *files_of(_group))(partial(constant_rows, group=_group))
+table("constants_fixed", GPU)(fixed_rows)
+table("constants_noise", GPU, CPU)(floor_rows)
+table("constants_untuned", GPU)(untuned_rows)

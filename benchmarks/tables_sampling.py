@@ -75,7 +75,7 @@ def estimators(result: Row, path: Path) -> None:
     plt.close(drawing)
 
 
-@figure("chart_tracing.png", "chart_tracing_h200.json")
+@figure("chart_tracing.png", "chart_tracing_cpu.json")
 def chart_tracing(result: Row, path: Path) -> None:
     """Draw what the command draws."""
     with tempfile.TemporaryDirectory() as folder:

@@ -170,7 +170,7 @@ def made_up():
 def test_the_tables_print_changes_beyond_the_noise_in_bold():
     """The noise is that of a difference; a change of 2.9 of it is plain, one of 3.1 bold, and a failure is named."""
     result = made_up()
-    assert tables_constants.noise(result, "reconstruction", 0, "chamfer") == pytest.approx(0.1)
+    assert tables_constants.noise([result], "reconstruction", 0, "chamfer") == pytest.approx(0.1)
     rows = tables_constants.constant_rows(result, group="reconstruction")
     at = next(i for i, row in enumerate(rows) if "`SPLIT_OFFSET`" in row[0])
     value = densify.SPLIT_OFFSET
@@ -181,7 +181,7 @@ def test_the_tables_print_changes_beyond_the_noise_in_bold():
     assert rows[at][1] == f"{value:.4g}"
     result["constants"][SPLIT]["less"] = {"failed": "ValueError: no"}
     assert tables_constants.constant_rows(result, group="reconstruction")[at][4] == "fails: ValueError"
-    assert tables_constants.floor_rows(result)[1] == ["reconstruction", "surface [mm]", "2.00 ± 0.100"]
+    assert tables_constants.floor_rows(result, result)[1] == ["reconstruction", "surface [mm]", "2.00 ± 0.100"]
 
 
 def test_all_tables_are_rectangular_and_name_every_constant():

@@ -126,6 +126,7 @@ MATERIALS = (
 )
 
 
+@pytest.mark.slow
 def test_materials_of_a_capture_with_its_true_surface(tiny_capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("beam_warp.study.materials.GAUSSIANS", {False: 500})
     words = ("--capture", tiny_capture.folder, "--out", tmp_path, "--budget-seconds", 3600)

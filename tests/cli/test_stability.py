@@ -50,6 +50,7 @@ def run_beside(page, capsys, *words, before="", code=0, **changes):
     return record, capsys.readouterr(), page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_tables_and_a_page_of_two_devices(tmp_path, capsys):
     fault = "3 rays differ by more than rounding explains"
     record, said, page = run_beside(tmp_path / "page.md", capsys, faults=[fault])
@@ -121,6 +122,7 @@ def test_captures_alone_of_two_devices(one_capture, tmp_path, capsys):
     assert f"| {fault} |" in text
 
 
+@pytest.mark.slow
 def test_a_capture_at_fault_exits_with_one(one_capture, monkeypatch, capsys):
     from beam_warp.stability.capture_cases.case import CaptureStress, Detection
 

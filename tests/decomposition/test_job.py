@@ -404,6 +404,7 @@ class TestWithACapture:
             job(sequence, light, tmp_path / "out", AUTO, capture=capture)
         assert not (tmp_path / "out" / "asset.usda").exists()
 
+    @pytest.mark.slow
     def test_the_image_path_follows_its_first_frame(self, discs, studio, capture, tmp_path, monkeypatch):
         """Colours are drawn towards those of the frame before: when that frame changes, the next is done again."""
         images = ImagePathOptions(occlusion_samples=4, light_samples=8)

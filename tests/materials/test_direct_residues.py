@@ -271,6 +271,21 @@ class TestResidues:
                 # squared times its slope, 4 pi / 4096 of at most 1
                 assert abs(share[v, p] - expected) < 4.0 * np.pi / 4096
 
+    def test_fresnel_share_is_the_mean_over_its_rays(self, device, rng, sky):
+        """Few rays, each with its power: what is left of the light that is not reflected, to rounding."""
+        normals = unit(rng.normal(size=(9, 3)))
+        directions, weights, everything = even_rays(normals, 8)
+        visibility = everything * rng.uniform(0.2, 1.0, everything.shape)
+        views = views_of(normals, self.COSINES, rng)
+        points = Points(normals, directions, weights, visibility, device)
+        points.gather(True, np.ones((9, 3)))
+        _, share = points.residues(sky(device), views, FRESNEL_HV)
+        directions, power = single(directions), single(weights).sum(2) * single(visibility)
+        for v in range(len(self.COSINES)):
+            half = unit(views[v][:, None] + directions)
+            left = 1.0 - DIELECTRIC_F0 - (1.0 - DIELECTRIC_F0) * schlick_weight((half * views[v][:, None]).sum(2))
+            np.testing.assert_allclose(share[v], (power * left).sum(1) / power.sum(1), atol=64 * EPS)
+
     @pytest.mark.parametrize("roughness", [0.1, 1.0])
     def test_white_furnace(self, device, rng, roughness):
         """A white open surface under uniform light of radiance 1 sends 1 to every view: L_D share + L_S."""

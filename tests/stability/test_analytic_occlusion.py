@@ -17,6 +17,8 @@ from beam_warp.stability.analytic_occlusion import (
 )
 from beam_warp.trace.occlusion import AmbientOcclusion
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 
 def sees_past_disc(o, d):
     at = o + d * (0.4 / d[..., 2:])

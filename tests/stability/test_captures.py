@@ -18,6 +18,8 @@ from beam_warp.stability.page import case_table
 from beam_warp.stability.suite import run_suite
 from beam_warp.world.gaussians import GaussianSequence
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 
 @pytest.fixture
 def studio(tiny_capture, tmp_path):

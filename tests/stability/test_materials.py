@@ -24,6 +24,8 @@ from beam_warp.stability.suite import StabilityCase
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 NAMES = [case.name for case in MATERIAL_CASES]
 
 

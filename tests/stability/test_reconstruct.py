@@ -13,6 +13,8 @@ from beam_warp.stability.capture_cases.subjects import object_appears
 from beam_warp.stability.captures import run_capture_case
 from beam_warp.stability.reconstruct import StressEffort, detections_in, done_in, reconstructing
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 CAMERAS = ("train_0", "train_1", "train_2")
 
 SMALL = StressEffort(

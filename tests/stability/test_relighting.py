@@ -39,6 +39,8 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import RenderedImage
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 SMALL = [case for case in RELIGHTING_CASES if not case.large]
 NAMES = [case.name for case in SMALL]
 

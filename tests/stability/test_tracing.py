@@ -27,6 +27,8 @@ from beam_warp.stability.tracing_cases import CASES
 from beam_warp.trace.reference import visibility_enclosure, visibility_reference
 from beam_warp.trace.transmittance import EXACT, TraceOptions
 
+pytestmark = pytest.mark.slow  # a stability suite
+
 CASE = {case.name: case for case in CASES}
 SMALL = [case for case in CASES if not case.large]
 

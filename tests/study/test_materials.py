@@ -82,6 +82,7 @@ class TestReferences:
         found = Interval.of_root_mean_square([8.0, 0.0], [2.0, 0.0])
         assert (found.low, found.value, found.high) == (2.0, 2.0, 2.0)
 
+    @pytest.mark.slow
     def test_truth_is_compared_where_it_is_solid(self, tiny_capture):
         records = tiny_capture.select(split="test", frames={0})
         mesh = np.load(tiny_capture.folder / "truth/mesh_0000.npz")
@@ -114,6 +115,7 @@ class TestStudy:
             whole = MaterialsSubject.on_true_surface(tiny_capture, light, 0, "tiny", "cpu")
         return replace(whole, views=whole.views[:3])
 
+    @pytest.mark.slow
     def test_errors_are_against_the_truth_where_there_is_one(self, subject, tmp_path):
         study = materials_study(subject, SMALL, device="cpu")
         table, skipped = run_study(study, tmp_path)
@@ -129,6 +131,7 @@ class TestStudy:
         assert all(0.0 < row.errors[COLOR].value < 1.0 for row in table.rows)
         assert all(row.cost.value > 0.0 for row in table.rows)
 
+    @pytest.mark.slow
     def test_without_truth_errors_fall_with_rays(self, subject, tiny_capture):
         training = replace(tiny_capture, records=tiny_capture.select(split="train"))
         plan = replace(SMALL, reference_rays=1024)
