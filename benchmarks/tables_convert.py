@@ -25,16 +25,15 @@ def _rows(result: Row, part: str) -> list[Row]:
 
 @table("convert_formats", CONVERT)
 def convert_formats(result: Row) -> Rows:
-    """Return who reads and who writes which files."""
-    other = f"splat-transform {result['splat_transform']}"
+    """Return who reads and who writes which files: a column a format, and who does what as rows."""
     groups: dict[str, list[Row]] = {}
     for row in result["formats"]:
         groups.setdefault(row["format"] or row["name"], []).append(row)
-    rows: list[list[Any]] = [["format", "files", "in", "out", f"{other} in", f"{other} out"]]
-    for name, members in groups.items():
-        who = [any(member[program][way] for member in members) for program in PROGRAMS for way in (0, 1)]
-        title = name if members[0]["format"] else ""
-        rows.append([title, ", ".join(f"`{m['name']}`" for m in members), *("yes" if does else "" for does in who)])
+    rows: list[list[Any]] = [["", *(f"`{name}`" if name[0] in ".l" else name for name in groups)]]
+    for program, named in zip(PROGRAMS, ("beam-convert", f"splat-transform {result['splat_transform']}"), strict=True):
+        for way, does in enumerate(("reads", "writes")):
+            cells = (any(member[program][way] for member in members) for members in groups.values())
+            rows.append([f"{named} {does}", *("yes" if known else "" for known in cells)])
     return rows
 
 

@@ -40,7 +40,7 @@ SWEEPS = 40
 INK, FAINT, ARROW = "#1f2933", "#9aa5b1", "#52606d"
 
 COLORS = {
-    "#e4e7eb": ("errors", "checks", "digests", "kernels", "device", "jobs"),
+    "#e4e7eb": ("errors", "checks", "digests", "blocks", "kernels", "device", "jobs"),
     "#d3e8d3": ("image", "world", "schema", "converters", "capture", "mesh", "stage"),
     "#fdebc8": ("light", "trace", "raster", "render", "interop"),
     "#d2e3f7": ("materials", "reconstruction", "decomposition"),
@@ -55,11 +55,11 @@ WAY: Sequence[tuple[str, str, str, float, float]] = (
     ("trained", "trained Gaussians\nof another program", "", 0.0, 1.0),
     ("capture", "capture\nread, inspect,\nundistort", "capture", 1.0, 3.0),
     ("reconstruct", "reconstruct\nfit the first frame,\ntrack the others", "reconstruction", 2.0, 3.0),
-    ("read", "read\nPLY or USD files", "converters", 1.0, 1.0),
+    ("read", "read\nsplats or USD files", "converters", 1.0, 1.0),
     ("sequence", "Gaussians\na cloud a frame,\nwith radiance", "world", 2.0, 1.0),
     ("decompose", "decompose\nread, see, light,\nsolve, write", "decomposition", 3.0, 2.0),
     ("asset", "relightable asset\nbase colour, normals,\nroughness, occlusion", "schema", 4.0, 2.0),
-    ("convert", "convert\nPLY and USD files", "converters", 5.1, 4.0),
+    ("convert", "convert\nto files of engines", "converters", 5.1, 4.0),
     ("validate", "validate\nagainst the contract", "schema", 5.1, 3.0),
     ("render", "render\nstages, shots, frames", "render", 5.1, 2.0),
     ("view", "view\nin the browser", "view", 5.1, 1.0),

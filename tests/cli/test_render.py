@@ -279,5 +279,5 @@ def test_broken_rows_are_refused_or_left_out_and_counted(ball, white_light, tmp_
     assert "must be finite" in capsys.readouterr().err
     assert run(*words, "--drop-invalid") == 0
     out, err = capsys.readouterr()
-    assert "1 of 10000 Gaussians dropped: not finite" in err
+    assert "1 of 10000 Gaussians dropped: 1 not finite" in err
     assert "9,999 Gaussians" in out
