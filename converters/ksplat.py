@@ -30,7 +30,7 @@ _HEADER = np.dtype(
     {
         "names": ["major", "minor", "sections", "rows", "level", "sh_low", "sh_high"],
         "formats": ["u1", "u1", "<u4", "<u4", "<u2", "<f4", "<f4"],
-        "offsets": [0, 1, 4, 12, 20, 36, 40],
+        "offsets": [0, 1, 4, 16, 20, 36, 40],
         "itemsize": _HEADER_BYTES,
     }
 )

@@ -113,7 +113,7 @@ CASES = {
     "level": (broken(20, "<H", 3), r"got version 0\.1, level 3"),
     "sections": (broken(4, "<I", 2**32 - 1), "must have the headers of 4294967295 sections"),
     "rows": (broken(SECTION + 4, "<I", 2**32 - 1), "must have .* bytes for 1 sections"),
-    "count": (broken(12, "<I", 6), "must have 6 Gaussians in its sections"),
+    "count": (broken(16, "<I", 6), "must have 6 Gaussians in its sections"),
     "degree": (broken(SECTION + 40, "<H", 3), "spherical harmonics of degree 0 to 2, got 3"),
     "buckets": (broken(SECTION + 12, "<I", 2**31), "must have buckets for all rows"),
     "block": (broken(SECTION + 16, "<f", float("nan")), "must have buckets for all rows"),
