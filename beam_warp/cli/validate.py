@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("asset", nargs="?", help="the file to check")
+    parser.add_argument("asset", nargs="?", help="the file to check, or the folder of an asset")
     parser.add_argument("--fix", action="store_true", help="mend in place what is safe to mend, then check")
     parser.add_argument("--physical", action="store_true", help="also trace the asset and judge it by physics (slower)")
     parser.add_argument("--device", help="cpu, cuda:0, … for --physical; the first GPU by default, if there is one")
@@ -53,10 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
+    from beam_warp.converters.numbering import files_at
     from beam_warp.schema.mending import mend
     from beam_warp.schema.sarif import write_sarif
     from beam_warp.schema.validator import validate
 
+    options.asset = str(files_at(Path(options.asset))[0])
     if options.sarif is not None and options.sarif.suffix not in (".sarif", ".json"):
         raise InvalidOptionError(f"--sarif must name a .sarif or .json file, got {options.sarif}. Choose another name.")
     report = mend(options.asset) if options.fix else validate(options.asset)

@@ -39,6 +39,14 @@ def test_valid(asset, capsys):
     assert capsys.readouterr().out == f"{asset}: valid (1 frame, 1 Gaussian; 0 errors, 0 warnings)\n"
 
 
+def test_the_folder_of_an_asset_is_that_asset(asset, capsys):
+    whole = asset.parent / "run" / "asset.usda"
+    whole.parent.mkdir()
+    write_asset(GaussianSequence.from_clouds([relightable([[0.0, 0.0, 0.0]])]), whole)
+    assert main([str(whole.parent)]) == 0
+    assert capsys.readouterr().out.startswith(f"{whole}: valid")
+
+
 def test_not_valid(damaged, capsys):
     assert main([str(damaged)]) == 1
     finding, verdict = capsys.readouterr().out.splitlines()
