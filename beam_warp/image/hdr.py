@@ -144,7 +144,7 @@ def _decode_new(data: bytes, position: int, width: int) -> tuple[NDArray[np.uint
                 position += 1 + code
                 if code == 0:
                     return None, position
-        if len(out) != end:  # a run crosses the component's end, or a literal the file's
+        if len(out) != end or position > size:  # a run crosses the component's end, or a literal the file's
             return None, position
     return np.frombuffer(bytes(out), np.uint8).reshape(4, width).T, position
 

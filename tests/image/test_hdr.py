@@ -112,6 +112,7 @@ def test_exposures_are_divided_out(tmp_path, picture):
         (HEADER + b"-Y 1 +X 9\n" + bytes((2, 2, 0, 9, 138, 5)) + bytes(60), "truncated one at row 0"),
         (HEADER + b"-Y 1 +X 9\n" + bytes((2, 2, 0, 9, 0, 5)) + bytes(60), "truncated one at row 0"),
         (HEADER + b"-Y 1 +X 9\n" + bytes((2, 2, 0, 9, 137, 5, 137)), "truncated one at row 0"),
+        (HEADER + b"-Y 2 +X 9\n" + bytes((2, 2, 0, 9, *(137, 5) * 3, 12, *range(9))), "truncated one at row 0"),
     ],
 )
 def test_refusals(tmp_path, data, message):
