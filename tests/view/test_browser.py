@@ -246,10 +246,15 @@ def test_a_window_that_is_resized(page, viewer):
     assert shown.shape[0] == 400
 
 
-def test_what_fails_is_said_on_the_page(page, viewer):
+def test_what_fails_is_said_on_the_page(page, viewer, monkeypatch):
+    def fail(*_, **__):
+        raise MemoryError("too small a device")
+
     before = screen(page)
-    viewer._loop.change(environment="moon")
-    page.get_by_text("This could not be drawn").first.wait_for(timeout=1000 * PATIENCE)
+    with monkeypatch.context() as broken:
+        broken.setattr(viewer._painter, "draw", fail)
+        viewer.change(environment="none")
+        page.get_by_text("This could not be drawn").first.wait_for(timeout=1000 * PATIENCE)
     viewer.change(environment="stage")
     settled(page, viewer, before)
 
