@@ -75,7 +75,7 @@ class Bench:
 
     Attributes:
         count: Gaussians of a conversion that is timed.
-        sog_count: Gaussians of one to or from SOG, whose palettes take minutes otherwise.
+        sog_count: Gaussians of one to or from SOG, for whose palettes splat-transform takes minutes otherwise.
         error_count: Gaussians of which errors are measured.
         repeats: Repeats of everything that is timed.
         sequence: Frames of the sequence, and Gaussians of each.
@@ -412,8 +412,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(
             count=2_000 if args.quick else 1_000_000,
-            sog_count=2_000 if args.quick else 100_000,
-            error_count=500 if args.quick else 100_000,
+            sog_count=2_000 if args.quick else 10_000,
+            error_count=500 if args.quick else 10_000,
             repeats=1 if args.quick else args.repeats,
             sequence=(3, 500) if args.quick else (30, 140_000),
             folder=Path(folder),
