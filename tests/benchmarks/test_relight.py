@@ -196,7 +196,6 @@ def test_all_of_it_runs_into_tables(device, bench, tmp_path, small_lights, relit
     assert [row[0] for row in tables_relight.path(result)[1:]] == list(result["path"]["cases"])
     assert len(tables_relight.results_speed(result)) == 2 + len(cases)
     assert tables_relight.samples(result)[0] == ["PSNR [dB]", "2 samples", "4 samples"]
-    assert len(tables_relight.shadows(result)) == 3
     assert len(tables_relight.furnace(result)) == 7
     assert len(tables_relight.consistent(result)) == 5
     monkeypatch.setattr(tables_relight, "USUAL", "N = 4")
