@@ -203,7 +203,8 @@ def test_all_of_it_runs_into_tables(device, bench, tmp_path, small_lights, relit
     relit = {way: {light: {"psnr": 30.0} for light in ("stage", "sunset")} for way in ("deferred", "path")}
     evaluated = {"paths": 2, "captures": {"demo": {"ways": {"direct": {"mean": {"relit": relit}}}}}}
     scored = tables_relight.results_accuracy(result, {"evaluation": evaluated})
-    assert [row[:2] for row in scored[1:]] == [("demo", "stage"), ("demo", "sunset")]
+    assert [row[:2] for row in scored[1:3]] == [["demo", "stage"], ["demo", "sunset"]]
+    assert [(row[0], row[4:]) for row in scored[3:]] == 2 * [("demo figure", ["", ""])]  # no capture was decomposed
     monkeypatch.setattr(tables_relight, "PICTURES", pictures)
     tables_relight.draw_comparison(result, tmp_path / "figure.png")
     assert 1000 < (tmp_path / "figure.png").stat().st_size <= LARGEST_FILE
