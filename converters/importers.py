@@ -72,7 +72,7 @@ _ARAS_P = Importer(
     name="aras-p UnityGaussianSplatting",
     axes="ruf",
     sh_degrees=(3, 3),
-    suffixes=(".ply", ".spz"),
+    suffixes=(".ply",),
     to_do="Tools › Gaussian Splats › Create GaussianSplatAsset. Leave the object's transform at its default.",
     evidence="source, 2c6fed3: values are taken as they are; 45 `f_rest` are assumed, so other degrees are padded",
 )
