@@ -12,6 +12,7 @@ import zlib
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
+from beam_warp.archives import MANY_FILES, open_zip
 from beam_warp.converters import formats
 from beam_warp.converters.frames import DecodedFrame, sequence_of
 from beam_warp.converters.numbering import holds_a_frame, in_order
@@ -19,7 +20,7 @@ from beam_warp.converters.options import ReadOptions
 from beam_warp.errors import AssetFormatError
 from beam_warp.world.gaussians import GaussianSequence
 
-MAX_ENTRIES = 2**16
+MAX_ENTRIES = 2**14
 """Most files in an archive."""
 
 MAX_FREE_BYTES, MAX_RATIO = 64 * 2**20, 32
@@ -36,7 +37,7 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
         AssetFormatError: It is malformed, encrypted, or holds no frames.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path, MANY_FILES) as archive:
             entries = archive.infolist()
     except _BROKEN as error:
         raise _malformed(path, "must be a whole zip archive", str(error)) from error
@@ -84,7 +85,7 @@ def _decoded(path: Path, entry: zipfile.ZipInfo, options: ReadOptions) -> Decode
     with TemporaryDirectory(prefix="beam_warp_") as folder:
         place = Path(folder) / PurePosixPath(entry.filename).name
         try:
-            with zipfile.ZipFile(path) as archive, archive.open(entry) as source, place.open("wb") as target:
+            with open_zip(path, MANY_FILES) as archive, archive.open(entry) as source, place.open("wb") as target:
                 shutil.copyfileobj(source, target, 1 << 20)
         except _BROKEN as error:
             raise _malformed(path, "must hold whole files", f"{entry.filename!r} ({error})") from error

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FLOORS = """
-errors checks digests blocks kernels
+errors checks digests archives blocks kernels
 image device
 world
 light schema jobs
@@ -38,7 +38,18 @@ render materials reconstruction
 ALLOWED = {("checks", "errors"), ("digests", "errors"), ("digests", "checks"), ("interop", "_version")}
 """Imports within a floor."""
 
-WITHOUT_WARP = {"errors", "checks", "digests", "blocks", "image", "world", "schema", "converters", "capture"}
+WITHOUT_WARP = {
+    "errors",
+    "checks",
+    "digests",
+    "archives",
+    "blocks",
+    "image",
+    "world",
+    "schema",
+    "converters",
+    "capture",
+}
 """Packages that a converter or validator waits for: none of them imports Warp."""
 
 

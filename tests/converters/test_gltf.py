@@ -402,7 +402,7 @@ PATHS = [
     (("accessors", 0, "type"), "MAT4", "accessor 0 must have known components, 3 in an element, got 5126 and 'MAT4'"),
     (("accessors", 0, "type"), [], "accessor 0 must have known components, 3 in an element, got 5126 and []"),
     (("accessors", 0, "count"), 4, "accessor 0 must lie within 36 bytes, got 4 every 12 bytes from 0"),
-    (("accessors", 0, "count"), 2**32, "the scene must have at most 1048576 Gaussians, got 4294967296"),
+    (("accessors", 0, "count"), 2**32, "the scene must have at most 262144 Gaussians, got 4294967296"),
     (("accessors", 0, "count"), 2**60, "count must be an integer of at least 0, got 1152921504606846976"),
     (("accessors", 0, "count"), 3.0, "count must be an integer of at least 0, got 3.0"),
     (("accessors", 0, "count"), 2, "all attributes must have 2 elements, got 3 for orientations"),
@@ -412,7 +412,7 @@ PATHS = [
     (("bufferViews", 0, "byteLength"), 2**40, "buffer view 0 must end within"),
     (("bufferViews", 0, "buffer"), 1, "an index must name one of 1 buffers, got 1"),
     (("bufferViews", 0, "extensions"), {"EXT_meshopt_compression": {}}, "must not be compressed, got EXT_meshopt_com"),
-    (("buffers", 0, "byteLength"), 2**40, "buffer 0 must have 1099511627776 bytes, got"),
+    (("buffers", 0, "byteLength"), 2**40, "buffers must have at most twice the"),
     (("buffers", 0, "uri"), None, "buffer 0 must be in the file or name a URI, got None"),
     (("buffers", 0, "uri"), "data:;base64,@@", "the data of buffer 0 must be base64, got data:;base64"),
     (("buffers", 0, "uri"), "data:,abc", "the data of buffer 0 must be base64, got data:"),
@@ -485,7 +485,7 @@ def test_documents_that_are_large_or_deep(tmp_path):
 def test_a_mesh_shown_again_and_again(make_cloud, tmp_path):
     document = document_of(arrays_of(make_cloud(count=5000, degree=0)))
     document["nodes"] = [{"children": list(range(1, 901))}] + [{"mesh": 0}] * 900
-    refused(tmp_path, document, "the scene must have at most 1048576 Gaussians, got 4500000")
+    refused(tmp_path, document, "the scene must have at most 262144 Gaussians, got 4500000")
 
 
 def test_glb_cut_anywhere(tmp_path):
