@@ -214,7 +214,12 @@ SPLATS = {
         for version in (1, 2, 3)
     },
     "spz 4": Reader(
-        written("a.spz", 1, spz_version=4), read_frames, "splats", numbers=SPZ_HEADER | TABLE, others=_zstandard_frames
+        written("a.spz", 1, spz_version=4),
+        read_frames,
+        "splats",
+        numbers=SPZ_HEADER | TABLE,
+        free=SPZ_FREE,
+        others=_zstandard_frames,
     ),
     "gltf": Reader(gltf, read_frames, "splats", is_json=True, others=_scenes, free=GLTF.free),
     "glb": Reader(
