@@ -1,7 +1,8 @@
 """Mending of an asset in place: what can be mended safely, and what is left to a person.
 
 `mend` runs ``python -m beam_warp.schema.validation.mending ASSET FOLDER`` as a child process, which a corrupt file may
-end. The child writes the layers that it has changed to the folder. They replace those of the asset once the child has ended.
+end. The child writes the layers that it has changed to the folder. They replace those of the asset once the child has
+ended.
 """
 
 from __future__ import annotations
