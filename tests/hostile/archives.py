@@ -271,6 +271,9 @@ def frames(folder: Path) -> Path:
     return folder / "a.zip"
 
 
+CRATE = {"version": (8, "<H"), "table of contents": (16, "<Q")}
+CRATE_FREE: frozenset[str] = frozenset()
+
 ARCHIVES = {
     "sog": Reader(
         written("a.sog", 3),
@@ -295,6 +298,7 @@ ARCHIVES = {
         others=archives,
         inside=member("a_0.splat", Ways(cuts=(0.3,), free=frozenset({"zeros"}))),
     ),
-    "usdz": Reader(written("a.usdz", 0), read_asset, others=archives),
+    "usdz": Reader(written("a.usdz", 0), read_asset, others=archives, free=frozenset({"a long name"}), is_slow=True),
+    "usdc": Reader(written("a.usdc", 0), read_asset, numbers=CRATE, is_slow=True, free=CRATE_FREE),
 }
 """Every reader of archives."""

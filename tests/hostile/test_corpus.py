@@ -43,7 +43,10 @@ def is_one_line(text):
     return one_line and " must " in text and ", got " in text and len(text) < 1000
 
 
-@pytest.mark.parametrize("name", READERS)
+SLOW = {True: [pytest.mark.slow], False: []}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW[it.is_slow]) for name, it in READERS.items()])
 def test_spoiled_files(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     reader = READERS[name]

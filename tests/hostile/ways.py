@@ -72,12 +72,14 @@ class Reader(Ways):
         read: Reads all that there is, from the path of that file.
         family: Fuzz target that reads it, too: ``splats``, ``captures`` or ``images``.
         inside: What it packs.
+        is_slow: True if a child process opens each file first.
     """
 
     make: Callable[[Path], Path]
     read: Callable[[Path], object]
     family: str = ""
     inside: Inside | None = None
+    is_slow: bool = False
 
 
 def cases(reader: Reader, sound: bytes) -> Iterator[Case]:
