@@ -340,9 +340,7 @@ MALFORMED = {
     "other size": (replace("sh0.webp", lambda p: p[:2]), r"sh0\.webp must have 4 x 4 px like means_l\.webp, got 4 x 2"),
     "vast": (replace("means_l.webp", lambda _: vast(16384, 16384)), r"pixel for each of 11 .* 16384 x 16384 px"),
     "vast, believed": (
-        lambda files: files.update(
-            {n: vast(1000, 1000) for n in files if n not in ("meta.json", "shN_centroids.webp")}
-        ),
+        lambda files: files.update({n: vast(500, 500) for n in files if n not in ("meta.json", "shN_centroids.webp")}),
         r"means_l\.webp must be an intact picture",
     ),
 }

@@ -1,5 +1,6 @@
 """Every spoiled file of the corpus ends in one line and exit code 2, soon and in little memory; others may be read."""
 
+import dataclasses
 import re
 import shutil
 import tempfile
@@ -73,6 +74,6 @@ def test_the_corpus_is_large(tmp_path):
     for name, reader in READERS.items():
         folder = tmp_path / name
         folder.mkdir()
-        counts[name] = sum(1 for _ in cases(reader, reader.make(folder).read_bytes()))
-    print(counts)
+        plain = dataclasses.replace(reader, others=None)  # those that each format adds take longer to make
+        counts[name] = sum(1 for _ in cases(plain, reader.make(folder).read_bytes()))
     assert sum(counts.values()) >= 300, counts
