@@ -58,12 +58,8 @@ def _malformed(path: Path, contract: str, got: str) -> AssetFormatError:
 def _is_shown(entry: zipfile.ZipInfo) -> bool:
     """Return False for folders, and for files that systems add without asking."""
     parts = PurePosixPath(entry.filename).parts
-    return (
-        parts != ()
-        and not entry.is_dir()
-        and "__MACOSX" not in parts
-        and not any(part.startswith(".") for part in parts[-1:])
-    )
+    is_file = parts != () and not entry.is_dir()
+    return is_file and "__MACOSX" not in parts and not parts[-1].startswith(".")
 
 
 def _frames(path: Path, files: dict[Path, zipfile.ZipInfo]) -> list[Path]:

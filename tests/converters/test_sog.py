@@ -370,8 +370,11 @@ def test_tricks_of_archives(tmp_path):
     bundle(random_sog() | {"scales.webp": bytes(20_000_000)}, path, zipfile.ZIP_DEFLATED)
     with pytest.raises(AssetFormatError, match=r"scales\.webp must unpack to at most \d+ bytes, got more"):
         converters.read(path)
-    bundle(random_sog() | {f"{number}" * 9: b"" for number in range(2000)}, path)
-    with pytest.raises(AssetFormatError, match=r"^a\.sog: a SOG bundle must list its eight files, got a directory of"):
+    bundle(random_sog() | {f"{number}" * 9: b"" for number in range(4000)}, path)
+    with pytest.raises(
+        AssetFormatError,
+        match=r"^a\.sog: a SOG bundle must be a zip archive of few files, got .*a directory of \d+ bytes",
+    ):
         converters.read(path)
     content = bytearray(bundle(random_sog(), path).read_bytes())
     content[content.index(b"RIFF") + 40] ^= 255
