@@ -489,6 +489,22 @@ def test_a_mesh_shown_again_and_again(make_cloud, tmp_path):
     refused(tmp_path, document, "the scene must have at most 262144 Gaussians, got 4500000")
 
 
+def test_a_rotation_of_nothing_that_a_node_turns(make_cloud, tmp_path):
+    arrays = arrays_of(make_cloud(count=3, degree=0))
+    arrays[f"{SPLAT}:ROTATION"] = np.zeros((3, 4), np.float32)
+    document = document_of(arrays, nodes=[{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}])
+    refused(tmp_path, document, "orientations must have unit length, got |v| = 0 at row 0")
+
+
+@pytest.mark.parametrize("more", [[{"byteLength": 2**50}], [{"byteLength": 2**20, "uri": "a.bin"}] * 9])
+def test_buffers_that_their_files_do_not_hold_raise_no_limit(make_cloud, tmp_path, more):
+    (tmp_path / "a.bin").write_bytes(bytes(2**20))
+    document = document_of(arrays_of(make_cloud(count=5000, degree=0)))
+    document["nodes"] = [{"children": list(range(1, 901))}] + [{"mesh": 0}] * 900
+    document["buffers"] += more
+    refused(tmp_path, document, "buffers must have at most twice the ")
+
+
 def test_glb_cut_anywhere(tmp_path):
     content = glb_bytes(sound())
     for size in [*range(0, 24), *range(24, len(content), 97), len(content) - 1]:
@@ -517,6 +533,7 @@ def test_malformed_glb(tmp_path, content, message):
     [
         ("POSITION", [np.nan, 0, 0], "positions must be finite, got NaN or infinity at row 1"),
         (f"{SPLAT}:ROTATION", [0, 0, 0, 0], "orientations must have unit length, got |v| = 0 at row 1"),
+        (f"{SPLAT}:ROTATION", [1e20, 0, 0, 0], "orientations must have unit length, got |v| = 0 at row 1"),
         (f"{SPLAT}:SCALE", [0, -1, 0], "scales must lie in [0, inf], got -1 at row 1"),
         (f"{SPLAT}:OPACITY", [1.5], "opacities must lie in [0, 1], got 1.5 at row 1"),
         (f"{SPLAT}:SH_DEGREE_0_COEF_0", [np.inf, 0, 0], "radiance must be finite, got NaN or infinity at row 1"),

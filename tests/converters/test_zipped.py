@@ -50,6 +50,11 @@ def test_one_file_needs_no_number(columns, ply_bytes, tmp_path):
     assert len(converters.read(path, source_axes="rub")[0]) == 3
 
 
+def test_an_entry_without_a_name_is_no_frame(columns, ply_bytes, tmp_path):
+    path = zipped(tmp_path / "person.zip", **{"": b"", "person.ply": ply_bytes(columns)})
+    assert len(converters.read(path, source_axes="rub")) == 1
+
+
 def test_archives_that_are_no_frames_or_reach_outside(columns, ply_bytes, tmp_path):
     sound = ply_bytes(columns)
     path = tmp_path / "a.zip"
