@@ -167,9 +167,9 @@ def test_hdf5_follows_no_links_to_frames_and_unpacks_no_large_chunk(tmp_path):
     assert len(converters.read(path)) == 1
     with h5py.File(path, "a") as file:
         del file["positions"]
-        large = {"chunks": (2**26, 3), "maxshape": (None, 3), "compression": "gzip"}
+        large = {"chunks": (2**23, 3), "maxshape": (None, 3), "compression": "gzip"}
         file.create_dataset("positions", data=MINIMAL["positions"], dtype="f4", **large)
-    with pytest.raises(AssetFormatError, match=r"must have chunks of at most 64 MiB, got \(67108864, 3\) of positions"):
+    with pytest.raises(AssetFormatError, match=r"must have chunks of at most 64 MiB, got \(8388608, 3\) of positions"):
         converters.read(path)
 
 
@@ -178,7 +178,7 @@ def test_archives_and_groups_without_end_are_refused(tmp_path, monkeypatch):
     with zipfile.ZipFile(path, "w") as archive:
         for number in range(4000):
             archive.writestr(f"{number}.npy", b"")
-    with pytest.raises(AssetFormatError, match="got a directory of [0-9]+ bytes"):
+    with pytest.raises(AssetFormatError, match=r"got a directory of \d+ bytes"):
         converters.read(path)
     monkeypatch.setattr("beam_warp.converters.arrays.MAX_NAMES", 8)
     with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -51,7 +51,9 @@ def test_one_file_needs_no_number(columns, ply_bytes, tmp_path):
 
 
 def test_an_entry_without_a_name_is_no_frame(columns, ply_bytes, tmp_path):
-    path = zipped(tmp_path / "person.zip", **{"": b"", "person.ply": ply_bytes(columns)})
+    path = zipped(tmp_path / "person.zip", **{"person.ply": ply_bytes(columns)})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(zipfile.ZipInfo(""), b"")
     assert len(converters.read(path, source_axes="rub")) == 1
 
 

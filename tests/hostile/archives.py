@@ -242,7 +242,7 @@ IN_HDF5: dict[str, Callable[[h5py.File], object]] = {
     "a number": _in_place("opacities", lambda _: 1.0),
     "NaN": _in_place("opacities", lambda _: [math.nan, 1.0]),
     "a vast shape": _in_place("positions", _made((2**40, 3), "f4", chunks=(1024, 3), compression="gzip")),
-    "a vast chunk": _in_place("positions", _made(data=FIELDS["positions"], chunks=(2**24, 3), **CHUNKS)),
+    "a vast chunk": _in_place("positions", _made(data=FIELDS["positions"], dtype="f4", chunks=(2**23, 3), **CHUNKS)),
     "a unit that is none": lambda file: file.attrs.update(meters_per_unit=math.nan),
     "a unit of texts": lambda file: file.attrs.update(meters_per_unit="\x1b[31m"),
     "axes of numbers": lambda file: file.attrs.update(axes=np.zeros((9, 9))),
