@@ -23,7 +23,7 @@ from beam_warp.world.gaussians import GaussianSequence
 MAX_ENTRIES = 2**14
 """Most files in an archive."""
 
-MAX_FREE_BYTES, MAX_RATIO = 64 * 2**20, 32
+MAX_FREE_BYTES, MAX_RATIO = 16 * 2**20, 32
 """A frame may unpack to so many bytes, and so many more for each byte that it takes in the archive."""
 
 _BROKEN = (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error, struct.error)
