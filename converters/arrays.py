@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -84,6 +85,8 @@ _BROKEN = (
     KeyError,
     TypeError,
     EOFError,
+    SyntaxError,
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
     struct.error,

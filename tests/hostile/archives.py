@@ -156,6 +156,7 @@ def _arrays(content: bytes) -> Iterator[Case]:
         "of negative size": _npy((-1, -9), "<f4", bytes(36)),
         "of many axes": _npy((1,) * 65, "<f4", bytes(4)),
         "with a program in its header": _npy((3, 3), "<f4", bytes(36)).replace(b"False", b"1if1else[]"),
+        "with an open header": _npy((3, 3), "<f4", bytes(36)).replace(b"}", b" "),
         "with a long header": b"\x93NUMPY\2\0" + struct.pack("<I", 2**20) + b"(" * 2**20,
     }
     for name, array in members.items():
