@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_number
+from beam_warp.checks import require_number, require_path
 from beam_warp.digests import array_digest, content_digest, described
 from beam_warp.stage.assets import StageAsset, joined
 from beam_warp.stage.camera_paths import CameraPath, OrbitPath
@@ -86,7 +86,7 @@ class Stage:
             MissingFileError: The file, or one that it names, is not there.
             AssetFormatError: It is malformed; says which field and what to do.
         """
-        return cls(**read_stage_file(Path(path)))
+        return cls(**read_stage_file(require_path("path", path)))
 
     @classmethod
     def of(
@@ -120,7 +120,7 @@ class Stage:
             require_number("spacing", spacing, 0.0, 1e6)
         assets = [
             read_stage_asset(
-                Path(path),
+                require_path("path", path),
                 source_axes=source_axes,
                 drop_invalid=drop_invalid,
                 on_ground=on_ground,
