@@ -91,7 +91,7 @@ def run(
         sequence: Frames with captured radiance, in any axes.
         environment: The light of the capture, in the world "rfu". Where it is not known, another one: base colour
             explains the captured colour by it, and relightings by it are not comparable with what was captured.
-        out: Folder; made if its parent exists.
+        out: Folder; made if it does not exist.
         options: See `RunOptions`.
         capture: The images that the Gaussians were reconstructed from: light is gathered where they show the surface,
             and base colour explains what they show. None takes the Gaussians' own colour for it.

@@ -22,15 +22,15 @@ KEY, CHECKSUM = "beam_key", "crc32"
 
 
 def make_folders(out: Path, *names: str) -> list[Path]:
-    """Make a folder for results and the named folders in it; those that exist stay as they are.
+    """Make a folder for results, those above it and the named ones in it; those that exist stay as they are.
 
     Raises:
-        OutputError: One of them cannot be made, or ``out`` has no parent.
+        OutputError: One of them cannot be made.
     """
     folders = [out / name for name in names]
     try:
         for folder in (out, *folders):
-            folder.mkdir(exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"out must be a folder that can be made, got {out} ({error.strerror}). Choose another place."

@@ -127,7 +127,7 @@ def reconstruct(
 
     Args:
         capture: Images and cameras; its world is that of the Gaussians.
-        out: Folder; made if its parent exists.
+        out: Folder; made if it does not exist.
         steps: How the Gaussians of a frame are found.
         options: See `ReconstructOptions`.
         progress: Called with (stage, done, total, note).

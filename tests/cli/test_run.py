@@ -73,7 +73,7 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
         ("ball.ply --environment sky.exr --roughness r.png", "roughness-mesh must be given"),
         ("ball.ply --environment sky.exr --samples 0", "--samples must be"),
         ("ball.ply --environment sky.exr --fps 0", "--fps must be"),
-        ("ball.ply --environment sky.exr --out missing/out", "out must be a folder that can be made"),
+        ("ball.ply --environment sky.exr --out text.ply/out", "output folder must be a folder, got"),
     ],
 )
 def test_mistakes(ball, sky, tmp_path, monkeypatch, refused, words, says):

@@ -12,7 +12,6 @@ from tyro.conf import arg
 from beam_warp import converters
 from beam_warp.checks import require_number
 from beam_warp.cli.common.pages import SECOND_PAGE
-from beam_warp.errors import OutputError
 from beam_warp.world.metadata import LOW_PASS_RANGE
 
 if TYPE_CHECKING:
@@ -59,18 +58,6 @@ class ReadingFlags:
     def raster(self, sequence: GaussianSequence) -> RasterOptions:
         """Return how a sequence is drawn; see `raster_options`."""
         return raster_options(sequence.metadata, self.antialiased, self.low_pass)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results, and those above it.
-
-    Raises:
-        OutputError: It cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"out must be a folder, got {folder} ({error.strerror}). Choose another.") from error
 
 
 def notes_of(sequence: GaussianSequence) -> list[str]:

@@ -43,7 +43,7 @@ class FrameStore:
     """
 
     def __init__(self, out: Path) -> None:
-        """Make ``out`` if its parent exists, and ``frames``, ``previews`` and ``digests`` in it.
+        """Make ``out``, and ``frames``, ``previews`` and ``digests`` in it.
 
         Raises:
             OutputError: A folder cannot be made.
