@@ -123,7 +123,7 @@ def kept_originals() -> list[Path]:
     return [path for table in _originals for path in table.values()]
 
 
-def require_apart(paths: Iterable[Path], name: str = "out") -> None:
+def require_apart(paths: Iterable[Path], name: str = "output") -> None:
     """Refuse to write over what is read.
 
     Raises:

@@ -95,7 +95,7 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
     """Refuse frames that would replace those of the input, or end up among them."""
     planned = [numbered_path(output, frame) for frame in range(frame_count)]
     require_path("output", planned[-1])
-    require_apart(planned, "output")
+    require_apart(planned)
     if source.is_dir() and output.parent.resolve() == source.resolve() and holds_a_frame(output.name):
         raise InvalidOptionError(
             f"output must be in another folder than the frames that are read, got {output}. Choose another folder."

@@ -69,7 +69,7 @@ def render(args: Render) -> int:
     picture, notes = _picture(args)
     with progress(args.quiet or args.json) as report:
         plan = _plan(args, stage, frame_count) if capture is None else _plan_of_capture(args, stage, capture)
-        require_apart(plan.outputs)
+        require_apart(plan.outputs, "out")
         job = RenderJob(stage, renderer, PictureWriter(picture), report)
         tally = _carry_out(plan, job, overwrite=args.output.overwrite)
     said = list(dict.fromkeys((*stage.notes, *notes, *plan.notes)))
