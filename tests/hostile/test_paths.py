@@ -59,7 +59,7 @@ def cloud(frames):
 @pytest.mark.parametrize("function", TAKE_A_PATH)
 @pytest.mark.parametrize("value", [None, b"a.ply", 3, "", "a\0.ply", "a\udc80.ply", "x" * 300 + ".ply"])
 def test_what_is_no_path(function, value):
-    with pytest.raises(InvalidOptionError, match="(path|folder|out) must (be a|have names)"):
+    with pytest.raises(InvalidOptionError, match=r"(path|folder|out) must (be a|have names)"):
         function(value)
 
 

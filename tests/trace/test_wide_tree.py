@@ -392,3 +392,10 @@ class TestMove:
             ):
                 with pytest.raises(InvalidArrayError, match=f"{name} must {match}"):
                     scene.move(*good[:place], bad, *good[place + 1 :])
+
+
+def test_a_scene_is_not_copied():
+    scene = Scene.from_gaussians(GaussianCloud(**{**one_gaussian()}), "cpu")
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(InvalidOptionError, match="scene must stay in the process that made it"):
+            copied(scene)
