@@ -129,7 +129,7 @@ def test_nobody_reads_the_output():
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is KiB on Linux alone")
 @pytest.mark.parametrize("columns", ["1", "-5", "100000000"])
 def test_help_in_any_width(columns):
-    """In one column, it took 100 s and 914 MiB."""
+    """Help in one column took 100 s and 914 MiB."""
     code = (
         "import resource, sys; from beam_warp.cli.main import main\n"
         "begun = resource.getrusage(resource.RUSAGE_SELF)\n"
