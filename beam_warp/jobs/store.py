@@ -48,7 +48,9 @@ def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> Non
         file.attrs[KEY] = key
         for name, array in arrays.items():
             data = np.asarray(array, order="C")
-            file.create_dataset(name, data=data, track_times=False).attrs[CHECKSUM] = crc32(data)  # same bytes again
+            file.create_dataset(name, data=data, track_times=False).attrs[CHECKSUM] = _checksum(
+                data
+            )  # same bytes again
 
 
 def frame_key(path: Path) -> str | None:
@@ -83,10 +85,14 @@ def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, ND
         ) from error
 
 
+def _checksum(array: NDArray[Any]) -> int:
+    return crc32(array.data if array.size else b"")
+
+
 def _checked(dataset: Any) -> NDArray[Any]:
     """Read an array, and compare it with its checksum: zeros in a damaged file would be values like any others."""
     array = np.asarray(dataset)
-    if crc32(np.ascontiguousarray(array)) != dataset.attrs[CHECKSUM]:
+    if _checksum(np.ascontiguousarray(array)) != dataset.attrs[CHECKSUM]:
         raise ValueError(f"another checksum of {dataset.name[1:]}")
     return array
 
