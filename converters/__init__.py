@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beam_warp.checks import require_path
 from beam_warp.converters.common.frames import sequence_of
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.common.options import Activation, MaterialActivation, ReadOptions
@@ -51,7 +52,7 @@ def read(
         AssetFormatError: The content is malformed; the message names file, place and remedy.
         InvalidOptionError: An option or the suffix is not one.
     """
-    source = Path(path)
+    source = require_path("path", path)
     options = ReadOptions(
         source_axes=source_axes,
         meters_per_unit=meters_per_unit,
@@ -110,7 +111,7 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
         InvalidOptionError: The suffix or an option does not fit.
         OutputError: The folder is closed, a file would be too large, or older frames are in the way.
     """
-    final = Path(path)
+    final = require_path("path", path)
     require_output(final, options)
     form = format_of(final)
     with folders_made(final.parent):

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from beam_warp.archives import MANY_FILES, open_zip
+from beam_warp.checks import require_path
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -43,7 +44,7 @@ def require_asset_file(path: str | Path) -> Path:
         MissingFileError: There is no such file, or it cannot be read.
         AssetFormatError: It is truncated or no USD file.
     """
-    source = Path(path).absolute()
+    source = require_path("path", path).absolute()
     if source.suffix.lower() not in SUFFIXES:
         raise AssetFormatError(
             f"{source} must end in {', '.join(SUFFIXES)}, got {source.suffix or 'no suffix'}. "

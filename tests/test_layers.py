@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FLOORS = """
-errors checks digests archives blocks kernels
+errors checks digests archives blocks outputs kernels
 image device
 world
 light schema jobs
@@ -35,7 +35,13 @@ render materials reconstruction
 """
 """Families of kernels from the bottom up."""
 
-ALLOWED = {("checks", "errors"), ("digests", "errors"), ("digests", "checks"), ("interop", "_version")}
+ALLOWED = {
+    ("checks", "errors"),
+    ("digests", "errors"),
+    ("digests", "checks"),
+    ("outputs", "errors"),
+    ("interop", "_version"),
+}
 """Imports within a floor."""
 
 WITHOUT_WARP = {
@@ -44,6 +50,7 @@ WITHOUT_WARP = {
     "digests",
     "archives",
     "blocks",
+    "outputs",
     "image",
     "world",
     "schema",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from beam_warp._version import __version__
 from beam_warp.cli.common.console import escaped, print_json, progress, run_command
+from beam_warp.cli.common.paths import paths_checked
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("asset", nargs="?", help="the file to check, or the folder of an asset")
+    parser.add_argument("asset", nargs="?", type=Path, help="the file to check, or the folder of an asset")
     parser.add_argument("--fix", action="store_true", help="mend in place what is safe to mend, then check")
     parser.add_argument("--physical", action="store_true", help="also trace the asset and judge it by physics (slower)")
     parser.add_argument("--device", help="cpu, cuda:0, … for --physical; the first GPU by default, if there is one")
@@ -49,7 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(lambda: _list_rules(options.json))
     if options.asset is None:
         parser.error("asset must be given, got none. Name a .usd, .usda, .usdc or .usdz file.")
-    return run_command(lambda: _validate(options))
+    return run_command(lambda: _with_paths_checked(options))
+
+
+def _with_paths_checked(options: argparse.Namespace) -> int:
+    with paths_checked(vars(options)):
+        return _validate(options)
 
 
 def _validate(options: argparse.Namespace) -> int:
@@ -58,7 +64,7 @@ def _validate(options: argparse.Namespace) -> int:
     from beam_warp.schema.validation.sarif import write_sarif
     from beam_warp.schema.validation.validator import validate
 
-    options.asset = str(files_at(Path(options.asset))[0])
+    options.asset = str(files_at(options.asset)[0])
     if options.sarif is not None and options.sarif.suffix not in (".sarif", ".json"):
         raise InvalidOptionError(f"--sarif must name a .sarif or .json file, got {options.sarif}. Choose another name.")
     report = mend(options.asset) if options.fix else validate(options.asset)

@@ -111,7 +111,7 @@ def test_the_input_is_never_written_over(person, capsys):
     spelled = person / "out" / ".." / "person.ply"
     code, _, err = run(person / "person.ply", spelled, capsys=capsys)
     assert code == 2
-    assert err.startswith("error: output must be another file than the input, got ")
+    assert err.startswith("error: output must be another file than those that are read, got ")
     assert (person / "person.ply").read_bytes() == before
     code, _, err = run(person / "take", person / "take" / "f.ply", capsys=capsys)
     assert code == 2
