@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from beam_warp.blocks import for_each_block
 from beam_warp.converters.activations import dc_from_color, exp_scale
 from beam_warp.converters.ply_checks import require_types, settle_log_scales
-from beam_warp.converters.ply_container import Element, PlyHeader, malformed, open_columns, read_columns
+from beam_warp.converters.ply_container import Element, PlyHeader, open_columns, read_columns
+from beam_warp.converters.refusals import malformed
 from beam_warp.image.color import DISPLAY_SRGB
 
 CHUNK_ROWS = 256

@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.ply_container import malformed
+from beam_warp.converters.refusals import malformed
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 GLB_HEADER, GLB_CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")

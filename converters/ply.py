@@ -21,8 +21,9 @@ from beam_warp.converters.colors import BASE_COLOR_ONLY, CAPTURED, NO_COLOR
 from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.options import MaterialActivation, ReadOptions
 from beam_warp.converters.ply_checks import require_not_linear, require_rotations, require_types, settle_log_scales
-from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, malformed, read_columns, read_header
+from beam_warp.converters.ply_container import RASTER_WORDS, PlyHeader, read_columns, read_header
 from beam_warp.converters.producers import LAYOUTS, NORMAL_NAMES, guess_producer, material_producer, material_properties
+from beam_warp.converters.refusals import malformed
 from beam_warp.errors import AssetFormatError, BeamError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES

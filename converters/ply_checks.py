@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from beam_warp.checks import rows_at
 from beam_warp.converters.activations import LOG_SCALE_LIMITS
-from beam_warp.converters.ply_container import Element, malformed
+from beam_warp.converters.ply_container import Element
+from beam_warp.converters.refusals import malformed
 
 _WORDS = {"u1": "uchar", "u4": "uint", "f4": "float", "f8": "double"}
 

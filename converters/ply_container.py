@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.blocks import for_each_block
-from beam_warp.errors import AssetFormatError, MissingFileError
+from beam_warp.converters.refusals import malformed
+from beam_warp.errors import MissingFileError
 
 MAX_HEADER_BYTES = 64 * 1024
 MAX_ELEMENTS = 16
@@ -100,11 +101,6 @@ class PlyHeader:
         """Comments of the form ``beam_<key> <value>``, by which our own writer describes a file."""
         pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
         return {key: value.strip() for key, _, value in pairs}
-
-
-def malformed(path: Path, contract: str, got: str, remedy: str) -> AssetFormatError:
-    """Make the error of a file that breaks its format."""
-    return AssetFormatError(f"{path.name}: {contract}, got {got}. {remedy}")
 
 
 def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.ply_container import malformed
+from beam_warp.converters.refusals import malformed
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 META = "meta.json"

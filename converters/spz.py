@@ -33,7 +33,7 @@ from beam_warp.converters.colors import display_radiance, resize_bands
 from beam_warp.converters.frame_files import FrameToWrite
 from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.options import ReadOptions, WriteOptions
-from beam_warp.converters.ply_container import malformed
+from beam_warp.converters.refusals import malformed
 from beam_warp.converters.rotations import SMALLER_LIMIT, from_smaller, to_smaller
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB
