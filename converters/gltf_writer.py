@@ -17,7 +17,7 @@ from beam_warp._version import __version__
 from beam_warp.converters.activations import color_from_dc
 from beam_warp.converters.colors import display_radiance, resize_bands
 from beam_warp.converters.frame_files import FrameToWrite
-from beam_warp.converters.gltf import COLOR_SPACES, EXTENSION, GEOMETRY, MATERIALS, harmonic
+from beam_warp.converters.gltf import AXES, COLOR_SPACES, EXTENSION, GEOMETRY, MATERIALS, harmonic
 from beam_warp.converters.gltf_container import FLOAT, GLB_CHUNK, GLB_HEADER, UNSIGNED_BYTE, WIDTHS
 from beam_warp.converters.options import WriteOptions
 from beam_warp.errors import InvalidOptionError, OutputError
@@ -46,6 +46,8 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
         radiance, space = cloud.radiance, cloud.radiance_color_space
     arrays = _arrays(cloud, resize_bands(radiance, options.sh_degree), space, materials)
     said: dict[str, Any] = {"radiance_meaning": meaning, "frames_per_second": frame.frames_per_second}
+    if cloud.axes != AXES:
+        said["axes"] = cloud.axes
     if frame.raster is not None:
         said["raster"] = list(frame.raster)
     document = _document(arrays, {"beam": said}, space)

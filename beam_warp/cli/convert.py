@@ -17,6 +17,7 @@ from beam_warp.cli.common.console import escaped, options_named, print_json, pri
 from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.converters.formats import FORMATS, format_of
+from beam_warp.converters.frame_files import written_axes
 from beam_warp.converters.importers import IMPORTERS
 from beam_warp.converters.numbering import numbered_path
 from beam_warp.converters.options import Activation, MaterialActivation, Profile
@@ -144,6 +145,9 @@ def convert(command: ConvertCommand) -> int:
         and first.base_color is not None
     ):
         notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
+    axes = written_axes(command.output, options, form)
+    if form.axes is not None and axes != form.axes:
+        notes.append(f"{form.name} means {form.axes}; this file is in {axes} and states it, which few readers heed")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
