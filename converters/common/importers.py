@@ -34,7 +34,7 @@ class Importer:
 
     name: str
     axes: str = RDF
-    other_axes: Mapping[str, str] = field(default_factory=dict)
+    other_axes: Mapping[str, str] = field(default_factory=dict, hash=False)
     units_per_meter: float = 1.0
     sh_degrees: tuple[int, int] = (0, 3)
     suffixes: tuple[str, ...]
