@@ -96,7 +96,7 @@ IMPORTERS: dict[str, Importer] = {
         name="SuperSplat",
         suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
         to_do="Nothing.",
-        evidence="source, cc6e86a: every file is turned by 180° about z when it is loaded, SPZ too",
+        evidence="source, cc6e86a, and pull request 885: a file is turned by 180° about z when it is loaded, SPZ too",
     ),
     "playcanvas": Importer(
         name="PlayCanvas 2.23",

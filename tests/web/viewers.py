@@ -111,7 +111,7 @@ VIEWERS = {
             "babylonjs",
             "babylon.html",
             "babylon",
-            Placement("ruf"),  # the loader flips y by itself, into a left-handed world
+            Placement("ruf"),  # the loader flips y by itself, of a GLB x, into a left-handed world
             colors_wrong=frozenset({".sog"}),
         ),
     )
