@@ -89,9 +89,10 @@ def require_output(path: Path, options: WriteOptions = WriteOptions()) -> None: 
         )
     if options.target is not None:
         IMPORTERS[options.target].require_reads(path, suffix_of(path.name))
-    if form.axes is not None and options.axes not in (None, form.axes):
+    if options.axes and form.axes_to_write and options.axes not in form.axes_to_write:
+        allowed = " or ".join(form.axes_to_write)
         raise InvalidOptionError(
-            f"axes must be {form.axes} for {form.name}, which fixes them, got {options.axes}. Leave them out."
+            f"axes must be {allowed} for {form.name}, which fixes them, got {options.axes}. Leave them out."
         )
     require_writable(path, is_made=True)
 

@@ -1,6 +1,7 @@
 """Zipped frames: an archive of numbered files in any format that keeps one frame a file, or of one such file.
 
-A frame is unpacked when it is asked for, under its own name in a temporary folder, and removed after it was read.
+A frame is unpacked when it is asked for, under its own name in a temporary folder, and removed after it was read. With
+``walk0.gltf`` comes ``walk0.bin`` from the same folder of the archive, which holds its arrays.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ import shutil
 import struct
 import zipfile
 import zlib
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
@@ -44,10 +47,10 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
     if len(entries) > MAX_ENTRIES:
         raise _malformed(path, f"must hold at most {MAX_ENTRIES} files", f"{len(entries)}")
     files = {Path(entry.filename): entry for entry in entries if _is_shown(entry)}
-    frames = [files[name] for name in _frames(path, files)]
-    for entry in frames:
+    frames = [[files[name] for name in (frame, *_beside(frame)) if name in files] for frame in _frames(path, files)]
+    for entry in chain(*frames):
         _require_safe(path, entry)
-    names = [f"{path.name}: {entry.filename}" for entry in frames]
+    names = [f"{path.name}: {entry.filename}" for entry, *_ in frames]
     return sequence_of(path.name, names, lambda frame: _decoded(path, frames[frame], options), options)
 
 
@@ -63,10 +66,14 @@ def _is_shown(entry: zipfile.ZipInfo) -> bool:
 
 
 def _frames(path: Path, files: dict[Path, zipfile.ZipInfo]) -> list[Path]:
-    """Return the frames in order; an archive of one file needs no number."""
-    if len(files) == 1 and holds_a_frame(next(iter(files)).name):
-        return list(files)
-    return in_order(files, path.name)
+    """Return the frames in order; one alone needs no number."""
+    found = [name for name in files if holds_a_frame(name.name)]
+    return found if len(found) == 1 else in_order(files, path.name)
+
+
+def _beside(frame: Path) -> list[Path]:
+    """Return the files that a frame needs beside itself."""
+    return [frame.with_suffix(".bin")] if frame.suffix.lower() == ".gltf" else []
 
 
 def _require_safe(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -81,13 +88,14 @@ def _require_safe(path: Path, entry: zipfile.ZipInfo) -> None:
         raise _malformed(path, f"must unpack to at most {MAX_RATIO} × its size", f"{entry.filename!r} of {got}")
 
 
-def _decoded(path: Path, entry: zipfile.ZipInfo, options: ReadOptions) -> DecodedFrame:
-    """Unpack a frame and read it."""
+def _decoded(path: Path, entries: Sequence[zipfile.ZipInfo], options: ReadOptions) -> DecodedFrame:
+    """Unpack the files of a frame and read the first of them."""
     with TemporaryDirectory(prefix="beam_warp_") as folder:
-        place = Path(folder) / PurePosixPath(entry.filename).name
-        try:
-            with open_zip(path, MANY_FILES) as archive, archive.open(entry) as source, place.open("wb") as target:
-                shutil.copyfileobj(source, target, 1 << 20)
-        except _BROKEN as error:
-            raise _malformed(path, "must hold whole files", f"{entry.filename!r} ({error})") from error
-        return formats.decode(place, options)
+        places = [Path(folder) / PurePosixPath(entry.filename).name for entry in entries]
+        for entry, place in zip(entries, places, strict=True):
+            try:
+                with open_zip(path, MANY_FILES) as archive, archive.open(entry) as source, place.open("wb") as target:
+                    shutil.copyfileobj(source, target, 1 << 20)
+            except _BROKEN as error:
+                raise _malformed(path, "must hold whole files", f"{entry.filename!r} ({error})") from error
+        return formats.decode(places[0], options)

@@ -21,6 +21,7 @@ from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
 from beam_warp.converters.formats import FORMATS, format_of
+from beam_warp.converters.frame_files import written_axes
 from beam_warp.converters.numbering import holds_a_frame, numbered_path
 from beam_warp.errors import InvalidOptionError
 from beam_warp.outputs import require_apart
@@ -147,6 +148,9 @@ def convert(command: ConvertCommand) -> int:
         and first.base_color is not None
     ):
         notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
+    axes = written_axes(command.output, options, form)
+    if form.axes is not None and axes != form.axes:
+        notes.append(f"{form.name} means {form.axes}; this file is in {axes} and states it, which few readers heed")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started

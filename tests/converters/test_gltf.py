@@ -220,6 +220,8 @@ def test_colour_that_is_linear(make_cloud, tmp_path):
 
 def test_a_file_of_splat_transform():
     cloud = converters.read(FOREIGN / "cloud.ply")[0]
+    (note,) = notes_of(converters.read(FOREIGN / "splat_transform.glb"))
+    assert note == "splat-transform turns its input by 180° about z: pass --source-axes luf to undo it"
     sequence = converters.read(FOREIGN / "splat_transform.glb", source_axes="luf")
     back = change_axes(sequence[0], "rdf")
     assert sequence.metadata["producer"] == "splat-transform 3.7.0 (asset.generator)"
