@@ -31,6 +31,7 @@ class Format:
         reader: Module of this package that reads it; None if it is only written.
         writer: Module of this package that writes it; None if it is only read.
         holds_sequences: True if one file holds all frames.
+        is_index: True if the file describes one frame whose Gaussians lie in files beside it or in folders there.
         axes: Axes that the format fixes, for the writer; None if a file may have any.
         keeps_axes: True if a file states its axes and no viewer reads it, so that it is written in those of the cloud.
         read_options: Options of `ReadOptions` that mean something for it.
@@ -40,6 +41,7 @@ class Format:
     reader: str | None = None
     writer: str | None = None
     holds_sequences: bool = False
+    is_index: bool = False
     axes: str | None = None
     keeps_axes: bool = False
     read_options: frozenset[str] = OF_ANY_FORMAT
@@ -88,10 +90,10 @@ FORMATS: dict[str, Format] = {
     ".spz": Format(name="SPZ", reader="spz", writer="spz", axes="rub"),
     **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf", writer="gltf_writer", axes="rub")),
     ".sog": Format(name="SOG", reader="sog", writer="sog_writer"),
-    "meta.json": Format(name="SOG", reader="sog"),
-    "lod-meta.json": Format(name="streamed SOG", reader="sog_streamed"),
-    ".lcc": Format(name="LCC", reader="lcc"),
-    ".lcc2": Format(name="LCC2", reader="lcc2"),
+    "meta.json": Format(name="SOG", reader="sog", writer="sog_writer", is_index=True),
+    "lod-meta.json": Format(name="streamed SOG", reader="sog_streamed", writer="sog_streamed_writer", is_index=True),
+    ".lcc": Format(name="LCC", reader="lcc", is_index=True),
+    ".lcc2": Format(name="LCC2", reader="lcc2", is_index=True),
     ".splat": Format(name="splat", reader="splat", writer="splat"),
     ".ksplat": Format(name="ksplat", reader="ksplat"),
     ".npz": Format(name="NumPy", reader="arrays", writer="arrays", keeps_axes=True),

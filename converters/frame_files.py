@@ -11,6 +11,7 @@ from beam_warp.converters.formats import Format
 from beam_warp.converters.importers import IMPORTERS, RDF
 from beam_warp.converters.numbering import numbered_path
 from beam_warp.converters.options import WriteOptions
+from beam_warp.converters.staging import folders_made
 from beam_warp.image.files import replacing
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -29,6 +30,7 @@ class FrameToWrite:
         units_per_meter: Units of the file in a metre.
         raster: How splats are to be drawn: antialiased or not, and the low-pass [px²]; None if that is not stated.
         beside: Returns the temporary place of another file, which appears under the given name together with this one.
+            A name may have folders in it, which are made.
     """
 
     name: str
@@ -65,7 +67,8 @@ def write_frames(sequence: GaussianSequence, path: Path, options: WriteOptions, 
     with ExitStack() as outputs:
 
         def beside(name: str) -> Path:
-            others.append(path.with_name(name))
+            others.append(path.parent / name)
+            outputs.enter_context(folders_made(others[-1].parent))
             return outputs.enter_context(replacing(others[-1]))
 
         for number, final in enumerate(paths):

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.activations import color_to_dc
+from beam_warp.converters.activations import dc_from_color
 from beam_warp.converters.frames import DecodedFrame
 from beam_warp.converters.levels import Index
 from beam_warp.converters.options import ReadOptions
@@ -151,7 +151,7 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     rows = _rows(header, "data.bin", 1, _GAUSSIAN)
     smaller = np.stack([rows["rotation"] >> np.uint32(10 * place) & np.uint32(1023) for place in range(3)], axis=1)
     radiance = np.empty((len(rows), 1 if header.bands is None else 1 + _BANDS, 3), np.float32)
-    radiance[:, 0] = color_to_dc(rows["color"][:, :3] / 255.0)
+    radiance[:, 0] = dc_from_color(rows["color"][:, :3] / 255.0)
     if header.bands is not None:
         words = _rows(header, "shcoef.bin", 2, np.dtype(("<u4", _BAND_WORDS)))
         for channel, (shift, bits) in enumerate(((0, 11), (11, 10), (21, 11))):

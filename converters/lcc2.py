@@ -53,12 +53,18 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     return joined(
         index,
         leaves.items(),
-        lambda file: replace(formats.decode(file, options), meters_per_unit=1.0),
+        lambda file: _without_axes(formats.decode(file, options)),
         format=f"LCC2 of {next(iter(leaves)).suffix} files ({ATTRIBUTION})",
         producer="XGRIDS, by its format",
         axes=AXES,
         notes=notes,
     )
+
+
+def _without_axes(frame: DecodedFrame) -> DecodedFrame:
+    """Leave out what is usual for files of a kind, and what their reader notes of it: the scene has its own axes."""
+    notes = tuple(note for note in frame.notes if not note.startswith("axes "))
+    return replace(frame, notes=notes, meters_per_unit=1.0)
 
 
 def _leaves(index: Index) -> dict[Path, Runs]:
