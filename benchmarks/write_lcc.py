@@ -78,7 +78,11 @@ def write_lcc(cloud: GaussianCloud, path: Path) -> None:
     contents["Environment.bin"] = data[:1].tobytes() + shcoef[:1].tobytes()
     for name, content in contents.items():
         (path.parent / name.lower()).write_bytes(content)
-    attributes = {"position": (cloud.positions.min(axis=0), cloud.positions.max(axis=0)), "scale": bounds, "shcoef": bands}
+    attributes = {
+        "position": (cloud.positions.min(axis=0), cloud.positions.max(axis=0)),
+        "scale": bounds,
+        "shcoef": bands,
+    }
     meta = {
         "version": "5.0",
         "totalSplats": len(rows),
@@ -117,7 +121,11 @@ def write_lcc2(cloud: GaussianCloud, path: Path, kind: str, write: Callable[[Gau
         half, fine = len(rows) // 2, 2 * number
         runs = [(0, half), (half, len(rows) - half)]
         leaves = [
-            {"id": f"0-{number}-{place}", "childNum": 0, "data": {"3dgs": {"name": fine, "start": first, "count": count}}}
+            {
+                "id": f"0-{number}-{place}",
+                "childNum": 0,
+                "data": {"3dgs": {"name": fine, "start": first, "count": count}},
+            }
             for place, (first, count) in enumerate(runs)
         ]
         coarse = {"name": fine + 1, "start": 0, "count": len(rows[::COARSER])}

@@ -24,11 +24,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.activations import dc_from_color
-from beam_warp.converters.frames import DecodedFrame
-from beam_warp.converters.levels import Index
-from beam_warp.converters.options import ReadOptions
-from beam_warp.converters.rotations import SMALLER_LIMIT, from_smaller
+from beam_warp.converters.common.activations import dc_from_color
+from beam_warp.converters.common.frames import DecodedFrame
+from beam_warp.converters.common.levels import Index
+from beam_warp.converters.common.options import ReadOptions
+from beam_warp.converters.common.rotations import SMALLER_LIMIT, from_smaller
 from beam_warp.errors import MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB
 
@@ -81,7 +81,9 @@ def probe(path: Path) -> LccHeader:
     attributes = index.content.get("attributes")
     if not isinstance(attributes, list):
         raise index.error("attributes must be a list", attributes)
-    named = {each.get("name"): each for each in attributes if isinstance(each, dict) and isinstance(each.get("name"), str)}
+    named = {
+        each.get("name"): each for each in attributes if isinstance(each, dict) and isinstance(each.get("name"), str)
+    }
     has_bands = kind == "Quality" or (kind is None and "shcoef" in named)
     header = LccHeader(
         index=index,

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from beam_warp.converters import formats
-from beam_warp.converters.frames import DecodedFrame
+from beam_warp.converters.common.frames import DecodedFrame
+from beam_warp.converters.common.levels import Index, Runs, joined
+from beam_warp.converters.common.options import ReadOptions
 from beam_warp.converters.lcc import ATTRIBUTION, AXES
-from beam_warp.converters.levels import Index, Runs, joined
-from beam_warp.converters.options import ReadOptions
 
 _KINDS = (".sog", ".spz", ".ply")
 
