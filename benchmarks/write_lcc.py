@@ -78,11 +78,7 @@ def write_lcc(cloud: GaussianCloud, path: Path) -> None:
     contents["Environment.bin"] = data[:1].tobytes() + shcoef[:1].tobytes()
     for name, content in contents.items():
         (path.parent / name.lower()).write_bytes(content)
-    attributes = {
-        "position": (cloud.positions.min(axis=0), cloud.positions.max(axis=0)),
-        "scale": bounds,
-        "shcoef": bands,
-    }
+    attributes = {"scale": bounds, "shcoef": bands}
     meta = {
         "version": "5.0",
         "totalSplats": len(rows),

@@ -93,8 +93,8 @@ def in_order(files: Iterable[Path], folder: str) -> list[Path]:
     found = [(match, path) for path in files if (match := _frame_of(path))]
     if not found:
         raise AssetFormatError(
-            f"{folder} must hold {ASSET_NAME}, {SOG_NAMES[1]} or numbered files (walk000000.ply, walk000001.ply, …), got "
-            "none. Pass a file, or another folder."
+            f"{folder} must hold {ASSET_NAME}, {SOG_NAMES[1]} or numbered files (walk000000.ply, walk000001.ply, …), "
+            "got none. Pass a file, or another folder."
         )
     prefixes = sorted({match["prefix"] for match, _ in found})
     if len(prefixes) > 1:
