@@ -83,8 +83,8 @@ def sog_of(
     order = np.argsort(keys, kind="stable") if runs is None else np.lexsort((keys, runs))
     textures, meta = _textures(cloud, radiance, codes, log_bounds, order)
     meta["beam"] = {"axes": cloud.axes, "framesPerSecond": frame.frames_per_second, "radianceMeaning": meaning}
-    if frame.raster is not None and frame.raster[0]:
-        meta["model"] = "antialiased"
+    if frame.model is not None:
+        meta["model"] = frame.model
     return meta, textures
 
 
