@@ -107,7 +107,7 @@ def write_lcc2(cloud: GaussianCloud, path: Path, kind: str, write: Callable[[Gau
         write: Writes Gaussians in that order to such a file; SOG has an order of its own.
     """
     folder = path.parent / "data" / "3dgs"
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     names, children = list[str](), dict[str, object]()
     for number, rows in enumerate(regions(cloud)):
         files = {f"{number}_0": rows, f"{number}_1": rows[::COARSER]}

@@ -81,9 +81,7 @@ def probe(path: Path) -> LccHeader:
     attributes = index.content.get("attributes")
     if not isinstance(attributes, list):
         raise index.error("attributes must be a list", attributes)
-    named = {
-        each.get("name"): each for each in attributes if isinstance(each, dict) and isinstance(each.get("name"), str)
-    }
+    named = {str(each.get("name")): each for each in attributes if isinstance(each, dict)}
     has_bands = kind == "Quality" or (kind is None and "shcoef" in named)
     header = LccHeader(
         index=index,

@@ -52,7 +52,7 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
         notes.append("its background, data.env, is left out")
     return joined(
         index,
-        leaves.items(),
+        leaves,
         lambda file: _without_axes(formats.decode(file, options)),
         format=f"LCC2 of {next(iter(leaves)).suffix} files ({ATTRIBUTION})",
         producer="XGRIDS, by its format",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,6 +22,12 @@ MAX_INDEX_BYTES = 2**26
 
 _MOST_VALUES = 2**20
 """Values in an index, which take up to a hundred bytes of memory each: some 50,000 regions."""
+
+FREE_COUNT = 2**20
+"""Gaussians that the files of a scene may have together, however small they are."""
+
+COUNT_PER_BYTE = 4
+"""Gaussians that they may have beyond for every byte; those of real scenes have 5 bytes or more each."""
 
 _COMMA_TOO_MANY = re.compile(r'("(?:[^"\\]|\\.)*"?)|,(?=\s*[}\]])', re.DOTALL)
 
@@ -144,7 +150,7 @@ class Runs:
 
 
 def joined(
-    index: Index, runs: Iterable[tuple[Path, Runs]], decode: Callable[[Path], DecodedFrame], **stated: Any
+    index: Index, runs: Mapping[Path, Runs], decode: Callable[[Path], DecodedFrame], **stated: Any
 ) -> DecodedFrame:
     """Read runs of Gaussians from files of one kind, and put them behind one another.
 
@@ -153,24 +159,36 @@ def joined(
 
     Args:
         index: For errors.
-        runs: Every file with its runs.
+        runs: The runs of every file.
         decode: Reads a whole file.
         stated: What the index states instead: attributes of a `DecodedFrame`.
 
     Raises:
-        AssetFormatError: Runs overlap or end beyond their file, or a file is malformed.
+        AssetFormatError: Runs overlap or end beyond their file, or a file is malformed, or files hold far more
+            Gaussians than their bytes can.
     """
     frames, parts = list[DecodedFrame](), list[dict[str, Any]]()
-    for file, wanted in runs:
+    most = FREE_COUNT + COUNT_PER_BYTE * sum(map(_bytes, runs))
+    for file, wanted in runs.items():
         frame = decode(file)
+        count = len(frame.fields["positions"])
+        most -= count
+        if most < 0:
+            raise index.error(f"files must hold at most {COUNT_PER_BYTE} Gaussians a byte", f"{count} in {file.name}")
         try:
-            rows = wanted.rows(len(frame.fields["positions"]))
+            rows = wanted.rows(count)
         except ValueError as error:
             raise index.error(f"runs in {file.name} must lie beside each other", str(error)) from error
         frames.append(replace(frame, fields={}))
         parts.append({name: _taken(value, rows) for name, value in frame.fields.items()})
     notes = dict.fromkeys([*stated.pop("notes", ()), *(note for frame in frames for note in frame.notes)])
     return replace(frames[0], fields=_concatenated(index, parts), notes=tuple(notes), **stated)
+
+
+def _bytes(file: Path) -> int:
+    """Return the bytes of a file; of one that describes others, those of all files in its folder."""
+    files = file.parent.iterdir() if file.suffix == ".json" else [file]
+    return sum(each.stat().st_size for each in files if each.is_file())
 
 
 def _taken(value: Any, rows: list[slice]) -> Any:

@@ -48,7 +48,7 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
         notes.append("environment, its background, is left out")
     decoded = joined(
         index,
-        runs.items(),
+        runs,
         lambda file: reader.decode(file, options),
         format=f"streamed SOG, {len(runs)} files at level 0",
         notes=notes,

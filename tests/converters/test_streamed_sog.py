@@ -12,6 +12,7 @@ from PIL import Image
 
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
+from beam_warp.converters.common import levels
 from beam_warp.converters.sog import streamed_writer
 from beam_warp.converters.sog.streamed_writer import coarser_levels, level_count
 from beam_warp.errors import BeamError, InvalidOptionError
@@ -180,6 +181,13 @@ def spoiled(scene, tmp_path, change):
 
 def leaf(index):
     return leaves(index)[0]["lods"]["0"]
+
+
+def test_small_files_may_not_hold_much(scene, monkeypatch):
+    monkeypatch.setattr(levels, "FREE_COUNT", 100)
+    monkeypatch.setattr(levels, "COUNT_PER_BYTE", 0)
+    with pytest.raises(BeamError, match="files must hold at most 0 Gaussians a byte, got '[0-9]+ in meta.json'"):
+        converters.read(scene[1])
 
 
 def test_what_other_programs_may_say(scene, tmp_path):
