@@ -362,7 +362,7 @@ def lcc2(folder: Path) -> Path:
 LEVELS: dict[str, Reader] = {
     "streamed sog": Reader(
         streamed_sog,
-        _frames,
+        read_frames,
         "splats",
         {
             "another version": (b'"version":1', b'"version":2'),
@@ -375,7 +375,7 @@ LEVELS: dict[str, Reader] = {
     ),
     "lcc": Reader(
         lcc,
-        _frames,
+        read_frames,
         "splats",
         {"levels that are not there": (b'"totalLevel": 2', b'"totalLevel": 1')},
         is_json=True,
@@ -383,7 +383,7 @@ LEVELS: dict[str, Reader] = {
     ),
     "lcc2": Reader(
         lcc2,
-        _frames,
+        read_frames,
         "splats",
         {
             "a file elsewhere": (b'"a.ply"', b'"../a.ply"'),
