@@ -227,7 +227,8 @@ class _Shot:
 def _layers(record: CaptureRecord) -> NDArray[np.float64]:
     """Return a record's premultiplied colour and coverage, ``(H, W, 4)``."""
     view = record.view()
-    return np.dstack([view.color, np.ones(view.color.shape[:2]) if view.alpha is None else view.alpha])
+    alpha = np.ones(view.color.shape[:2]) if view.alpha is None else view.alpha
+    return np.dstack([view.color, alpha]).astype(np.float64)
 
 
 def _white(records: Collection[CaptureRecord], flaws: Collection[str], size: float, gain: float) -> float:
