@@ -39,8 +39,8 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.demo.lights import sunset
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import BeamError
-from beam_warp.evaluate.asset import evaluate_asset
-from beam_warp.evaluate.materials import EvaluateOptions
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
+from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
@@ -112,7 +112,7 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     evaluated = time.perf_counter()
     sequence = in_units_of(converters.read(out / "asset.usda"), copy.white)
     options = EvaluateOptions(scaled_relighting=True, device=arguments.device)
-    row["scores"] = scores(evaluate_asset(sequence, clean, options).scores.as_dict())
+    row["scores"] = scores(score_materials(sequence, clean, options, metrics=PerceptualMetrics()).as_dict())
     row["errors"] = stated_errors(sequence, clean, frames[0], arguments.device)
     row["seconds"]["evaluate"] = time.perf_counter() - evaluated
     return row

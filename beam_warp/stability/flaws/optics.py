@@ -18,7 +18,7 @@ from scipy.special import j1
 from beam_warp.capture.lenses import Lens
 from beam_warp.world.camera import Camera
 
-Transfer: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+Transfer: TypeAlias = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]
 """Spectrum of a kernel over the frequencies along x and y [1/pixel]."""
 
 MARGIN = 16
@@ -52,7 +52,7 @@ def defocused(layers: NDArray[np.float64], diameter: float) -> NDArray[np.float6
     Source: Fourier transform of a disc, 2 J1(s) / s (Goodman, Introduction to Fourier Optics).
     """
 
-    def disc(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def disc(u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.floating]:
         s = np.maximum(np.pi * diameter * np.hypot(u, v), 1e-9)
         return 2.0 * j1(s) / s
 
