@@ -99,3 +99,14 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     assert {len(cells) for cells in body} == {len(head)}
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["wrongly: few-cameras", "masks in 1 of 2 runs", ""]
+
+
+def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
+    asked = argparse.Namespace(frames=1, gaussians=300, preset="draft", device="cpu")
+    row = benchmark.measure(tiny_capture, "noise", 1.0, 0, asked, tmp_path)
+    assert row["gaussians"] <= 300
+    assert row["named"] == {"noise": False}
+    assert row["scores"]["novel_view"]["psnr"] > 15.0  # in the clean capture's units, or it would be dim
+    assert 0.0 < row["errors"]["base_color"]["within_1"] <= row["errors"]["base_color"]["within_2"] <= 1.0
+    assert row["recovered"]["light_stops_injected"] == 0.0
+    json.dumps(row)
