@@ -45,7 +45,7 @@ FIELDS = ("fps", "duration", "assets", "meshes", "lights", "environment", "camer
 _PLACE = ("translate", "rotate", "scale")
 
 ASSET_FIELDS = (
-    *("path", "name", "source_axes", "drop_invalid", *_PLACE),
+    *("path", "name", "source_axes", "meters_per_unit", "drop_invalid", *_PLACE),
     *("on_ground", "centered", "start", "speed", "loop", "blend"),
 )
 
@@ -95,13 +95,20 @@ def read_stage_file(path: Path) -> dict[str, Any]:
 
 
 def read_stage_asset(
-    path: Path, *, source_axes: str | None = None, drop_invalid: bool = False, name: str | None = None, **place: Any
+    path: Path,
+    *,
+    source_axes: str | None = None,
+    meters_per_unit: float | None = None,
+    drop_invalid: bool = False,
+    name: str | None = None,
+    **place: Any,
 ) -> StageAsset:
     """Read an asset and put it on a stage.
 
     Args:
         path: A file or folder of Gaussians, as `beam_warp.converters.read` takes it.
         source_axes: Axes of the file; None takes its word.
+        meters_per_unit: Length of the file's unit [m]; None takes its word.
         drop_invalid: Leave out rows that are no Gaussians.
         name: Name of the asset in messages; the file's name if None.
         place: Further attributes of a `StageAsset`.
@@ -109,7 +116,9 @@ def read_stage_asset(
     Raises:
         BeamError: It cannot be read, or is not relightable.
     """
-    sequence = converters.read(path, source_axes=source_axes, drop_invalid=drop_invalid)
+    sequence = converters.read(
+        path, source_axes=source_axes, meters_per_unit=meters_per_unit, drop_invalid=drop_invalid
+    )
     return StageAsset(sequence=sequence, name=name or path.name, files=source_files(path), **place)
 
 
@@ -130,7 +139,7 @@ def _asset(record: Any, where: str, folder: Path) -> StageAsset:
     fields = Fields({"path": record} if isinstance(record, str) else record, where, ASSET_FIELDS)
     path = fields.path("path", folder, folders=True)
     options = fields.given(
-        **dict.fromkeys(("start", "speed"), "number"),
+        **dict.fromkeys(("start", "speed", "meters_per_unit"), "number"),
         **dict.fromkeys(("on_ground", "centered", "loop", "drop_invalid"), "flag"),
         **dict.fromkeys(("name", "blend", "source_axes"), "text"),
     )

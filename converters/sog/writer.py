@@ -27,6 +27,7 @@ from beam_warp.converters.sog.clustering import codebook, nearest_codes, palette
 from beam_warp.converters.sog.files import META
 from beam_warp.converters.sog.reader import COEFFICIENTS, LARGEST_AT_CODE, PALETTE_COLUMNS, PALETTE_LIMIT
 from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianCloud
 
 MAX_SIDE = 16_380
@@ -55,7 +56,7 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
     if radiance.shape[1] - 1 not in (0, *COEFFICIENTS.values()):
         raise InvalidOptionError("sh_degree must be at most 3 for SOG, got 4. Pass --sh-degree 3.")
     codes, log_bounds = _position_codes(cloud.positions)
-    order = np.argsort(_morton_keys(codes), kind="stable")
+    order = morton_order(codes)
     textures, meta = _textures(cloud, radiance, codes, log_bounds, order)
     meta["beam"] = {"axes": cloud.axes, "framesPerSecond": frame.frames_per_second, "radianceMeaning": meaning}
     if frame.raster is not None and frame.raster[0]:
@@ -110,14 +111,6 @@ def _position_codes(positions: NDArray[np.float32]) -> tuple[NDArray[np.uint16],
     bounds = np.stack([logs.min(axis=0), logs.max(axis=0)]) if len(logs) else np.zeros((2, 3))
     extent = bounds[1] - bounds[0]
     return np.rint((logs - bounds[0]) / np.where(extent > 0.0, extent, 1.0) * 65535.0).astype(np.uint16), bounds
-
-
-def _morton_keys(codes: NDArray[np.uint16]) -> NDArray[np.uint64]:
-    """Interleave the 16 bits of three axes."""
-    spread = codes.astype(np.uint64)
-    for shift, mask in ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249)):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
 
 
 def _rotation_codes(orientations: NDArray[np.float32]) -> NDArray[np.uint8]:
