@@ -46,7 +46,7 @@ FLAWS: Mapping[str, str] = {
     "exposure": "exposure up to 0.2 stop and white balance up to 5 % off, a camera",
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
-    "masks": "the same with masks one pixel too large in half of the cameras, too small in the others",
+    "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
     "poses": "poses off by 0.3 pixel of rotation and 1 mm",
     "light": "environment turned by 2° and 10 % too bright",
     "motion-blur": "the subject moves by a pixel while the shutter is open",
