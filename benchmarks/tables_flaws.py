@@ -66,9 +66,9 @@ def _quality(rows: Sequence[Row]) -> float:
 
 
 def _named(rows: Sequence[Row]) -> str:
-    """Return which flaws were named, and in how many runs, and what was said beside."""
+    """Return which flaws were named, and in how many runs, and the codes of other findings."""
     counts = {flaw: sum(row["named"][flaw] for row in rows) for flaw in rows[0]["named"]}
     runs = f" in {{}} of {len(rows)} runs" if len(rows) > 1 else ""
     named = [flaw + runs.format(count) for flaw, count in counts.items() if count]
-    beside = dict.fromkeys(words for row in rows for words in row["beside"])
-    return ", ".join([*named, *(f"wrongly: {words}" for words in beside)]) or ("" if not counts else "nothing")
+    beside = dict.fromkeys(words.partition(" ")[0] for row in rows for words in row["beside"])
+    return ", ".join([*named, *(f"also `{code}`" for code in beside)]) or ("" if not counts else "nothing")

@@ -93,12 +93,12 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
         case = {"capture": "walker", "flaw": flaw, "size": 1.0, "seed": seed}
         return {"case": case, "scores": {**images, **numbers}, "named": {}, "beside": [], **more}
 
-    rows = [row("noise", 29.0), row("clean", 30.0, beside=["few-cameras"])]
+    rows = [row("noise", 29.0), row("clean", 30.0, beside=["few-cameras in frame 0"])]
     rows += [row("masks", 20.0 + 2 * seed, seed, named={"masks": bool(seed)}) for seed in (0, 1)]
     head, *body = tables_flaws.flaws({"rows": rows})
     assert {len(cells) for cells in body} == {len(head)}
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
-    assert [cells[-1] for cells in body] == ["wrongly: few-cameras", "masks in 1 of 2 runs", ""]
+    assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
 
 
 def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
