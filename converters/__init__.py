@@ -118,6 +118,11 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
     with folders_made(final.parent):
         if form.holds_sequences:
             return form.of_writer("write")(sequence, final, options)
+        if len(sequence) > 1 and form.is_index:
+            raise InvalidOptionError(
+                f"output must have a file for each of {len(sequence)} frames, got {final.name}, which describes one "
+                "frame. Write .sog files, or frames to folders of their own."
+            )
         if len(sequence) > 1:
             require_no_stale_frames(final, len(sequence))
         return write_frames(sequence, final, options, form)

@@ -12,6 +12,7 @@ from beam_warp.converters.common.importers import IMPORTERS, RDF
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.formats import Format, suffix_of
 from beam_warp.converters.numbering import numbered_path
+from beam_warp.converters.staging import folders_made
 from beam_warp.image.files import replacing
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianSequence
@@ -52,7 +53,8 @@ def write_frames(sequence: GaussianSequence, path: Path, options: WriteOptions, 
     with ExitStack() as outputs:
 
         def beside(name: str) -> Path:
-            others.append(path.with_name(name))
+            others.append(path.parent / name)
+            outputs.enter_context(folders_made(others[-1].parent))
             return outputs.enter_context(replacing(others[-1]))
 
         for number, final in enumerate(paths):

@@ -8,7 +8,8 @@ from typing import Any
 
 from beam_warp import converters
 from beam_warp.checks import require_number
-from beam_warp.converters.numbering import SOG_NAME, files_at
+from beam_warp.converters.formats import format_of
+from beam_warp.converters.numbering import files_at
 from beam_warp.errors import AssetFormatError, SchemaVersionError
 from beam_warp.stage.assets import StageAsset, placement_of
 from beam_warp.stage.camera_paths import (
@@ -129,8 +130,8 @@ def source_files(path: Path) -> tuple[tuple[Path, ...], ...]:
         from beam_warp.schema.stage_queries import layer_files  # brings OpenUSD along
 
         return (tuple(layer_files(files[0])),)
-    if files[0].name == SOG_NAME:
-        return (tuple(sorted(file for file in files[0].parent.iterdir() if file.is_file())),)
+    if format_of(files[0]).is_index:
+        return (tuple(sorted(file for file in files[0].parent.rglob("*") if file.is_file())),)
     return tuple((file,) for file in files)
 
 

@@ -44,6 +44,8 @@ SCALAR_TYPES = {
 }
 """NumPy code of each type word, old or new."""
 
+_RENDER_MODE = re.compile(r"splatrendermode:?\s+(default|mip|2dgs)|antialiased\s+([01])")
+
 RASTER_WORDS = {False: "classic", True: "antialiased"}
 """First word of the comment ``beam_raster``, by whether splats are drawn antialiased."""
 
@@ -101,6 +103,18 @@ class PlyHeader:
         """Comments of the form ``beam_<key> <value>``, by which our own writer describes a file."""
         pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
         return {key: value.strip() for key, _, value in pairs}
+
+    @property
+    def render_mode(self) -> str:
+        """How the splats are to be drawn: ``default``, ``mip`` or ``2dgs``, by the last comment that says it.
+
+        Brush writes ``SplatRenderMode: mip``, and Postshot ``antialiased 1``.
+        """
+        mode = "default"
+        for comment in self.comments:
+            if said := _RENDER_MODE.fullmatch(comment.lower()):
+                mode = said[1] or ("mip" if said[2] == "1" else "default")
+        return mode
 
 
 def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:

@@ -8,6 +8,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import write_lcc
 from hostile.archives import ARCHIVES
 from hostile.splats import SPLATS, read_frames
 from hostile.ways import Reader
@@ -16,6 +17,7 @@ from support.drawn_ball import relightable
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame, write_frame
 from beam_warp.schema.reader import read_asset
@@ -333,3 +335,66 @@ READERS: dict[str, Reader] = {
     "stored frame": Reader(stored, read_frame, cuts=(0.0, 0.01, 0.1, 0.3)),
 }
 """Every reader of files that strangers made."""
+
+
+def streamed_sog(folder: Path) -> Path:
+    """A scene of one region."""
+    converters.write(_cloud(), folder / "lod-meta.json")
+    return folder / "lod-meta.json"
+
+
+def lcc(folder: Path) -> Path:
+    """A scene of four regions and two levels."""
+    radiance = {"radiance": np.zeros((3, 1, 3), np.float32), "radiance_color_space": DISPLAY_SRGB}
+    write_lcc.write_lcc(_cloud()[0].with_arrays(axes="rfu", **radiance), folder / "meta.lcc")
+    return folder / "meta.lcc"
+
+
+def lcc2(folder: Path) -> Path:
+    """A scene of one leaf."""
+    ply(folder)
+    leaf = {"childNum": 0, "data": {"3dgs": {"name": 0, "start": 0, "count": 2}}}
+    root = {"splatFiles": ["a.ply"], "childNum": 1, "child": {"0": leaf}}
+    (folder / "a.lcc2").write_text(json.dumps({"version": "0.0.3", "splatType": ".ply", "root": root}))
+    return folder / "a.lcc2"
+
+
+LEVELS: dict[str, Reader] = {
+    "streamed sog": Reader(
+        streamed_sog,
+        read_frames,
+        "splats",
+        {
+            "another version": (b'"version":1', b'"version":2'),
+            "a file elsewhere": (b"0_0/meta.json", b"../../a.json "),
+            "a file that is none": (b"0_0/meta.json", b"0_0/\\u001b[31m"),
+            "a run beyond the file": (b'"offset":0', b'"offset":9'),
+        },
+        is_json=True,
+        free=frozenset({"asset", "generator", "count", "bound", "min", "max"}),
+    ),
+    "lcc": Reader(
+        lcc,
+        read_frames,
+        "splats",
+        {"levels that are not there": (b'"totalLevel": 2', b'"totalLevel": 1')},
+        is_json=True,
+        free=frozenset({"version", "totalSplats", "indexDataSize", "offset", "epsg", "splats"}),
+    ),
+    "lcc2": Reader(
+        lcc2,
+        read_frames,
+        "splats",
+        {
+            "a file elsewhere": (b'"a.ply"', b'"../a.ply"'),
+            "a file of another kind": (b'"a.ply"', b'"a.lcc2"'),
+            "a run beyond the file": (b'"start": 0', b'"start": 9'),
+            "negative": (b'"count": 2', b'"count": -2'),
+        },
+        is_json=True,
+        free=frozenset({"version", "childNum"}),
+    ),
+}
+"""Readers of scenes with levels of detail."""
+
+READERS |= LEVELS

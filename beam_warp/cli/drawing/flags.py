@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, MetersPerUnit, Quiet, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
-from beam_warp.converters.numbering import SOG_NAME
+from beam_warp.converters.numbering import SOG_NAMES
 
 
 @dataclass(frozen=True)
@@ -233,4 +233,4 @@ class Render:
     def is_stage(self) -> bool:
         """Whether one stage is rendered, and not assets."""
         path = self.assets.asset[0]
-        return len(self.assets.asset) == 1 and path.suffix.lower() == ".json" and path.name != SOG_NAME
+        return len(self.assets.asset) == 1 and path.suffix.lower() == ".json" and path.name not in SOG_NAMES
