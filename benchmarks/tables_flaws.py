@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,25 +15,70 @@ TIMES = {0.5: "half of it", 1.0: "", 2.0: "twice that"}
 IMAGES = ("ambient_occlusion", "base_color_scaled", "relit_scaled", "novel_view")
 
 
+Key = tuple[str, str, float]
+"""Capture, name of the flaw, size."""
+
+
 @table("flaws", "flaws_cpu.json")
 def flaws(result: Row) -> Rows:
     """Return a row for every flaw and size of every capture, means over seeds: the clean ones first, then the worst."""
-    groups: dict[tuple[str, str, float], list[Row]] = {}
+    head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
+    head += ["normals", "depth [mm]", "roughness", "named"]
+    return [head, *(_cells(label, rows) for label, rows in _groups(result))]
+
+
+@table("flaws_recovered", "flaws_cpu.json")
+def recovered(result: Row) -> Rows:
+    """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
+    head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
+    head += ["base colour within 1, 2 stated errors", "roughness", "seconds"]
+    return [head, *(_recovered(label, rows) for label, rows in _groups(result))]
+
+
+def _groups(result: Row) -> Iterator[tuple[str, list[Row]]]:
+    """Yield the runs of each flaw under its words, in the order of the tables."""
+    groups: dict[Key, list[Row]] = {}
     for row in result["rows"]:
         case = row["case"]
         groups.setdefault((case["capture"], case["flaw"], case["size"]), []).append(row)
     captures = list(dict.fromkeys(capture for capture, *_ in groups))
-    ordered = sorted(groups, key=lambda key: (captures.index(key[0]), key[1] != "clean", _quality(groups[key])))
-    head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
-    head += ["normals", "depth [mm]", "roughness", "named"]
-    return [head, *(_cells(key, groups[key], len(captures) > 1) for key in ordered)]
+    for key in sorted(groups, key=lambda key: (captures.index(key[0]), key[1] != "clean", _quality(groups[key]))):
+        capture, name, size = key
+        words = WORDS.get(name) or "; ".join(FLAWS[part] for part in name.split("+"))
+        parts = [capture if len(captures) > 1 else "", words, TIMES.get(size, f"times {size:g}")]
+        yield ", ".join(filter(None, parts)), groups[key]
 
 
-def _cells(key: tuple[str, str, float], rows: Sequence[Row], several: bool) -> list[str]:
+def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
+    """Return the cells of a flaw in the second table."""
+    found = [row for row in rows if "scores" in row]
+    if not found:
+        return [label, *[""] * 7]
+    stops, spread = (_mean(found, "recovered", key) for key in ("light_stops", "exposure_spread"))
+    should, injected = (_mean(found, "recovered", f"{key}_injected") for key in ("light_stops", "exposure_spread"))
+
+    def within(name: str) -> str:
+        return ", ".join(f"{100 * _mean(found, 'errors', name, f'within_{count}'):.0f} %" for count in (1, 2))
+
+    exposures = [f"{spread:.2f}", f"{injected:.2f}"]
+    return [
+        label,
+        f"{stops:+.2f}",
+        f"{-should:+.2f}",
+        *exposures,
+        within("base_color"),
+        within("roughness"),
+        _time(found),
+    ]
+
+
+def _time(rows: Sequence[Row]) -> str:
+    """Return the mean seconds of the job."""
+    return f"{_mean(rows, 'seconds', 'run'):.0f}"
+
+
+def _cells(label: str, rows: Sequence[Row]) -> list[str]:
     """Return the cells of a flaw."""
-    capture, name, size = key
-    words = WORDS.get(name) or "; ".join(FLAWS[part] for part in name.split("+"))
-    label = ", ".join(filter(None, [capture if several else "", words, TIMES.get(size, f"times {size:g}")]))
     found = [row["scores"] for row in rows if "scores" in row]
     if not found:
         return [label, f"refused: {rows[0]['refused']}", *[""] * 8]

@@ -91,7 +91,11 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
         images = dict.fromkeys((*tables_flaws.IMAGES, "roughness"), score)
         numbers = {"base_color_scale": [1.0] * 3, "normals_median_degrees": 2.0, "depth_median_mm": 1.0}
         case = {"capture": "walker", "flaw": flaw, "size": 1.0, "seed": seed}
-        return {"case": case, "scores": {**images, **numbers}, "named": {}, "beside": [], **more}
+        stops = {"light_stops": 0.5, "light_stops_injected": 0.25}
+        found = {**stops, "exposure_spread": 0.1, "exposure_spread_injected": 0.2}
+        errors = {key: {"within_1": 0.6, "within_2": 0.9} for key in ("base_color", "roughness")}
+        said = {"recovered": found, "errors": errors, "seconds": {"run": 7.0}, "named": {}, "beside": [], **more}
+        return {"case": case, "scores": {**images, **numbers}, **said}
 
     rows = [row("noise", 29.0), row("clean", 30.0, beside=["few-cameras in frame 0"])]
     rows += [row("masks", 20.0 + 2 * seed, seed, named={"masks": bool(seed)}) for seed in (0, 1)]
@@ -99,6 +103,17 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     assert {len(cells) for cells in body} == {len(head)}
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
+    _, first, *_ = tables_flaws.recovered({"rows": rows})
+    assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", "60 %, 90 %", "60 %, 90 %", "7"]
+
+
+def test_what_was_refused_has_a_row():
+    case = {"capture": "walker", "flaw": "masks", "size": 2.0, "seed": 0}
+    rows = [{"case": case, "refused": "no", "named": {"masks": False}, "beside": []}]
+    for make in (tables_flaws.flaws, tables_flaws.recovered):
+        head, cells = make({"rows": rows})
+        assert len(cells) == len(head)
+        assert cells[0].endswith("twice that")
 
 
 def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
