@@ -143,14 +143,14 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the middle one [stop].
+    ``exposure_spread``: largest exposure of a camera over the middle one [stop]; 0 where none is known.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
     spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
     return {
         "light_stops": decomposition["exposure_stops"],
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
-        "exposure_spread": max(spreads, default=None),
+        "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
     }
 

@@ -60,21 +60,8 @@ def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
     def within(name: str) -> str:
         return ", ".join(f"{100 * _mean(found, 'errors', name, f'within_{count}'):.0f} %" for count in (1, 2))
 
-    exposures = [f"{spread:.2f}", f"{injected:.2f}"]
-    return [
-        label,
-        f"{stops:+.2f}",
-        f"{-should:+.2f}",
-        *exposures,
-        within("base_color"),
-        within("roughness"),
-        _time(found),
-    ]
-
-
-def _time(rows: Sequence[Row]) -> str:
-    """Return the mean seconds of the job."""
-    return f"{_mean(rows, 'seconds', 'run'):.0f}"
+    cells = [label, f"{stops:+.2f}", f"{0.0 - should:+.2f}", f"{spread:.2f}", f"{injected:.2f}"]
+    return [*cells, within("base_color"), within("roughness"), f"{_mean(found, 'seconds', 'run'):.0f}"]
 
 
 def _cells(label: str, rows: Sequence[Row]) -> list[str]:
