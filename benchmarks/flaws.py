@@ -99,7 +99,9 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     try:
         run_job(asked)
     except BeamError as error:
-        return {**row, "refused": str(error), **told(copy, name, [Finding("error", "refused", str(error))])}
+        said = str(error).replace(f"{folder}{os.sep}", "")
+        row["seconds"]["run"] = time.perf_counter() - written
+        return {**row, "refused": said, **told(copy, name, [Finding("error", "refused", said)])}
     row["seconds"]["run"] = time.perf_counter() - written
     reconstruction, decomposition = (
         json.loads((place / "report.json").read_text()) for place in (out / "reconstruction", out)

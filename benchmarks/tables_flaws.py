@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -68,7 +69,7 @@ def _cells(label: str, rows: Sequence[Row]) -> list[str]:
     """Return the cells of a flaw."""
     found = [row["scores"] for row in rows if "scores" in row]
     if not found:
-        return [label, f"refused: {rows[0]['refused']}", *[""] * 8]
+        return [label, "refused: " + re.sub(r"/\S*/capture/", "capture/", rows[0]["refused"]), *[""] * 8]
 
     def image(channel: str) -> str:
         return f"{_mean(found, channel, 'psnr'):.1f} dB / {_mean(found, channel, 'ssim'):.3f}"
