@@ -19,6 +19,8 @@ from beam_warp.image.color import linear_to_srgb
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_fits import (
     EVEN,
+    LEAST_POINTS,
+    LEAST_VIEWS,
     LIGHT_COLUMNS,
     LightEvidence,
     LightFits,
@@ -28,16 +30,11 @@ from beam_warp.materials.light_fits import (
     turned_lights,
     well_shown,
 )
+from beam_warp.materials.light_turn import weaker_explains
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.environment import EnvironmentMap
-
-LEAST_POINTS = 64
-"""Fewest Gaussians that say anything about light."""
-
-LEAST_VIEWS = 4
-"""Fewest views: one side of a subject alone is explained by many lights."""
 
 MOST_VIEWS = 12
 """Views that gloss is looked at in: what more of them say costs more than it tells."""
@@ -189,7 +186,7 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
         exposure_stops=_exposure_stops(mean_colors(shown), irradiance_over_pi(shown, lights[best])),
         point_count=count,
     )
-    is_unlike = min(fits.clearly(EVEN, here), fits.clearly(EVEN, there)) > 1.0
+    is_unlike = all(fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, lights[way]) > 1.0 for way in (here, there))
     ways = [best] if fits.clearly(best, other) > 1.0 else [best, other]
     told = [f"{'mirrored and ' if way >= LIGHT_COLUMNS else ''}turned by {_refined(fits, way):+.0f}" for way in ways]
     return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
@@ -258,7 +255,7 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
 
     Args:
         check: What was found.
-        is_unlike: Whether an even light explains the capture better than any turn.
+        is_unlike: Whether a light of less contrast explains the capture better than any turn.
         told: The turns that explain it best, in words, without the unit of the last.
     """
     if is_unlike:
@@ -266,9 +263,9 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
             Finding(
                 "warning",
                 "environment-unexplained",
-                "environment does not explain the capture under any turn: a light that is the same from all sides "
-                f"explains it better, with a spread of base colours of {check.spread_even:.2f}, not "
-                f"{check.spread_best:.2f}",
+                "environment does not explain the capture under any turn: a light of less contrast explains it better, "
+                f"and one that is the same from all sides leaves a spread of base colours of {check.spread_even:.2f}, "
+                f"this one {check.spread_best:.2f}",
                 remedy="Check that it is the light of this capture.",
             )
         ]

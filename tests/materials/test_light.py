@@ -13,8 +13,8 @@ from beam_warp.demo.lights import demo_environments
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import linear_to_srgb, srgb_to_linear
 from beam_warp.materials.evidence import view_evidence
-from beam_warp.materials.light import LEAST_POINTS, check_light, judge_light, light_evidence, looks_like_ldr
-from beam_warp.materials.light_fits import LIGHT_COLUMNS, LIGHT_ROWS, LightEvidence
+from beam_warp.materials.light import check_light, judge_light, light_evidence, looks_like_ldr
+from beam_warp.materials.light_fits import LEAST_POINTS, LIGHT_COLUMNS, LIGHT_ROWS, LightEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.stability.material_cases import MaterialStudio
