@@ -26,6 +26,7 @@ class CaptureImages:
     Attributes:
         raster: How the Gaussians were drawn when they were fitted.
         is_stated: Whether the sequence states which frames of the capture it shows.
+        has_light: Whether the capture comes with its light, in the units of its images.
     """
 
     def __init__(self, capture: Capture, sequence: GaussianSequence) -> None:
@@ -36,6 +37,7 @@ class CaptureImages:
         """
         self.raster = RasterOptions.from_metadata(sequence.metadata)
         self.is_stated = stated_capture_frames(sequence.metadata, len(sequence)) is not None
+        self.has_light = capture.environment_path is not None
         self._records = {
             index: list(capture.select(split=SPLIT, frames={frame}))
             for index, frame in enumerate(matched_frames(sequence, capture, SPLIT))

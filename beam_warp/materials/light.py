@@ -36,6 +36,9 @@ from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.environment import EnvironmentMap
 
+ASKED = 1024
+"""Most Gaussians to ask, spread evenly over the cloud."""
+
 MOST_VIEWS = 12
 """Views that gloss is looked at in: what more of them say costs more than it tells."""
 
@@ -55,9 +58,10 @@ colour over those Gaussians."""
 TOO_BRIGHT = 1.1
 TOO_DARK = 0.05
 PLAUSIBLE = 0.7
+DARKEST = 0.04
 """Quantile `BRIGHT` above which light is stated too dim, `BRIGHTEST` below which too bright, and what the proposed
 exposure makes of the former. The former is 0.66 to 0.99 with the true light, on a figure in white clothes too; nothing
-but charcoal is below 0.05."""
+but charcoal is below 0.05. `DARKEST` is what the surface of a dielectric reflects, whatever is below it."""
 
 
 FEW_VALUES = 16
@@ -104,9 +108,15 @@ class LightCheck:
     point_count: int
     findings: tuple[Finding, ...] = ()
 
+    @property
+    def is_near(self) -> bool:
+        """Whether the light fits as it is or turned by a few degrees: it explains, and no other turn does better."""
+        codes = {finding.code for finding in self.findings}
+        return not codes & {"environment-black", "environment-turned", "environment-unexplained", "light-unchecked"}
+
 
 def check_light(
-    scene: Scene, points: SurfacePoints, views: ViewEvidence, environment: EnvironmentMap, *, subset: int = 1024
+    scene: Scene, points: SurfacePoints, views: ViewEvidence, environment: EnvironmentMap, *, subset: int = ASKED
 ) -> LightCheck:
     """Ask well-seen Gaussians whether an environment is the light that they were captured under.
 
@@ -127,7 +137,7 @@ def check_light(
     return judge_light(light_evidence(scene, points, views, subset), environment)
 
 
-def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, subset: int) -> LightEvidence:
+def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, subset: int = ASKED) -> LightEvidence:
     """Collect what well-seen Gaussians show, and towards which cells of the sphere they are open."""
     good = views.seen & (views.weight > WELL_SEEN) & (points.confidence > AGREEMENT) & (views.saturated < UNCUT)
     rows = np.flatnonzero(good)
@@ -192,6 +202,24 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
     return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
 
 
+def possible_scales(evidence: LightEvidence, environment: EnvironmentMap) -> tuple[float, float]:
+    """Return the least and the largest factor that all base colours could have under a light of another scale.
+
+    Nothing reflects more than it gets, and a dielectric reflects no less than `DARKEST` of it. Only this bounds the
+    scale of a light: highlights, which do not depend on base colour, would tell it, but how bright they are depends on
+    roughness and on normals far more than a light that was measured is off.
+
+    Returns:
+        Factors by which base colours under this light may be multiplied; NaN where too little is seen.
+    """
+    shown = well_shown(evidence)
+    if len(shown.normals) < LEAST_POINTS:
+        return float("nan"), float("nan")
+    base = _lit_colors(mean_colors(shown), irradiance_over_pi(shown, turned_lights(environment)[0]))
+    darkest, brightest = np.quantile(base.max(axis=1), (1.0 - BRIGHTEST, BRIGHTEST))
+    return float(DARKEST / max(darkest, 1e-9)), float(1.0 / max(brightest, 1e-9))
+
+
 def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
     """Detect a display-referred picture that was given as light: cut at white, or from 8 bits whatever its scale.
 
@@ -239,15 +267,20 @@ def _refined(fits: LightFits, best: int) -> float:
 
 def _exposure_stops(colors: NDArray[np.float64], irradiance: NDArray[np.float32]) -> float:
     """Return the exposure of the light that makes base colours plausible [stops]."""
-    mean = irradiance.mean(axis=1)
-    lit = mean > WELL_LIT * mean.mean()
-    if not lit.any():
+    base = _lit_colors(colors, irradiance).max(axis=1)
+    if not len(base):
         return 0.0
-    base = (colors[lit] / np.maximum(irradiance[lit], 1e-12)).max(axis=1)
     bright, brightest = (max(float(value), 1e-9) for value in np.quantile(base, (BRIGHT, BRIGHTEST)))
     if bright > TOO_BRIGHT:
         return float(np.log2(bright / PLAUSIBLE))
     return float(np.log2(brightest / PLAUSIBLE)) if brightest < TOO_DARK else 0.0
+
+
+def _lit_colors(colors: NDArray[np.float64], irradiance: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return base colours of the points that get at least `WELL_LIT` of the mean light, ``(M, 3)``."""
+    mean = irradiance.mean(axis=1)
+    lit = mean > WELL_LIT * mean.mean()
+    return colors[lit] / np.maximum(irradiance[lit], 1e-12)
 
 
 def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:

@@ -1,10 +1,10 @@
 """Fine questions to shading: by which small turn a stated light fits best, and whether it fits at all.
 
 Under the right light, observed colours divided by irradiance are base colours, in which most neighbours are alike. The
-light is turned about the up axis by small steps, and the least misfit found by a parabola; the standard error comes from leaving out one
-part of the surface after the other. What hides the sky sends light itself: without this bounce the turn of a walking
-figure is off by two to four degrees, because the sides of its limbs that face each other are brighter than the sky
-alone makes them.
+light is turned about the up axis by small steps, and the least misfit found by a parabola; the standard error comes
+from leaving out one part of the surface after the other. What hides the sky sends light itself: without this bounce
+the turn of a walking figure is off by two to four degrees, because the sides of its limbs that face each other are
+brighter than the sky alone makes them.
 
 Changes from view to view tell the turn of the same figures three times less well than shading does, and are left out;
 tilts about level axes are as uncertain, and are not looked for.

@@ -376,7 +376,7 @@ class TestWithACapture:
         """
         assert not CaptureImages(capture, discs).is_display_referred(0)
         records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in capture.records)
-        display = replace(capture, records=records)
+        display = replace(capture, records=records, environment_path=None)
         images = CaptureImages(display, discs)
         assert images.ceiling(0, images.views(0)) == 1.0
         one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
