@@ -55,27 +55,35 @@ def test_a_small_turn_is_found(name, degrees):
     assert found.is_certain == (degrees != 0.0)
 
 
-def painted(seed):
-    """Base colours of another paint on the same ball, ``(M, 3)``."""
-    return Ball.of(count=800, seed=seed).base_color
-
-
-def test_the_standard_error_is_honest(monkeypatch):
-    """Over balls of other paint and noise, errors over standard errors are those of a normal distribution.
-
-    Normals are exact, so that the part for those that are not is left out.
-    """
-    monkeypatch.setattr(light_turn, "SYSTEMATIC", 0.0)
+def errors_over_standard_errors(paints):
+    """Of a light three degrees askew, on balls of several paints, ``(M, 3)`` each, with noise."""
     light = LIGHTS["stage"]
     white = replace(Ball.of(count=800, roughness=1.0), base_color=np.ones((800, 3))).evidence(light)
     scores = []
-    for seed in range(24):
-        evidence = noisy(replace(white, colors=white.colors * painted(seed).astype(np.float32)), seed)
+    for seed, paint in enumerate(paints):
+        evidence = noisy(replace(white, colors=white.colors * paint.astype(np.float32)), seed)
         found = find_turn(evidence, light.rotated(3.0))
         scores.append((found.degrees + 3.0) / found.standard_error)
+    return np.array(scores)
+
+
+def test_the_standard_error_is_honest(monkeypatch):
+    """Where paint differs from point to point, errors over standard errors are those of a normal distribution.
+
+    Normals are exact here, so that the part for those that are not is left out.
+    """
+    monkeypatch.setattr(light_turn, "SYSTEMATIC", 0.0)
+    rng = np.random.default_rng(0)
+    scores = errors_over_standard_errors([rng.uniform(0.3, 0.6, (800, 3)) for _ in range(24)])
     low, high = chi2.ppf((1e-3, 1.0 - 1e-3), len(scores))
     assert low < np.square(scores).sum() < high
     assert abs(np.mean(scores)) < 3.3 / np.sqrt(len(scores))
+
+
+def test_the_standard_error_is_not_too_small_in_large_patches():
+    """Patches larger than the parts that are left out say less than their number of points: still no false certainty."""
+    scores = errors_over_standard_errors([Ball.of(count=800, seed=seed).base_color for seed in range(12)])
+    assert np.square(scores).sum() < chi2.ppf(1.0 - 1e-3, len(scores))
 
 
 def test_light_from_other_surfaces_counts():
