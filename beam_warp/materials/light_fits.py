@@ -106,7 +106,7 @@ class LightFits:
         """Fit lights of ``(lights, L, 3)`` radiance to points that views show, at least `LEAST_IN_BLOCK` of them."""
         blocks = parts_of(shown.positions)
         apart, pairs = neighbor_differences(shown, _base_colors(shown, lights), blocks, NEIGHBORS)
-        sums = BlockSums(apart, pairs, *_glossy_sums(shown, lights, blocks))
+        sums = BlockSums(apart, pairs, *glossy_sums(shown, lights, blocks))
         left_out = np.stack([sums.misfits(without=block) for block in range(len(apart))])
         return cls(sums.spreads(), sums.gloss(), sums.misfits(), left_out)
 
@@ -252,12 +252,13 @@ def _mirrored(
     openness: NDArray[np.float32],
     directions: NDArray[np.float32],
     lights: NDArray[np.float64],
+    roughness: float,
 ) -> NDArray[np.float32]:
     """Return the luminance that points mirror towards views, under each light, ``(V, M, lights)``; GGX, F0 = 0.04."""
     cells = cell_directions()
     by_light = (lights @ LUMINANCE).T.astype(np.float32)
     reach = np.maximum(normals @ cells.T, 0.0)
-    power = np.float32(GLOSS_ROUGHNESS**4)
+    power = np.float32(roughness**4)
     result = np.empty((len(directions), len(normals), len(lights)), np.float32)
     for view, toward in enumerate(directions):
         # |v + l|² = 2 + 2 v.l, so that no half vector is formed
@@ -282,8 +283,8 @@ def _base_colors(shown: LightEvidence, lights: NDArray[np.float64]) -> NDArray[n
     return observed[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
 
 
-def _glossy_sums(
-    shown: LightEvidence, lights: NDArray[np.float64], blocks: NDArray[np.int64]
+def glossy_sums(
+    shown: LightEvidence, lights: NDArray[np.float64], blocks: NDArray[np.int64], roughness: float = GLOSS_ROUGHNESS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return what `BlockSums` holds of changes from view to view: met, expected, seen."""
     weights, total = shown.weights, shown.weights.sum(axis=0)
@@ -299,7 +300,7 @@ def _glossy_sums(
     seen = _by_block((weights * found**2).sum(axis=0)[:, None], blocks)
     sums = np.zeros((2, len(seen), len(lights)))
     if seen.sum() > GLOSSY_PART**2 * float(weights.sum()):
-        mirrored = _mirrored(shown.normals, shown.openness, shown.directions, lights)
+        mirrored = _mirrored(shown.normals, shown.openness, shown.directions, lights, roughness)
         for index in range(len(lights)):
             expected = changes(mirrored[..., index])
             both = np.stack([(weights * expected * found).sum(axis=0), (weights * expected**2).sum(axis=0)], axis=1)
