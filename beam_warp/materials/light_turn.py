@@ -181,5 +181,7 @@ def _least(misfit: NDArray[np.float64]) -> float:
     best = int(np.argmin(misfit))
     near = slice(max(best - REACH, 0), best + REACH + 1)
     bend, slope, _ = np.polyfit(TURNS[near] - TURNS[best], misfit[near], 2)
-    turn = TURNS[best] - slope / (2.0 * bend) if bend > FLAT * misfit[best] else np.nan
-    return float(turn) if abs(turn) < TURNS[-1] else float("nan")
+    if not bend > FLAT * misfit[best]:
+        return float("nan")
+    turn = float(TURNS[best] - slope / (2.0 * bend))
+    return turn if abs(turn) < TURNS[-1] else float("nan")

@@ -391,7 +391,7 @@ class TestWithACapture:
 
     @pytest.mark.parametrize("turns", [True, False])
     def test_a_light_that_is_askew(self, discs, studio, capture, tmp_path, monkeypatch, turns):
-        """It is turned, which all that shows the light says; or kept, which a finding says with the remedy."""
+        """Turned, as all that shows the light says; or kept, as a finding says with the remedy."""
         monkeypatch.setattr("beam_warp.decomposition.capture_light.find_turn", lambda *_: LightTurn(6.0, 1.25))
         monkeypatch.setattr("beam_warp.decomposition.capture_light.judge_light", lambda *_: LightCheck(point_count=64))
         one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})

@@ -56,7 +56,7 @@ def test_a_small_turn_is_found(name, degrees):
 
 
 def errors_over_standard_errors(paints):
-    """Of a light three degrees askew, on balls of several paints, ``(M, 3)`` each, with noise."""
+    """Return errors for a light three degrees askew, on balls of several paints, ``(M, 3)`` each, with noise."""
     light = LIGHTS["stage"]
     white = replace(Ball.of(count=800, roughness=1.0), base_color=np.ones((800, 3))).evidence(light)
     scores = []
@@ -81,7 +81,7 @@ def test_the_standard_error_is_honest(monkeypatch):
 
 
 def test_the_standard_error_is_not_too_small_in_large_patches():
-    """Patches larger than the parts that are left out say less than their number of points: still no false certainty."""
+    """Patches larger than the parts that are left out say less than so many points: still no false certainty."""
     scores = errors_over_standard_errors([Ball.of(count=800, seed=seed).base_color for seed in range(12)])
     assert np.square(scores).sum() < chi2.ppf(1.0 - 1e-3, len(scores))
 
