@@ -183,5 +183,5 @@ def _least(misfit: NDArray[np.float64]) -> float:
     bend, slope, _ = np.polyfit(TURNS[near] - TURNS[best], misfit[near], 2)
     if not bend > FLAT * misfit[best]:
         return float("nan")
-    turn = float(TURNS[best] - slope / (2.0 * bend))
-    return turn if abs(turn) < TURNS[-1] else float("nan")
+    turn = float(TURNS[best]) - float(slope) / (2.0 * float(bend))
+    return turn if abs(turn) < float(TURNS[-1]) else float("nan")
