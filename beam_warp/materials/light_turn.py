@@ -158,7 +158,7 @@ def weaker_explains(shown: LightEvidence, light: NDArray[np.float64]) -> float:
     left_out = np.log(np.maximum(full.sum() - full, 1e-6) / np.maximum(half.sum() - half, 1e-6))
     chance = student.ppf(1.0 - CHANCE, len(full) - 1) * float(np.sqrt((len(full) - 1) * left_out.var()))
     gain = float(np.log(max(full.sum(), 1e-6) / max(half.sum(), 1e-6)))
-    return gain / max(chance, LEAST_GAIN)
+    return gain / max(float(chance), LEAST_GAIN)
 
 
 def shown_colors(shown: LightEvidence) -> NDArray[np.float64]:
