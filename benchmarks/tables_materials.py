@@ -200,6 +200,35 @@ def light_check(result: Row) -> Rows:
     return rows
 
 
+@table("light_turn", "light_turn_cpu.json")
+def light_turn(result: Row) -> Rows:
+    """Errors of turns in both halves of the points, and scales by highlights of each roughness."""
+    rows: Rows = []
+    for name, found in result["captures"].items():
+        turns, highlights = found["turns"], found["highlights"]
+        rows = rows or [
+            ["", "light as measured", "worst of all stated turns", "turned, as measured", "turned by 8°"]
+            + [f"scale at roughness {roughness}" for roughness in highlights]
+        ]
+
+        def applied(least: float, most: float, turns: Any = turns) -> str:
+            some = [turn["applied"] for turn in turns if least <= abs(turn["stated"]) <= most]
+            return f"{sum(some)} of {len(some)}"
+
+        right = [turn for turn in turns if turn["stated"] == 0.0]
+        rows.append(
+            [
+                name,
+                ", ".join(f"{turn['error']:+.1f}° ± {turn['standard_error']:.1f}°" for turn in right),
+                f"{max((turn['error'] for turn in turns), key=abs):+.1f}°",
+                applied(0.0, 0.0),
+                applied(8.0, 8.0),
+                *(f"{scale['scale']:.2f} ± {scale['standard_error']:.2f}" for scale in highlights.values()),
+            ]
+        )
+    return rows
+
+
 @figure("materials_perfect.png", PERFECT)
 def draw_perfect(result: Row, path: Path) -> None:
     """Draw `perfect` and `light`, with every way to sample."""

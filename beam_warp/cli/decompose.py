@@ -40,6 +40,9 @@ class Measuring:
         float | Literal["auto"],
         arg(metavar="STOPS|auto", help="Brighten the light by powers of two; auto where the colour has no scale."),
     ] = "auto"
+    turn_light: Annotated[
+        bool, arg(help="Turn the light where the capture shows beyond doubt that it is askew by a few degrees.")
+    ] = True
     roughness: Annotated[
         float | Literal["estimate"] | Path | None,
         arg(
@@ -180,6 +183,7 @@ def run_options(
         images=ImagePathOptions(seed=seed) if preset == "paper" else None,
         roughness=roughness,
         exposure=measuring.exposure,
+        turn_light=measuring.turn_light,
         persistent=persistent,
         device=device,
     )

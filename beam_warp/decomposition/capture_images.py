@@ -27,6 +27,7 @@ class CaptureImages:
     Attributes:
         raster: How the Gaussians were drawn when they were fitted.
         is_stated: Whether the sequence states which frames of the capture it shows.
+        has_light: Whether the capture comes with its light, in the units of its images.
         notes: Images that are missing and were left out, in words.
     """
 
@@ -38,6 +39,7 @@ class CaptureImages:
         """
         self.raster = RasterOptions.from_metadata(sequence.metadata)
         self.is_stated = stated_capture_frames(sequence.metadata, len(sequence)) is not None
+        self.has_light = capture.environment_path is not None
         self._records: dict[int, list[CaptureRecord]] = {}
         missing: list[str] = []
         for index, frame in enumerate(matched_frames(sequence, capture, SPLIT)):

@@ -20,7 +20,8 @@ from beam_warp.jobs.store import kept_frame
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.agreement import judge_clipping, judge_environment, match_silhouettes, require_match
 from beam_warp.materials.exposure import estimate_exposure
-from beam_warp.materials.light import check_light
+from beam_warp.materials.light import judge_light, possible_scales
+from beam_warp.materials.light_turn import LightTurn, find_turn
 from beam_warp.materials.roughness_source import stated_roughness
 from beam_warp.world.environment import EnvironmentMap
 
@@ -39,20 +40,47 @@ class CaptureLight:
     """The light that a sequence was captured under.
 
     Attributes:
-        environment: The given one times the exposure.
+        environment: The given one times the exposure, and turned if it was askew.
         prepared: The same, prepared on the job's device.
         stops: The exposure, as a power of two.
         is_fitted: Whether the exposure was found, because the captured colour has no scale of its own.
+        turn: By which turn the light as given explains the capture best; unknown of a light that did not come with it.
+        turned_by: By how much it was turned [degree].
+        scales: Least and largest factor that all base colours could have and be those of dielectrics; NaN where nothing
+            was asked.
     """
 
     environment: EnvironmentMap
     prepared: PreparedEnvironment
     stops: float
     is_fitted: bool
+    turn: LightTurn
+    turned_by: float
+    scales: tuple[float, float]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is to be said about a light that is askew."""
+        if not self.turn.is_certain:
+            return []
+        done, remedy = "it was turned by that", "Keep it as it is by --no-turn-light, if it was measured better."
+        if not self.turned_by:
+            done, remedy = "it was kept as it is", f"Turn it by --rotate {self.turn.degrees:+.1f}."
+        what = f"environment explains the capture best turned by {self.turn} about the up axis; {done}"
+        return [Finding("warning", "environment-turned", what, remedy=remedy)]
+
+    def as_record(self) -> dict[str, Any]:
+        """Return turn and scale for a report, JSON-able; None where nothing tells them."""
+        degrees, error = (value if np.isfinite(value) else None for value in vars(self.turn).values())
+        scales = list(self.scales) if np.isfinite(self.scales).all() else None
+        return {
+            "light_turn": {"degrees": degrees, "standard_error": error, "turned_by": self.turned_by},
+            "base_color_scales": scales,
+        }
 
 
 def prepare_light(environment: EnvironmentMap, source: Source, described: str, folder: Path) -> CaptureLight:
-    """Prepare an environment and find its exposure.
+    """Prepare an environment; find whether it is askew, and its exposure.
 
     Args:
         environment: The light as it was given.
@@ -61,6 +89,16 @@ def prepare_light(environment: EnvironmentMap, source: Source, described: str, f
         folder: Where it is kept, so that a resumed job has it at once.
     """
     device, options = source.device, source.options
+    turn, turned_by, scales = LightTurn(), 0.0, (float("nan"), float("nan"))
+    if source.has_light and environment.radiance.any():
+        found = kept_frame(
+            folder / "turn.h5",
+            _key(environment, source, described),
+            lambda: {"found": np.array(_turn(source.first, environment, turns_light=options.turn_light))},
+        )
+        degrees, error, turned_by, *scales = found["found"].tolist()
+        turn, scales = LightTurn(degrees, error), (scales[0], scales[1])
+    environment = environment.rotated(turned_by) if turned_by else environment
     with source.log.timer("prepare light"):
         given = PreparedEnvironment(environment, device)
     stops = 0.0
@@ -68,14 +106,33 @@ def prepare_light(environment: EnvironmentMap, source: Source, described: str, f
     if options.exposure != "auto":
         stops = float(options.exposure)
     elif is_fitted:
-        first = source.first
-        text = f"{described} {source.image_digest(0)}"
-        key = array_digest(environment.radiance, *first.cloud.arrays().values(), text=text)
+        key = _key(environment, source, described)
         found = kept_frame(
-            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(first, given, options)])}
+            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(source.first, given, options)])}
         )
         stops = float(found["stops"][0])
-    return CaptureLight(environment.scaled(2.0**stops), given.scaled(2.0**stops), stops, is_fitted)
+        is_fitted = bool(stops) or not source.has_light
+    scaled = environment.scaled(2.0**stops)
+    return CaptureLight(scaled, given.scaled(2.0**stops), stops, is_fitted, turn, turned_by, scales)
+
+
+def _key(environment: EnvironmentMap, source: Source, described: str) -> str:
+    """Return the key of what is found out about a light from the first frame."""
+    text = f"{described} {source.image_digest(0)}"
+    return array_digest(environment.radiance, *source.first.cloud.arrays().values(), text=text)
+
+
+def _turn(frame: SeenFrame, environment: EnvironmentMap, *, turns_light: bool) -> list[float]:
+    """Return the turn of a light, its standard error, by how much the light is to be turned, and possible scales.
+
+    A light that does not fit at all, or far better under another turn, has no small error.
+    """
+    evidence = frame.light_evidence
+    turn = find_turn(evidence, environment)
+    if turn.is_certain and not judge_light(evidence, environment).is_near:
+        turn = LightTurn()
+    turned_by = turn.degrees if turns_light and turn.is_certain else 0.0
+    return [turn.degrees, turn.standard_error, turned_by, *possible_scales(evidence, environment)]
 
 
 def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOptions) -> float:
@@ -86,7 +143,17 @@ def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOp
     roughness = stated_roughness(frame.original, stated)
     with frame.log.timer("exposure"):
         return float(
-            np.log2(estimate_exposure(frame.cloud, scene, points, roughness, light, options=options.gathering))
+            np.log2(
+                estimate_exposure(
+                    frame.cloud,
+                    scene,
+                    points,
+                    roughness,
+                    light,
+                    options=options.gathering,
+                    is_measured=frame.capture is not None and frame.capture.has_light,
+                )
+            )
         )
 
 
@@ -130,4 +197,4 @@ def _judge(frame: SeenFrame, environment: EnvironmentMap) -> list[Finding]:
         require_match(match)
     findings += [match.finding] if match.finding is not None else []
     findings += judge_clipping(images, capture.ceiling(frame.number, images))
-    return findings + list(check_light(frame.scene, frame.points, views, environment).findings)
+    return findings + list(judge_light(frame.light_evidence, environment).findings)

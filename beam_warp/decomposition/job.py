@@ -61,7 +61,7 @@ class RunResult:
         asset: Root layer of the asset.
         overview: The contact sheet.
         sequence: The relightable sequence, read lazily from the store, axes "rfu".
-        environment: The light as used: the given one times the exposure.
+        environment: The light as used: the given one times the exposure, and turned if it was askew.
         report: What was measured, JSON-able; also written to ``report.json``.
     """
 
@@ -135,6 +135,7 @@ def run(
     notes += plan.archive.remove_beyond(len(sequence))
     first_key = source.key(plan.key, source.first)
     findings = light_findings(source.first, light.environment, folder / "findings.json", first_key)
+    findings += [vars(finding) for finding in light.findings]
     roughness = RoughnessFinder(plan)
     frames = FrameMeasurement(plan, roughness)
     if chosen.images is not None:

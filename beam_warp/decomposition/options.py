@@ -27,7 +27,10 @@ class RunOptions:
             over views and frames.
         exposure: Stops by which the environment is brightened before use; ``"auto"`` finds them where the captured
             colour is display-referred, whose scale is unknown, and takes 0 where it is scene-linear. With a capture,
-            its images decide, because they are what is explained.
+            its images decide, because they are what is explained; a light that comes with it is changed only as far as
+            base colours would be impossible otherwise.
+        turn_light: Turn the light about the up axis where the capture shows beyond doubt that it is a little askew.
+            Only a light that comes with the capture is turned; see `beam_warp.materials.light_turn`.
         persistent: State that row i is the same Gaussian in every frame, so that base colour is fitted over all
             frames at once; sequences that carry ids state it themselves.
         device: Warp device; None takes the first CUDA device, or the CPU.
@@ -40,6 +43,7 @@ class RunOptions:
     images: ImagePathOptions | None = None
     roughness: float | RoughnessTexture | Literal["estimate"] = 0.5
     exposure: float | Literal["auto"] = "auto"
+    turn_light: bool = True
     persistent: bool = False
     device: str | None = None
 

@@ -45,6 +45,7 @@ def relightable_sequence(plan: JobPlan, solved: SolvedFrames) -> GaussianSequenc
             "radiance_meaning": "captured",
             "source_axes": plan.source.first.original.axes,
             "exposure_stops": f"{plan.light.stops:.4f}",
+            "light_turn_degrees": f"{plan.light.turned_by:.4f}",
         },
     )
 
@@ -75,6 +76,7 @@ def _light_in_words(plan: JobPlan) -> str:
     """Return what is known of the light: only images with a scale of their own can be compared with a relighting."""
     stops, is_fitted = plan.light.stops, plan.light.is_fitted
     name = "the given light" if plan.source.images is None or is_fitted else "the light of the capture"
+    name += f", turned by {plan.light.turned_by:+.1f} degrees" if plan.light.turned_by else ""
     if is_fitted:
         return f"{name}, exposure fitted by {stops:+.1f} stops"
     return f"{name}, exposed by {stops:+.1f} stops" if stops else name
@@ -110,6 +112,7 @@ def run_report(
         "light": _light_in_words(plan),
         "exposure_stops": plan.light.stops,
         "exposure_is_fitted": plan.light.is_fitted,
+        **plan.light.as_record(),
         "resumed_frames": measurement.resumed,
         "persistent": plan.persistent,
         "materials": solved.statistics,

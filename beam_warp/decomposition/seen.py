@@ -14,6 +14,8 @@ from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.base_color import fill_from_neighbors
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
+from beam_warp.materials.light import light_evidence
+from beam_warp.materials.light_fits import LightEvidence
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints, estimate_normals
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
@@ -43,7 +45,7 @@ class SeenFrame:
 
     def forget(self) -> None:
         """Free what was worked out, which lies on the device; it is worked out again when it is asked for."""
-        for name in ("scene", "views", "points", "surface"):
+        for name in ("scene", "views", "points", "surface", "light_evidence"):
             self.__dict__.pop(name, None)
 
     @cached_property
@@ -85,6 +87,14 @@ class SeenFrame:
         scene = self.scene
         with self.log.timer("surface"):
             return SurfacePoints.seen_by(self.cloud, views, scene, offset)
+
+    @cached_property
+    def light_evidence(self) -> LightEvidence:
+        """What well-seen Gaussians show of the light; only with a capture."""
+        assert self.views is not None
+        points, scene = self.points, self.scene
+        with self.log.timer("check"):
+            return light_evidence(scene, points, self.views)
 
     @cached_property
     def surface(self) -> SurfaceNormals:

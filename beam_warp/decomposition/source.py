@@ -70,6 +70,11 @@ class Source:
             return self.images.is_display_referred(0)
         return self.first.cloud.radiance_color_space == DISPLAY_SRGB
 
+    @property
+    def has_light(self) -> bool:
+        """Whether the light was measured with the capture, so that its scale and its turn are nearly right."""
+        return self.images is not None and self.images.has_light
+
     def image_digest(self, number: int) -> str:
         """Return the digest of a frame's images; empty without a capture."""
         return "" if self.images is None else self.images.digest(number, self.digests)

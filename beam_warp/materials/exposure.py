@@ -37,6 +37,7 @@ def estimate_exposure(
     light: PreparedEnvironment,
     *,
     options: MaterialOptions,
+    is_measured: bool = False,
 ) -> float:
     """Find the factor on an environment that makes display-referred captured colour physically plausible.
 
@@ -44,7 +45,8 @@ def estimate_exposure(
     light asks for more than 1, too much lets the specular lobe alone exceed what was captured. The factor is the one
     whose bounds cut least of the captured radiance (in absolute
     values: outliers must not decide); among those that are equally good, the one that gives the
-    brightest surfaces `BRIGHTEST`.
+    brightest surfaces `BRIGHTEST`, or of a light that was measured, the one that changes it least: a subject without
+    white is no evidence against it.
 
     For light s times the environment, sum w L_D (L_o - L_S) / s = A - s B: two measurements with the same rays give
     A and B, and with them the base colour under every s.
@@ -56,6 +58,7 @@ def estimate_exposure(
         roughness: Their roughness.
         light: The light of the capture up to a factor.
         options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
+        is_measured: Whether the light is in the units of the capture as far as anybody knows.
 
     Returns:
         A positive factor; 1 where nothing was observed.
@@ -88,5 +91,6 @@ def estimate_exposure(
         brightest.append(max(float(largest[order][min(middle, len(order) - 1)]), 1e-9))
     energy = float((amplitude * captured / denominator).sum())
     equally_good = np.array(misfit) <= min(misfit) + MISFIT_SLACK * energy
-    distance = np.where(equally_good, np.abs(np.log(np.array(brightest) / BRIGHTEST[1])), np.inf)
+    off = EXPOSURE_FACTORS if is_measured else np.array(brightest) / BRIGHTEST[1]
+    distance = np.where(equally_good, np.abs(np.log(off)), np.inf)
     return float(EXPOSURE_FACTORS[int(np.argmin(distance))])

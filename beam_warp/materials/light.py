@@ -19,6 +19,8 @@ from beam_warp.image.color import linear_to_srgb
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_fits import (
     EVEN,
+    LEAST_POINTS,
+    LEAST_VIEWS,
     LIGHT_COLUMNS,
     LightEvidence,
     LightFits,
@@ -28,16 +30,14 @@ from beam_warp.materials.light_fits import (
     turned_lights,
     well_shown,
 )
+from beam_warp.materials.light_turn import weaker_explains
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.environment import EnvironmentMap
 
-LEAST_POINTS = 64
-"""Fewest Gaussians that say anything about light."""
-
-LEAST_VIEWS = 4
-"""Fewest views: one side of a subject alone is explained by many lights."""
+ASKED = 1024
+"""Most Gaussians to ask, spread evenly over the cloud."""
 
 MOST_VIEWS = 12
 """Views that gloss is looked at in: what more of them say costs more than it tells."""
@@ -58,9 +58,10 @@ colour over those Gaussians."""
 TOO_BRIGHT = 1.1
 TOO_DARK = 0.05
 PLAUSIBLE = 0.7
+DARKEST = 0.04
 """Quantile `BRIGHT` above which light is stated too dim, `BRIGHTEST` below which too bright, and what the proposed
 exposure makes of the former. The former is 0.66 to 0.99 with the true light, on a figure in white clothes too; nothing
-but charcoal is below 0.05."""
+but charcoal is below 0.05. `DARKEST` is what the surface of a dielectric reflects, whatever is below it."""
 
 
 FEW_VALUES = 16
@@ -107,9 +108,15 @@ class LightCheck:
     point_count: int
     findings: tuple[Finding, ...] = ()
 
+    @property
+    def is_near(self) -> bool:
+        """Whether the light fits as it is or turned by a few degrees: it explains, and no other turn does better."""
+        codes = {finding.code for finding in self.findings}
+        return not codes & {"environment-black", "environment-turned", "environment-unexplained", "light-unchecked"}
+
 
 def check_light(
-    scene: Scene, points: SurfacePoints, views: ViewEvidence, environment: EnvironmentMap, *, subset: int = 1024
+    scene: Scene, points: SurfacePoints, views: ViewEvidence, environment: EnvironmentMap, *, subset: int = ASKED
 ) -> LightCheck:
     """Ask well-seen Gaussians whether an environment is the light that they were captured under.
 
@@ -130,7 +137,7 @@ def check_light(
     return judge_light(light_evidence(scene, points, views, subset), environment)
 
 
-def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, subset: int) -> LightEvidence:
+def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, subset: int = ASKED) -> LightEvidence:
     """Collect what well-seen Gaussians show, and towards which cells of the sphere they are open."""
     good = views.seen & (views.weight > WELL_SEEN) & (points.confidence > AGREEMENT) & (views.saturated < UNCUT)
     rows = np.flatnonzero(good)
@@ -189,10 +196,28 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
         exposure_stops=_exposure_stops(mean_colors(shown), irradiance_over_pi(shown, lights[best])),
         point_count=count,
     )
-    is_unlike = min(fits.clearly(EVEN, here), fits.clearly(EVEN, there)) > 1.0
+    is_unlike = all(fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, lights[way]) > 1.0 for way in (here, there))
     ways = [best] if fits.clearly(best, other) > 1.0 else [best, other]
     told = [f"{'mirrored and ' if way >= LIGHT_COLUMNS else ''}turned by {_refined(fits, way):+.0f}" for way in ways]
     return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
+
+
+def possible_scales(evidence: LightEvidence, environment: EnvironmentMap) -> tuple[float, float]:
+    """Return the least and the largest factor that all base colours could have under a light of another scale.
+
+    Nothing reflects more than it gets, and a dielectric reflects no less than `DARKEST` of it. Only this bounds the
+    scale of a light: highlights, which do not depend on base colour, would tell it, but how bright they are depends on
+    roughness and on normals far more than a light that was measured is off.
+
+    Returns:
+        Factors by which base colours under this light may be multiplied; NaN where too little is seen.
+    """
+    shown = well_shown(evidence)
+    if len(shown.normals) < LEAST_POINTS:
+        return float("nan"), float("nan")
+    base = _lit_colors(mean_colors(shown), irradiance_over_pi(shown, turned_lights(environment)[0]))
+    darkest, brightest = np.quantile(base.max(axis=1), (1.0 - BRIGHTEST, BRIGHTEST))
+    return float(DARKEST / max(darkest, 1e-9)), float(1.0 / max(brightest, 1e-9))
 
 
 def looks_like_ldr(environment: EnvironmentMap) -> Finding | None:
@@ -242,15 +267,20 @@ def _refined(fits: LightFits, best: int) -> float:
 
 def _exposure_stops(colors: NDArray[np.float64], irradiance: NDArray[np.float32]) -> float:
     """Return the exposure of the light that makes base colours plausible [stops]."""
-    mean = irradiance.mean(axis=1)
-    lit = mean > WELL_LIT * mean.mean()
-    if not lit.any():
+    base = _lit_colors(colors, irradiance).max(axis=1)
+    if not len(base):
         return 0.0
-    base = (colors[lit] / np.maximum(irradiance[lit], 1e-12)).max(axis=1)
     bright, brightest = (max(float(value), 1e-9) for value in np.quantile(base, (BRIGHT, BRIGHTEST)))
     if bright > TOO_BRIGHT:
         return float(np.log2(bright / PLAUSIBLE))
     return float(np.log2(brightest / PLAUSIBLE)) if brightest < TOO_DARK else 0.0
+
+
+def _lit_colors(colors: NDArray[np.float64], irradiance: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return base colours of the points that get at least `WELL_LIT` of the mean light, ``(M, 3)``."""
+    mean = irradiance.mean(axis=1)
+    lit = mean > WELL_LIT * mean.mean()
+    return colors[lit] / np.maximum(irradiance[lit], 1e-12)
 
 
 def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
@@ -258,7 +288,7 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
 
     Args:
         check: What was found.
-        is_unlike: Whether an even light explains the capture better than any turn.
+        is_unlike: Whether a light of less contrast explains the capture better than any turn.
         told: The turns that explain it best, in words, without the unit of the last.
     """
     if is_unlike:
@@ -266,9 +296,9 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
             Finding(
                 "warning",
                 "environment-unexplained",
-                "environment does not explain the capture under any turn: a light that is the same from all sides "
-                f"explains it better, with a spread of base colours of {check.spread_even:.2f}, not "
-                f"{check.spread_best:.2f}",
+                "environment does not explain the capture under any turn: a light of less contrast explains it better, "
+                f"and one that is the same from all sides leaves a spread of base colours of {check.spread_even:.2f}, "
+                f"this one {check.spread_best:.2f}",
                 remedy="Check that it is the light of this capture.",
             )
         ]

@@ -27,6 +27,12 @@ from beam_warp.world.environment import EnvironmentMap, texel_directions
 LIGHT_ROWS, LIGHT_COLUMNS = 16, 32
 """Cells that the light is averaged over; a turn by one column is 11.25 degrees, turns between are interpolated."""
 
+LEAST_POINTS = 64
+"""Fewest Gaussians that say anything about light."""
+
+LEAST_VIEWS = 4
+"""Fewest views: one side of a subject alone is explained by many lights."""
+
 EVEN = 2 * LIGHT_COLUMNS
 """Number of the even light among those that are compared: turns and their mirror images come first."""
 
@@ -98,14 +104,10 @@ class LightFits:
     @classmethod
     def of(cls, shown: LightEvidence, lights: NDArray[np.float64]) -> LightFits:
         """Fit lights of ``(lights, L, 3)`` radiance to points that views show, at least `LEAST_IN_BLOCK` of them."""
-        tree = cKDTree(shown.positions)
-        parts = np.array_split(tree.indices, min(BLOCKS, tree.n // LEAST_IN_BLOCK))
-        blocks = np.empty(tree.n, np.int64)
-        for number, rows in enumerate(parts):
-            blocks[rows] = number
-        apart, pairs = _differences(tree, shown.normals, _base_colors(shown, lights), blocks)
-        sums = BlockSums(apart, pairs, *_glossy_sums(shown, lights, blocks))
-        left_out = np.stack([sums.misfits(without=block) for block in range(len(parts))])
+        blocks = parts_of(shown.positions)
+        apart, pairs = neighbor_differences(shown, _base_colors(shown, lights), blocks, NEIGHBORS)
+        sums = BlockSums(apart, pairs, *glossy_sums(shown, lights, blocks))
+        left_out = np.stack([sums.misfits(without=block) for block in range(len(apart))])
         return cls(sums.spreads(), sums.gloss(), sums.misfits(), left_out)
 
     def clearly(self, better: int, worse: int) -> float:
@@ -163,14 +165,33 @@ def _by_block(values: NDArray[np.floating], blocks: NDArray[np.int64]) -> NDArra
     return sums
 
 
-def _differences(
-    tree: cKDTree, normals: NDArray[np.float32], base: NDArray[np.float64], blocks: NDArray[np.int64]
+def parts_of(positions: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return which part of the surface each point belongs to, ``(M,)``: at most `BLOCKS`, none of them small."""
+    tree = cKDTree(positions)
+    blocks = np.zeros(tree.n, np.int64)
+    for number, rows in enumerate(np.array_split(tree.indices, max(1, min(BLOCKS, tree.n // LEAST_IN_BLOCK)))):
+        blocks[rows] = number
+    return blocks
+
+
+def neighbor_differences(
+    shown: LightEvidence, base: NDArray[np.float64], blocks: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sums of absolute differences of neighbours' base colours by block, and how many neighbours there are.
 
     Neighbours that face away from each other are on two sides of a thin part, which are painted apart.
+
+    Args:
+        shown: The points.
+        base: Logarithms of their base colours under some lights, ``(M, K)``.
+        blocks: Part of the surface of each, ``(M,)``.
+        count: Neighbours that each point is compared with.
+
+    Returns:
+        Sums ``(B, K)`` and counts ``(B, 1)``.
     """
-    _, near = tree.query(tree.data, k=min(NEIGHBORS + 1, tree.n))
+    tree, normals = cKDTree(shown.positions), shown.normals
+    _, near = tree.query(tree.data, k=min(count + 1, tree.n))
     pairs = np.stack([np.repeat(np.arange(tree.n), near.shape[1]), near.reshape(-1)], axis=1)
     first, second = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0).T
     facing = (normals[first] * normals[second]).sum(axis=1) > 0.0
@@ -203,7 +224,7 @@ def mean_colors(shown: LightEvidence) -> NDArray[np.float64]:
 
 def irradiance_over_pi(shown: LightEvidence, light: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return what a white diffuser at each point reflects of a light of ``(L, K)`` radiance, ``(M, K)``."""
-    diffuse = np.maximum(shown.normals @ cell_directions().T, 0.0) * shown.openness * _cell_angles()
+    diffuse = np.maximum(shown.normals @ cell_directions().T, 0.0) * shown.openness * cell_angles()
     return diffuse @ light.astype(np.float32) / np.float32(np.pi)  # pyright: ignore[reportReturnType]  # float32: NumPy says float64 of a division
 
 
@@ -220,7 +241,7 @@ def cell_directions() -> NDArray[np.float32]:
     return texel_directions(LIGHT_ROWS, LIGHT_COLUMNS).reshape(-1, 3).astype(np.float32)
 
 
-def _cell_angles() -> NDArray[np.float32]:
+def cell_angles() -> NDArray[np.float32]:
     """Return solid angles of the cells [sr]."""
     rows = (2.0 * np.pi / LIGHT_COLUMNS) * -np.diff(np.cos(np.linspace(0.0, np.pi, LIGHT_ROWS + 1)))
     return np.repeat(rows, LIGHT_COLUMNS).astype(np.float32)
@@ -231,12 +252,13 @@ def _mirrored(
     openness: NDArray[np.float32],
     directions: NDArray[np.float32],
     lights: NDArray[np.float64],
+    roughness: float,
 ) -> NDArray[np.float32]:
     """Return the luminance that points mirror towards views, under each light, ``(V, M, lights)``; GGX, F0 = 0.04."""
     cells = cell_directions()
     by_light = (lights @ LUMINANCE).T.astype(np.float32)
     reach = np.maximum(normals @ cells.T, 0.0)
-    power = np.float32(GLOSS_ROUGHNESS**4)
+    power = np.float32(roughness**4)
     result = np.empty((len(directions), len(normals), len(lights)), np.float32)
     for view, toward in enumerate(directions):
         # |v + l|² = 2 + 2 v.l, so that no half vector is formed
@@ -248,7 +270,7 @@ def _mirrored(
         masking = 0.5 / (
             reach * np.sqrt(cosine**2 * (1.0 - power) + power) + cosine * np.sqrt(reach**2 * (1.0 - power) + power)
         )
-        transfer = lobe * masking * fresnel * reach * openness * _cell_angles()
+        transfer = lobe * masking * fresnel * reach * openness * cell_angles()
         result[view] = transfer.astype(np.float32) @ by_light
     return result
 
@@ -261,8 +283,8 @@ def _base_colors(shown: LightEvidence, lights: NDArray[np.float64]) -> NDArray[n
     return observed[:, None] - np.log(np.maximum(irradiance, least).astype(np.float64))
 
 
-def _glossy_sums(
-    shown: LightEvidence, lights: NDArray[np.float64], blocks: NDArray[np.int64]
+def glossy_sums(
+    shown: LightEvidence, lights: NDArray[np.float64], blocks: NDArray[np.int64], roughness: float = GLOSS_ROUGHNESS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return what `BlockSums` holds of changes from view to view: met, expected, seen."""
     weights, total = shown.weights, shown.weights.sum(axis=0)
@@ -278,7 +300,7 @@ def _glossy_sums(
     seen = _by_block((weights * found**2).sum(axis=0)[:, None], blocks)
     sums = np.zeros((2, len(seen), len(lights)))
     if seen.sum() > GLOSSY_PART**2 * float(weights.sum()):
-        mirrored = _mirrored(shown.normals, shown.openness, shown.directions, lights)
+        mirrored = _mirrored(shown.normals, shown.openness, shown.directions, lights, roughness)
         for index in range(len(lights)):
             expected = changes(mirrored[..., index])
             both = np.stack([(weights * expected * found).sum(axis=0), (weights * expected**2).sum(axis=0)], axis=1)

@@ -67,6 +67,7 @@ OPTIONS = {
     "orbit": "--orbit 30 10",
     "rotate": "--rotate 40",
     "exposure": "--exposure 1.5",
+    "turn_light": "--no-turn-light",
     "roughness": "--roughness 0.25",
     "roughness_mesh": "--roughness {folder}/rough.png --roughness-mesh {folder}/mesh.obj",
     "samples": "--samples 128",

@@ -19,6 +19,8 @@ from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.light import LightCheck
+from beam_warp.materials.light_turn import LightTurn
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import contact_sheet
@@ -383,7 +385,7 @@ class TestWithACapture:
         """
         assert not CaptureImages(capture, discs).is_display_referred(0)
         records = tuple(replace(record, color_space=DISPLAY_SRGB) for record in capture.records)
-        display = replace(capture, records=records)
+        display = replace(capture, records=records, environment_path=None)
         images = CaptureImages(display, discs)
         assert images.ceiling(0, images.views(0)) == 1.0
         one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
@@ -393,6 +395,23 @@ class TestWithACapture:
         # candidates are a sixteenth of a stop apart
         difference = plain.report["exposure_stops"] - brighter.report["exposure_stops"]
         assert difference == pytest.approx(2.0, abs=1.5 / 16.0)
+
+    @pytest.mark.parametrize("turns", [True, False])
+    def test_a_light_that_is_askew(self, discs, studio, capture, tmp_path, monkeypatch, turns):
+        """Turned, as all that shows the light says; or kept, as a finding says with the remedy."""
+        monkeypatch.setattr("beam_warp.decomposition.capture_light.find_turn", lambda *_: LightTurn(6.0, 1.25))
+        monkeypatch.setattr("beam_warp.decomposition.capture_light.judge_light", lambda *_: LightCheck(point_count=64))
+        one = GaussianSequence.from_clouds([discs[0]], metadata={"capture_frames": "0"})
+        found = job(one, studio, tmp_path / "out", replace(AUTO, turn_light=turns), capture=capture)
+        expected = studio.rotated(6.0) if turns else studio
+        np.testing.assert_array_equal(found.environment.radiance, expected.radiance)
+        turned_by = 6.0 if turns else 0.0
+        assert found.report["light_turn"] == {"degrees": 6.0, "standard_error": 1.25, "turned_by": turned_by}
+        assert read(found.asset).metadata["light_turn_degrees"] == f"{turned_by:.4f}"
+        assert ("turned by +6.0 degrees" in found.report["light"]) == turns
+        said = next(text for text in found.report["warnings"] if "up axis" in text)
+        assert "+6.0 ± 1.2 degrees" in said
+        assert ("--no-turn-light" if turns else "--rotate +6.0") in said
 
     @pytest.mark.parametrize("what", ["black", "elsewhere", "transparent", "single"])
     def test_what_cannot_be_decomposed_is_refused_at_once(self, discs, studio, capture, tmp_path, what):

@@ -33,7 +33,7 @@ def balls(*greys):
 
 def images(digest):
     """Images that carry no scale, as far as a job looks before it reads them."""
-    return SimpleNamespace(is_display_referred=lambda _: True, digest=lambda *_: digest)
+    return SimpleNamespace(is_display_referred=lambda _: True, has_light=False, digest=lambda *_: digest)
 
 
 def source_of(folder, sequence, shown=None):

@@ -244,6 +244,22 @@ class TestExposure:
         factor = estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions())
         assert abs(np.log2(factor) + stops) < 0.25
 
+    @pytest.mark.parametrize(
+        ("whites", "stops", "expected"),
+        [(0.5, 0.0, (0.0, 0.0)), (0.5, 0.5, (0.0, 0.0)), (0.8, -2.0, (1.4, 2.0))],
+        ids=["grey clothes", "grey clothes, too bright", "whites above 1"],
+    )
+    def test_a_measured_light_is_changed_only_by_what_is_impossible(self, rng, whites, stops, expected):
+        """A subject without white does not make it brighter; base colours above 1 do, as far as they must."""
+        points, spacing = sphere_points(1500)
+        truth = rng.choice([0.1, 0.3, whites], (1500, 1)) * np.ones(3)
+        cloud = colored(cloud_of(tiles(points, points, spacing)), reflected(truth, np.pi), DISPLAY_SRGB)
+        scene = Scene.from_gaussians(cloud, "cpu")
+        surface, rough = certain(cloud, scene, points), np.full(1500, ROUGHNESS, np.float32)
+        light = prepared(EVEN, "cpu").scaled(2.0**stops)
+        factor = estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions(), is_measured=True)
+        assert expected[0] <= np.log2(factor) <= expected[1]
+
 
 def test_views_are_unit_and_on_the_visible_side():
     views = view_set()
