@@ -321,6 +321,17 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.materials.light_turn:{name}", "walker, runner, robot", does, NO_SCORE)
+        for name, does in (
+            ("TURN_NEIGHBORS", "Neighbours whose base colours are compared."),
+            ("REACH", "Turns beside the best that the parabola goes through."),
+            ("SYSTEMATIC", "Error of a turn that the whole surface shares [degree]."),
+            ("LEAST_TURN", "Least turn that is undone [degree]."),
+            ("LARGEST_TURN", "Largest turn that is undone [degree]."),
+            ("CERTAIN", "Standard errors from which on a turn is undone."),
+        )
+    ),
+    *(
         Constant(f"beam_warp.materials.agreement:{name}", BOTH, does, NO_SCORE)
         for name, does in (
             ("LEAST_OVERLAP", "Coverage in common below which cameras do not fit."),
@@ -399,7 +410,8 @@ UNTUNED = {
         beam_warp.materials.evidence: RADII
         beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS
         beam_warp.materials.exposure: EXPOSURE_FACTORS
-        beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK
+        beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
+        beam_warp.materials.light_turn: TURNS
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -443,8 +455,10 @@ UNTUNED = {
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN
         beam_warp.materials.exposure: ASKED
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
-        beam_warp.materials.light: LEAST_POINTS LEAST_VIEWS MOST_VIEWS NEAR
-        beam_warp.materials.light_fits: LIGHT_ROWS LIGHT_COLUMNS EVEN LEAST_LIGHT BLOCKS LEAST_IN_BLOCK
+        beam_warp.materials.light: ASKED MOST_VIEWS NEAR
+        beam_warp.materials.light_fits: LIGHT_ROWS LIGHT_COLUMNS EVEN LEAST_LIGHT BLOCKS LEAST_IN_BLOCK LEAST_POINTS
+        beam_warp.materials.light_fits: LEAST_VIEWS
+        beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT
         beam_warp.materials.residues: LEAST_ALPHA FEWEST_LIGHT_SAMPLES
         beam_warp.materials.roughness: MOST_ASKED TINY
         beam_warp.materials.roughness_source: MAX_TEXELS
