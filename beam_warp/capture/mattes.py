@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, label, map_coordinates, maximum_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, label, map_coordinates, maximum_filter, minimum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 SOLID = 0.5
@@ -142,6 +142,17 @@ def matte(
     color = photograph * alpha[..., None]
     color[at] = _subject(photograph[at], alpha[at], inner, outer, outline.nearest)
     return Matte(color, alpha, offset)
+
+
+def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Take a mask in on all sides, or let it out if ``pixels`` is negative.
+
+    Args:
+        mask: Coverage in [0, 1], ``(H, W)``.
+        pixels: How far, at most the 3 that are looked at around an outline [pixel].
+    """
+    outline = _outline(mask)
+    return mask if outline is None else _moved(mask, outline, np.full(len(outline.points), pixels))
 
 
 def keyed(photograph: NDArray[np.float32], plate: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -347,12 +358,22 @@ def _beyond(values: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[
 
 
 def _moved(mask: NDArray[np.float32], outline: _Outline, moves: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Take a mask in by some way at each point of its outline [pixel], ``(K,)``."""
+    """Take a mask in by some way at each point of its outline [pixel], ``(K,)``.
+
+    It is interpolated by cubic splines, within the range of the pixels around, so that soft outlines stay as steep.
+    """
     is_moved = moves[outline.nearest] != 0.0
     near, nearest = outline.near[is_moved], outline.nearest[is_moved]
     alpha = mask.copy()
-    places = near + moves[nearest, None] * outline.normals[nearest]
-    alpha[tuple(near.T)] = map_coordinates(mask, places.T, order=1, mode="nearest")
+    if not len(near):
+        return alpha
+    low = np.maximum(near.min(axis=0) - BAND, 0)
+    part = mask[tuple(slice(first, last + BAND + 1) for first, last in zip(low, near.max(axis=0), strict=True))]
+    places = (near + moves[nearest, None] * outline.normals[nearest] - low).T
+    least, most = (
+        map_coordinates(of(part, 3), places, order=0, mode="nearest") for of in (minimum_filter, maximum_filter)
+    )
+    alpha[tuple(near.T)] = np.clip(map_coordinates(part, places, order=3, mode="nearest"), least, most)
     return alpha
 
 
