@@ -167,7 +167,8 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
         findings.warn(
             "no-coverage",
             "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
-            remedy="Write masks (masks/<image>.png, white on the subject) for a subject by itself.",
+            remedy="For a subject by itself, write masks (masks/<image>.png, white on the subject) or plates "
+            "(plates/<camera>.png, without the subject).",
         )
         return
     unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]

@@ -33,6 +33,9 @@ MARGINS = (2.5, 1.25)
 BAND = 7
 """Pixels up to this far from the outline are looked at [pixel]: the first margin, and the largest offset."""
 
+FAINT = 0.02
+"""Coverage within this of 0 or 1 is as good as it."""
+
 BLUR = 1.5
 """Standard deviation of the filter through which an outline's normals are seen [pixel]."""
 
@@ -128,11 +131,13 @@ def matte(
         return Matte(photograph * mask[..., None], mask, None)
     at = tuple(outline.near.T)
     empty = np.float32(0.0) if plate is None else plate
+    softness = _softness(mask[at], outline.distances)
     excess = error = np.zeros(len(outline.points))
-    for margin in MARGINS:
+    for margin in np.add(MARGINS, softness):
         distance = outline.distances + excess[outline.nearest]
-        inner = _fit(photograph, outline, outline.everywhere(distance) < -margin)
-        outer = _fit(photograph - empty, outline, outline.everywhere(distance) > margin)
+        place = outline.everywhere(distance)
+        inner = _fit(photograph, outline, place < -margin)
+        outer = _fit(photograph - empty, outline, place > margin)
         outer.values += np.broadcast_to(empty, photograph.shape)[at]
         shown = _coverage(photograph[at], inner.values, outer.values)
         shown = np.where(np.abs(distance) <= margin, shown, distance < 0.0)
@@ -254,6 +259,12 @@ def _outline(mask: NDArray[np.float32]) -> _Outline | None:
         nearest=nearest,
         distances=np.where(inside[box][nearby], -distances, distances) - (mask[box][at] - SOLID)[nearest],
     )
+
+
+def _softness(mask: NDArray[np.float32], distances: NDArray[np.float64]) -> float:
+    """Return how much further from its outline a mask is soft than one that is sharp [pixel]."""
+    soft = np.abs(distances[(mask > FAINT) & (mask < 1.0 - FAINT)])
+    return max(float(np.quantile(soft, 0.9)) - 1.0, 0.0) if len(soft) else 0.0
 
 
 def _fit(image: NDArray[np.float32], outline: _Outline, sure: NDArray[np.bool_]) -> _Colors:
