@@ -46,6 +46,9 @@ RIDGE = 1e-6
 """Half the side of the window in which colours are fitted, the standard deviation of its weights [pixel], the fewest
 samples from which one is known, and the share of the weights that holds slopes to 0 where samples do not tell."""
 
+BRIGHTEST = 1e9
+"""Larger values near an outline count as this one, so that their squares are finite."""
+
 BLOCK = 4096
 """Windows that are fitted at a time."""
 
@@ -131,21 +134,22 @@ def matte(
         return Matte(photograph * mask[..., None], mask, None)
     at = tuple(outline.near.T)
     empty = np.float32(0.0) if plate is None else plate
+    seen = np.clip(photograph, -BRIGHTEST, BRIGHTEST)
     softness = _softness(mask[at], outline.distances)
     excess = error = np.zeros(len(outline.points))
     for margin in np.add(MARGINS, softness):
         distance = outline.distances + excess[outline.nearest]
         place = outline.everywhere(distance)
-        inner = _fit(photograph, outline, place < -margin)
-        outer = _fit(photograph - empty, outline, place > margin)
+        inner = _fit(seen, outline, place < -margin)
+        outer = _fit(seen - empty, outline, place > margin)
         outer.values += np.broadcast_to(empty, photograph.shape)[at]
-        shown = _coverage(photograph[at], inner.values, outer.values)
+        shown = _coverage(seen[at], inner.values, outer.values)
         shown = np.where(np.abs(distance) <= margin, shown, distance < 0.0)
         excess, error = _excess(outline, mask[at], shown, inner, outer)
     offset, moves = _believed(excess, error)
     alpha = _moved(mask, outline, moves)
     color = photograph * alpha[..., None]
-    color[at] = _subject(photograph[at], alpha[at], inner, outer, outline.nearest)
+    color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
     return Matte(color, alpha, offset)
 
 
@@ -211,9 +215,9 @@ class _Outline:
     nearest: NDArray[np.int64]
     distances: NDArray[np.float64]
 
-    def everywhere(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
+    def everywhere(self, distances: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return distances of near pixels with those of all others, which are infinite, ``(H, W)``."""
-        found = np.where(self.inside, -np.inf, np.inf)
+        found = np.where(self.inside, np.float32(-np.inf), np.float32(np.inf))
         found[tuple(self.near.T)] = distances
         return found
 

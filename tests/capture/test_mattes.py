@@ -32,7 +32,7 @@ def test_a_mask_is_moved_to_the_outline_of_a_disc(pixels, with_plate):
 def test_a_subject_like_its_backdrop_is_left_as_it_is():
     mask = disc(RADIUS + 1.0)
     wall = np.full((SIDE, SIDE, 3), 0.01, np.float32)
-    found = matte(before(wall, disc(), np.float32([0.01, 0.01, 0.01])), mask)
+    found = matte(before(wall, disc(), np.full(3, 0.01, np.float32)), mask)
     assert found.offset is None
     np.testing.assert_array_equal(found.alpha, mask)
     np.testing.assert_allclose(found.color, wall * mask[..., None], atol=1e-6)
@@ -63,7 +63,7 @@ def test_a_cluttered_backdrop_is_trusted_little():
 )
 def test_a_sound_mask_stays_as_it_is(radius, center, subject, blur, seed):
     true = gaussian_filter(disc(radius, center), blur).astype(np.float32)
-    photograph = before(WALL, true, np.float32(subject))
+    photograph = before(WALL, true, np.array(subject, np.float32))
     noise = np.random.default_rng(seed).normal(0.0, 0.01, photograph.shape)
     found = matte((photograph + noise).astype(np.float32), true)
     assert np.abs(found.alpha - true).max() < 0.05
@@ -75,6 +75,15 @@ def test_masks_without_an_outline_are_left_as_they_are():
         found = matte(photograph, mask.astype(np.float32))
         np.testing.assert_array_equal(found.alpha, mask.astype(np.float32))
         assert found.offset is None
+
+
+def test_values_without_measure_stay_finite():
+    photograph = before(WALL, disc())
+    photograph[48, 17:19] = 3e38
+    photograph[10, 10] = -3e38
+    found = matte(photograph, disc(RADIUS + 1.0))
+    assert np.isfinite(found.color).all()
+    assert found.offset.pixels == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("pixels", [-1.0, 1.0])

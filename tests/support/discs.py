@@ -3,9 +3,9 @@
 import numpy as np
 
 SIDE, RADIUS, SAMPLES = 96, 30.0, 8
-SUBJECT = np.float32([0.8, 0.5, 0.3])
+SUBJECT = np.array([0.8, 0.5, 0.3], np.float32)
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE].astype(np.float32)
-WALL = (0.2 + 0.001 * ROWS + 0.0005 * COLUMNS)[..., None] * np.float32([1.0, 0.9, 0.8])
+WALL = (0.2 + 0.001 * ROWS + 0.0005 * COLUMNS)[..., None] * np.array([1.0, 0.9, 0.8], np.float32)
 """A backdrop whose brightness is linear."""
 
 
