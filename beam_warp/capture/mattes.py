@@ -15,6 +15,7 @@ give the subject's part: I - (1 - a) B before a smooth backdrop, a F before a cl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,16 +179,18 @@ def keyed(photograph: NDArray[np.float32], plate: NDArray[np.float32]) -> NDArra
     """
     level = np.maximum(plate, 1e-3 * max(float(plate.mean()), 1e-6))
     gain = np.median(photograph / level, axis=(0, 1))
-    excess = uniform_filter(photograph - gain * plate, (3, 3, 0)) ** 2 / (level * level.mean())
-    excess = excess.sum(axis=-1)
+    sides: Any = (3, 3, 1)
+    difference = uniform_filter(np.clip(photograph, -BRIGHTEST, BRIGHTEST) - gain * plate, sides)
+    excess = (difference**2 / (level * level.mean())).sum(axis=-1)
     found = excess > max(KEY * float(np.median(excess)), LEAST_KEY)
     solid = ~_without_specks(~_without_specks(found))
-    return np.clip(gaussian_filter(solid.astype(np.float32), KEY_BLUR), 0.0, 1.0)
+    return np.clip(gaussian_filter(solid.astype(np.float32), KEY_BLUR), 0.0, 1.0).astype(np.float32)
 
 
 def _without_specks(found: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return pixels without connected parts of fewer than `SPECK`."""
-    parts, _ = label(found)
+    labelled: Any = label(found)  # its types say that it may be a number
+    parts: NDArray[np.int32] = labelled[0]
     large = np.bincount(parts.ravel()) >= SPECK
     large[0] = False
     return large[parts]
@@ -246,8 +249,8 @@ def _outline(mask: NDArray[np.float32]) -> _Outline | None:
     low = np.maximum(points.min(axis=0) - BAND, 0)
     box = tuple(slice(first, last + BAND + 1) for first, last in zip(low, points.max(axis=0), strict=True))
     at = tuple((points - low).T)
-    slopes = -np.stack(np.gradient(np.pad(gaussian_filter(mask[box], BLUR, mode="nearest"), 1, mode="edge")))
-    slopes = slopes[:, 1:-1, 1:-1]
+    smooth = np.pad(gaussian_filter(mask[box], BLUR, mode="nearest"), 1, mode="edge")
+    slopes = 0.5 * np.stack([smooth[:-2, 1:-1] - smooth[2:, 1:-1], smooth[1:-1, :-2] - smooth[1:-1, 2:]])
     edge = np.zeros(mask[box].shape, dtype=bool)
     edge[at] = True
     near = np.argwhere(maximum_filter(edge, 2 * BAND + 1))
@@ -258,7 +261,7 @@ def _outline(mask: NDArray[np.float32]) -> _Outline | None:
         inside=inside,
         points=points,
         normals=(slopes[:, *at] / np.maximum(steepness[at], 1e-6)).T,
-        lengths=np.bincount(nearest, steepness[nearby], len(points)),
+        lengths=np.bincount(nearest, steepness[nearby], len(points)).astype(np.float64),
         near=near + low,
         nearest=nearest,
         distances=np.where(inside[box][nearby], -distances, distances) - (mask[box][at] - SOLID)[nearest],

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter, uniform_filter
+from scipy.ndimage import distance_transform_edt, gaussian_gradient_magnitude, minimum_filter, uniform_filter
 
 from beam_warp.capture.mattes import SOLID, MaskOffset, matte, moved_mask
 from beam_warp.capture.views import CapturedView
@@ -28,8 +29,8 @@ TIGHTEST = 0.2
 MOST_PIXELS = 3.0
 """No mask is moved further [pixel]."""
 
-SURE_DEPTH = 2
-"""Colour is the subject's alone this far within a mask that is exact [pixel]."""
+SOLID_COLOR = 0.99
+"""Colour is the subject's alone where coverage is more, before and after its outline is moved."""
 
 
 def relative_offset(mask: NDArray[np.float32], drawn: NDArray[np.float32]) -> MaskOffset | None:
@@ -42,8 +43,7 @@ def relative_offset(mask: NDArray[np.float32], drawn: NDArray[np.float32]) -> Ma
     Returns:
         The offset; None where the mask has no outline.
     """
-    slopes = np.gradient(gaussian_filter(mask.astype(np.float64), 1.0))
-    length = uniform_filter(np.hypot(*slopes), WINDOW)
+    length = uniform_filter(gaussian_gradient_magnitude(mask.astype(np.float64), 1.0), WINDOW)
     edge = (mask > SOLID) & (minimum_filter(mask, 3, mode="nearest") <= SOLID) & (length > 0.5 / WINDOW)
     if not edge.any():
         return None
@@ -95,19 +95,14 @@ def agreed_offsets(
 def moved_view(view: CapturedView, pixels: float) -> CapturedView:
     """Take a cut-out's mask in by so many pixels, or let it out if negative.
 
-    Colour near the outline, which the file does not have or has with too little light, is that of the nearest pixels
-    that are surely the subject's.
-
-    Raises:
-        InvalidArrayError: The view has no coverage.
+    Colour along the outline, which the file does not have or has with too little light, is that of the nearest pixels
+    that are the subject's alone.
     """
     if view.alpha is None or pixels == 0.0:
         return view
-    pixels = float(np.clip(pixels, -MOST_PIXELS, MOST_PIXELS))
-    alpha = moved_mask(view.alpha, pixels)
-    within = int(np.ceil(SURE_DEPTH + max(pixels, 0.0)))
-    sure = minimum_filter(view.alpha, 2 * within + 1, mode="nearest") > 0.99
-    if not sure.any():
+    alpha = moved_mask(view.alpha, float(np.clip(pixels, -MOST_PIXELS, MOST_PIXELS)))
+    solid = np.minimum(alpha, view.alpha) > SOLID_COLOR
+    if not solid.any():
         return replace(view, alpha=alpha, color=np.minimum(view.color, alpha[..., None]))
-    row, column = distance_transform_edt(~sure, return_distances=False, return_indices=True)
-    return replace(view, alpha=alpha, color=view.color[row, column] * alpha[..., None])
+    nearest: Any = distance_transform_edt(~solid, return_distances=False, return_indices=True)
+    return replace(view, alpha=alpha, color=view.color[tuple(nearest)] * np.where(solid, 1.0, alpha)[..., None])
