@@ -56,6 +56,8 @@ def relative_offset(mask: NDArray[np.float32], drawn: NDArray[np.float32]) -> Ma
 def largest_offset(view: CapturedView) -> MaskOffset | None:
     """Return how far a cut-out's mask can reach beyond the subject: as far as colour is missing within its outline.
 
+    This is half a pixel too little where the file's straight colour is the subject's in all pixels that it touches.
+
     Returns:
         The bound; None where the view has no mask with an outline, or the subject is as dark as nothing.
     """
