@@ -19,6 +19,12 @@ _ROUNDS_OF_SHARING = 8
 _ROUNDS_OF_NUMBERS = 100
 _ROUNDS_OF_VECTORS = 8
 
+_ROUNDING = 1e-5
+"""Squared distance over squared length that float32 cannot tell from 0."""
+
+_MOST_COMPARED = 2**27
+"""Most comparisons of a group's members with its entries in a round, so that no palette takes minutes."""
+
 _SAMPLE = 2**16
 """Vectors that the coarse division of a palette is found from."""
 
@@ -114,14 +120,16 @@ def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float3
     rng = np.random.default_rng(_SEED)
     coarse = max(1, round(np.sqrt(size)))
     sample = vectors[rng.choice(len(vectors), min(_SAMPLE, len(vectors)), replace=False)]
-    centers = _means(sample, sample[:coarse].copy())[0]
+    different = rng.permutation(np.unique(sample, axis=0))  # equal starts would leave most vectors in one group
+    centers = _means(sample, different[:coarse])[0]
+    coarse = len(centers)
     groups, distances = _nearest(vectors, centers)
     order = np.argsort(groups, kind="stable")
     ends = np.cumsum(np.bincount(groups, minlength=coarse))
     shares = _shares(np.bincount(groups, np.sqrt(distances), minlength=coarse), np.diff(ends, prepend=0), size)
     rows = np.split(order, ends[:-1])
     starts = [vectors[rng.choice(part, share, replace=False)] for part, share in zip(rows, shares, strict=True)]
-    labels, entries = np.empty(len(vectors), np.intp), np.empty((size, vectors.shape[1]), np.float32)
+    labels, entries = np.empty(len(vectors), np.intp), np.zeros((size, vectors.shape[1]), np.float32)
 
     def divide(rows: NDArray[np.intp], start: NDArray[np.float32], first: int) -> None:
         entries[first : first + len(start)], own = _means(vectors[rows], start)
@@ -133,10 +141,14 @@ def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float3
 
 
 def _shares(weights: NDArray[np.number], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:
-    """Divide entries among groups by weight; a group gets no more than it has members, and at least one if it has."""
+    """Divide entries among groups by weight; a group gets no more than it has members, and at least one if it has.
+
+    A group without weight, whose members are equal, gets no more than one: entries may be left over.
+    """
     shares = np.minimum(np.maximum(1, np.floor(weights / max(weights.sum(), 1e-300) * size)), counts).astype(np.intp)
+    most = np.where(weights > 0.0, np.minimum(counts, _MOST_COMPARED // np.maximum(counts, 1)), np.minimum(1, counts))
     for group in np.argsort(-weights, kind="stable"):  # what remains, or is too much by the least of one
-        shares[group] = np.clip(shares[group] + size - shares.sum(), min(1, counts[group]), counts[group])
+        shares[group] = np.clip(shares[group] + size - shares.sum(), min(1, counts[group]), most[group])
     return shares
 
 
@@ -166,5 +178,6 @@ def _nearest(
         score = half - part @ centers.T  # half the squared distance, up to the vector's own square
         labels[start : start + block] = best = score.argmin(axis=1)
         distances[start : start + block] = 2.0 * score[np.arange(len(part)), best]
-    distances += np.einsum("ij,ij->i", vectors, vectors)
-    return labels, np.maximum(distances, 0.0)
+    squares = np.einsum("ij,ij->i", vectors, vectors)
+    distances += squares
+    return labels, np.where(distances > _ROUNDING * squares, distances, 0.0)
