@@ -76,8 +76,8 @@ WORST_ERROR = 0.5
 
 KEY = 12.0
 LEAST_KEY = 1e-4
-"""A pixel is not of the plate if its squared difference, relative to its brightness, is more than so many times the
-median of all pixels, which noise exceeds once in 10,000 pixels, and at least this."""
+"""A pixel is not of the plate if its squared difference, over its brightness and the mean one, is more than so many
+times the median of all pixels, which noise is not, and at least this."""
 
 SPECK = 24
 """Parts of fewer pixels are noise, and holes of fewer pixels where the subject looks like the plate."""
