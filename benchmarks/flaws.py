@@ -60,6 +60,7 @@ LEAST_PIXELS = 0.1
 
 NAMED: Mapping[str, Collection[str]] = {
     "exposure": ("camera-exposure",),
+    "masks": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
     "wrong-camera": ("sees-nothing",),

@@ -28,6 +28,7 @@ from beam_warp.capture.records import (
     SparsePoints,
     camera_name_of,
     mask_beside,
+    plate_beside,
     read_bytes,
     read_text,
 )
@@ -143,6 +144,7 @@ def _record(row: _Pose, photographs: dict[int, Photograph], folder: Path, images
         camera=camera,
         image_path=images / name,
         mask_path=mask_beside(folder, name),
+        plate_path=plate_beside(folder, camera_name_of(name)),
         undistortion=undistortion,
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.findings import Findings, are, count_of, names_of
+from beam_warp.capture.mattes import MaskOffset
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.image.color import LUMINANCE
 from beam_warp.image.files import display_image
@@ -32,6 +33,9 @@ PLAIN_STOPS = 1.5
 BLACK = 1e-4
 """An image is black if its brightest pixel is at most this share of the median image's brightest pixel."""
 
+MASK_PIXELS, MASK_ERRORS = 0.5, 3.0
+"""Masks that are off by more than so many pixels and so many standard errors are reported."""
+
 SOLID = 0.5
 """A pixel belongs to the subject if its alpha is above this."""
 
@@ -48,6 +52,7 @@ class Glimpse:
         exposure: Median luminance of the subject, or of all where coverage is not known, as a power of two; None for
             an image without a subject, or a black one.
         coverage: Mean alpha; None if it is unknown.
+        mask_offset: How far the mask reached beyond the subject; None if nothing tells.
     """
 
     record: CaptureRecord
@@ -56,6 +61,7 @@ class Glimpse:
     brightest: float
     exposure: float | None
     coverage: float | None
+    mask_offset: MaskOffset | None = None
 
 
 def glimpse_of(record: CaptureRecord) -> Glimpse:
@@ -80,6 +86,7 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
         brightest=float(view.color.max()),
         exposure=float(np.log2(level)) if level > 0.0 else None,
         coverage=None if alpha is None else float(alpha.mean()),
+        mask_offset=view.mask_offset,
     )
 
 
@@ -123,6 +130,7 @@ def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse],
         left_out |= {*_names(void), *(record.name for record in training if record.camera_name in dead)}
     shown = [glimpse for glimpse in glimpses if glimpse not in black and glimpse not in empty]
     _judge_coverage(shown, findings)
+    _judge_outlines(shown, findings)
     names = {record.name for record in training}
     _judge_exposure([glimpse for glimpse in shown if glimpse.record.name in names], findings)
     return left_out
@@ -159,7 +167,8 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
         findings.warn(
             "no-coverage",
             "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
-            remedy="Write masks (masks/<image>.png, white on the subject) for a subject by itself.",
+            remedy="For a subject by itself, write masks (masks/<image>.png, white on the subject) or plates "
+            "(plates/<camera>.png, without the subject).",
         )
         return
     unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
@@ -197,6 +206,27 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             "perhaps inverted",
             _names(inverted),
             "White is the subject.",
+        )
+
+
+def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
+    """Find cameras whose masks end elsewhere than the subject does."""
+    by_camera: dict[str, list[MaskOffset]] = defaultdict(list)
+    for glimpse in glimpses:
+        if glimpse.mask_offset is not None:
+            by_camera[glimpse.record.camera_name].append(glimpse.mask_offset)
+    off = {
+        name: tuple(float(np.median([getattr(found, part) for found in offsets])) for part in ("pixels", "error"))
+        for name, offsets in by_camera.items()
+    }
+    wrong = {name: found for name, found in off.items() if abs(found[0]) > max(MASK_PIXELS, MASK_ERRORS * found[1])}
+    if wrong:
+        findings.warn(
+            "mask-offset",
+            f"masks of {count_of(len(wrong), 'camera')} end more than {MASK_PIXELS:g} pixel outside (+) or inside (-) "
+            "of where the subject does, and are moved there",
+            (f"{name} {pixels:+.1f} ± {error:.1f}" for name, (pixels, error) in wrong.items()),
+            "Make them again for outlines that are exact.",
         )
 
 

@@ -211,12 +211,12 @@ def _below(folder: Path, path: Path | None) -> str:
 def _judge_files(capture: Capture, findings: Findings) -> set[str]:
     """Find files that are missing or of another size; return the names of records that cannot be read."""
     step = -(-len(capture.records) // MAX_HEADERS)
-    missing: dict[str, list[CaptureRecord]] = {"image": [], "mask": []}
-    sizes: dict[str, list[tuple[CaptureRecord, str]]] = {"image": [], "mask": []}
+    missing: dict[str, list[CaptureRecord]] = {"image": [], "mask": [], "plate": []}
+    sizes: dict[str, list[tuple[CaptureRecord, str]]] = {"image": [], "mask": [], "plate": []}
     damaged: list[tuple[CaptureRecord, BeamError]] = []
     for record in capture.records[::step]:
         expected = (record.camera.width, record.camera.height)
-        for what, path in (("image", record.image_path), ("mask", record.mask_path)):
+        for what, path in (("image", record.image_path), ("mask", record.mask_path), ("plate", record.plate_path)):
             if path is None:
                 continue
             try:
@@ -230,7 +230,7 @@ def _judge_files(capture: Capture, findings: Findings) -> set[str]:
                     damaged.append((record, error))
                 if what == "image":
                     break
-    images, masks = missing["image"], missing["mask"]
+    images = missing["image"]
     if images:
         findings.add(
             "error" if len(images) * step >= len(capture.records) else "warning",
@@ -240,14 +240,15 @@ def _judge_files(capture: Capture, findings: Findings) -> set[str]:
             (record.name for record in images),
             "Copy them there, or take the records out.",
         )
-    if masks:
-        findings.warn(
-            "missing-mask",
-            f"{count_of(len(masks), 'mask')} {are(masks)} missing, and the images left out: "
-            f"{_below(capture.folder, masks[0].mask_path)}",
-            (record.name for record in masks),
-            "Copy them there.",
-        )
+    for what in ("mask", "plate"):
+        if missing[what]:
+            findings.warn(
+                f"missing-{what}",
+                f"{count_of(len(missing[what]), what)} {are(missing[what])} missing, and the images left out: "
+                f"{_below(capture.folder, getattr(missing[what][0], f'{what}_path'))}",
+                (record.name for record in missing[what]),
+                "Copy them there.",
+            )
     if damaged:
         what = f"{count_of(len(damaged), 'file')} cannot be read, and the images are left out: {damaged[0][1]}"
         findings.warn("damaged-image", what.rstrip("."), (record.name for record, _ in damaged))
@@ -260,7 +261,8 @@ def _judge_files(capture: Capture, findings: Findings) -> set[str]:
                 (record.name for record, _ in wrong),
                 "Scale the intrinsics with the images, or export the images at the size of the calibration.",
             )
-    unusable = [*images, *masks, *(record for record, _ in (*damaged, *sizes["image"], *sizes["mask"]))]
+    wrong = (*damaged, *sizes["image"], *sizes["mask"], *sizes["plate"])
+    unusable = [*(record for records in missing.values() for record in records), *(record for record, _ in wrong)]
     return {record.name for record in unusable}
 
 

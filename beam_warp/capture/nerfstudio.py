@@ -27,6 +27,7 @@ from beam_warp.capture.records import (
     SparsePoints,
     camera_name_of,
     mask_beside,
+    plate_beside,
     read_json,
 )
 from beam_warp.capture.undistort import Intrinsics
@@ -218,14 +219,16 @@ def _record(fields: _Fields, root: Path, splits: Mapping[str, str], keep: float)
         fields.matrix("transform_matrix") @ OPENGL_TO_OPENCV, "transform_matrix", keep
     )
     file_path = fields.text("file_path")
+    camera_name = fields.file_stem("camera", camera_name_of(file_path))
     return CaptureRecord(
-        camera_name=fields.file_stem("camera", camera_name_of(file_path)),
+        camera_name=camera_name,
         frame=fields.integer("frame", 0, low=0, high=MAX_FRAME),
         time=fields.number("time", 0.0, low=-1e9, high=1e9),
         split=fields.text("split", splits.get(file_path, "train")),
         camera=camera,
         image_path=root / file_path,
         mask_path=fields.path("mask_path", root) or mask_beside(root, file_path),
+        plate_path=fields.path("plate_path", root) or plate_beside(root, camera_name),
         color_space=_color_space(fields),
         truth_path=fields.path("truth", root),
         relit_paths=fields.paths("relit", root),

@@ -27,6 +27,7 @@ from beam_warp.capture.records import (
     CaptureRecord,
     camera_name_of,
     mask_beside,
+    plate_beside,
     read_json,
     read_text,
 )
@@ -152,6 +153,7 @@ def read(folder: Path, matrices: Sequence[Path]) -> CaptureContents:
                 camera=_camera(parts[stem], sizes[stem], scale, shift, found[stem]),
                 image_path=image,
                 mask_path=mask_beside(folder, name),
+                plate_path=plate_beside(folder, camera_name_of(name.removeprefix(f"{IMAGE_FOLDER}/"))),
                 color_space=options.color_space,
             )
         )

@@ -9,17 +9,18 @@ import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.capture.lenses import Lens
+from beam_warp.capture.mattes import MaskOffset, keyed, matte
 from beam_warp.capture.undistort import COLORS, Intrinsics, Undistortion
 from beam_warp.capture.views import CapturedView
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
-from beam_warp.image.files import Image, read_image
+from beam_warp.image.files import SUFFIXES, Image, read_image
 from beam_warp.world.camera import Camera
 
 MAX_CONTAINERS = 2**21
@@ -37,6 +38,9 @@ COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
 IMAGE_FOLDER = "images"
 MASK_FOLDER = "masks"
 """Folder of masks that are not named: ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``, for ``images/a/0.jpg``."""
+
+PLATE_FOLDER = "plates"
+"""Folder of images without the subject that are not named: ``plates/<camera>.png``, of any suffix that is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,8 @@ class CaptureRecord:
         camera: Pinhole camera of `image`.
         image_path: The image file, as photographed.
         mask_path: An image file, as photographed, that is white on the subject; None if there is none.
-        color_space: Colour space of the file, `LINEAR_REC709` or `DISPLAY_SRGB`; None for the format's convention.
+        plate_path: An image file of the same camera, as photographed, without the subject; None if there is none.
+        color_space: Colour space of the files, `LINEAR_REC709` or `DISPLAY_SRGB`; None for the format's convention.
         truth_path: An EXR of exact channels, if the capture is synthetic.
         relit_paths: Exact images under other lights, by the name of the light.
         undistortion: Undistortion of all files as they are read; None if a pinhole took them.
@@ -77,6 +82,7 @@ class CaptureRecord:
     camera: Camera
     image_path: Path
     mask_path: Path | None = None
+    plate_path: Path | None = None
     color_space: str | None = None
     truth_path: Path | None = None
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
@@ -110,22 +116,29 @@ class CaptureRecord:
     def view(self) -> CapturedView:
         """Read the image for reconstruction: scene-linear colour, undistorted, and coverage of the subject.
 
-        Coverage is the image's alpha times the mask, or the one of them that exists; without either it is unknown, and
-        alpha is None. The mask is applied to the photograph before that is undistorted, so that edges of both are
-        filtered alike. Nothing is kept: each call reads the files again.
+        Coverage is the image's alpha times the mask, or the one of them that exists; without either it is what differs
+        from the plate, and without that it is unknown, and alpha is None. Where the image shows what is beyond the
+        mask, the mask is moved to where the subject ends, and the backdrop is taken out of the colour: see
+        `beam_warp.capture.mattes`. This is done in the photograph before that is undistorted, so that edges of colour
+        and coverage are filtered alike. Nothing is kept: each call reads the files again.
 
         Raises:
-            MissingFileError: The image, or the mask that the capture names, does not exist.
+            MissingFileError: The image, or the mask or plate that the capture names, does not exist.
             AssetFormatError: A file is damaged, not of the camera's size, or holds values that no image has.
         """
-        image = self._photograph()
-        if self.mask_path is not None:
-            image = _masked(image, self._sized(read_image(self.mask_path), "mask"))
+        image, offset = self._photograph(), None
+        mask = None if self.mask_path is None else _coverage(self._sized(read_image(self.mask_path), "mask"))
+        if (scene := _scene(image)) is not None:
+            if image.alpha is not None and not _is_opaque(image.alpha):
+                mask = image.alpha if mask is None else image.alpha * mask
+            image, offset = self._cut_out(image, scene, mask)
+        elif mask is not None:
+            image = _masked(image, mask)
         image = self._undistorted(image)
         rgba = image.linear_rgba()
         alpha = None if image.alpha is None else rgba[..., 3]
         if alpha is not None:
-            if not ((alpha >= -ALPHA_ROUNDING) & (alpha <= 1.0 + ALPHA_ROUNDING)).all():
+            if not _is_coverage(alpha):
                 raise AssetFormatError(
                     f"alpha must lie in [0, 1], got {np.nanmin(alpha):g} to {np.nanmax(alpha):g}"
                     f"{' and NaN' if np.isnan(alpha).any() else ''} at {self.image_path}. Export the image again."
@@ -136,7 +149,7 @@ class CaptureRecord:
                 f"image must be finite, got NaN or infinity in {int((~np.isfinite(rgba)).any(axis=-1).sum())} pixels "
                 f"at {self.image_path}. Export it again, or repair those pixels."
             )
-        return CapturedView(name=self.name, camera=self.camera, color=rgba[..., :3], alpha=alpha)
+        return CapturedView(name=self.name, camera=self.camera, color=rgba[..., :3], alpha=alpha, mask_offset=offset)
 
     def truth(self) -> Image:
         """Read the exact channels, undistorted like the image.
@@ -166,6 +179,30 @@ class CaptureRecord:
     def _photograph(self) -> Image:
         return self._sized(read_image(self.image_path, color_space=self.color_space), "image")
 
+    def _plate(self) -> NDArray[np.float32] | None:
+        """Read the plate, scene-linear."""
+        if self.plate_path is None:
+            return None
+        plate = self._sized(read_image(self.plate_path, color_space=self.color_space), "plate").linear_rgba()[..., :3]
+        if not np.isfinite(plate).all():
+            raise AssetFormatError(f"plate must be finite, got NaN or infinity at {self.plate_path}. Export it again.")
+        return plate
+
+    def _cut_out(
+        self, image: Image, scene: NDArray[np.float32], mask: NDArray[np.float32] | None
+    ) -> tuple[Image, MaskOffset | None]:
+        """Return a photograph with the subject's coverage and colour alone, and how far off its mask was."""
+        plate = self._plate()
+        if mask is None and plate is None:
+            return image, None
+        if not np.isfinite(scene).all() or (mask is not None and not _is_coverage(mask)):
+            return (image if mask is None else _masked(_opaque(image), mask)), None  # as it is, and then refused
+        start = keyed(scene, cast("NDArray[np.float32]", plate)) if mask is None else np.clip(mask, 0.0, 1.0)
+        found = matte(scene, start, plate)
+        planes = dict(zip("RGBA", [*np.moveaxis(found.color, -1, 0), found.alpha], strict=True))
+        cut = Image(image.path, planes, LINEAR_REC709, premultiplied=True)
+        return cut, None if mask is None else found.offset
+
     def _sized(self, image: Image, what: str) -> Image:
         if (image.width, image.height) != (self.camera.width, self.camera.height):
             raise AssetFormatError(
@@ -178,10 +215,42 @@ class CaptureRecord:
         return image if self.undistortion is None else self.undistortion.image(image)
 
 
-def _masked(image: Image, mask: Image) -> Image:
-    """Return an image whose alpha is multiplied by a mask's brightness; coverage has no sRGB curve to decode."""
+def _coverage(mask: Image) -> NDArray[np.float32]:
+    """Return a mask's brightness; coverage has no sRGB curve to decode."""
     rgb = mask.rgb()
-    coverage = rgb[..., 0] if (rgb == rgb[..., :1]).all() else rgb.mean(axis=-1, dtype=np.float32)
+    return rgb[..., 0] if (rgb == rgb[..., :1]).all() else rgb.mean(axis=-1, dtype=np.float32)
+
+
+def _is_coverage(alpha: NDArray[np.float32]) -> bool:
+    """Tell whether values lie in [0, 1], but for rounding; NaN does not."""
+    return bool(((alpha >= -ALPHA_ROUNDING) & (alpha <= 1.0 + ALPHA_ROUNDING)).all())
+
+
+def _scene(image: Image) -> NDArray[np.float32] | None:
+    """Return subject and backdrop, scene-linear, ``(H, W, 3)``; None if the image shows the subject alone.
+
+    Straight colour under an alpha of 0 is the backdrop's if it varies: where a subject was cut out, it is constant.
+    """
+    alpha = image.alpha
+    if alpha is not None and not _is_opaque(alpha):
+        if image.premultiplied or not (beyond := image.rgb()[alpha == 0.0]).size:
+            return None
+        if not (beyond != np.median(beyond, axis=0)).any(axis=-1).mean() > 0.5:
+            return None
+    return _opaque(image).linear_rgba()[..., :3]
+
+
+def _is_opaque(alpha: NDArray[np.float32]) -> bool:
+    return bool((alpha == 1.0).all())
+
+
+def _opaque(image: Image) -> Image:
+    """Return an image without its alpha."""
+    return replace(image, channels={name: plane for name, plane in image.channels.items() if name != "A"})
+
+
+def _masked(image: Image, coverage: NDArray[np.float32]) -> Image:
+    """Return an image whose alpha is multiplied by coverage."""
     channels = dict(image.channels)
     if image.premultiplied:
         if image.color_space == DISPLAY_SRGB:
@@ -350,3 +419,11 @@ def mask_beside(root: Path, file_path: str) -> Path | None:
         if path.is_file():
             return path
     return None
+
+
+def plate_beside(root: Path, camera_name: str) -> Path | None:
+    """Return the image in `PLATE_FOLDER` that is named after a camera; None if there is none."""
+    folder = root / PLATE_FOLDER
+    if not folder.is_dir():
+        return None
+    return next((path for suffix in SUFFIXES if (path := folder / f"{camera_name}{suffix}").is_file()), None)

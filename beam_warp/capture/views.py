@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beam_warp.capture.mattes import MaskOffset
 from beam_warp.checks import require_array, require_count, require_finite, require_range
 from beam_warp.errors import InvalidArrayError
 from beam_warp.world.camera import Camera
@@ -21,6 +22,7 @@ class CapturedView:
         camera: The pinhole that took the image.
         color: Scene-linear Rec.709, premultiplied by ``alpha`` where there is one, ``(H, W, 3)`` float32.
         alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None if it is unknown.
+        mask_offset: How far the file's mask reached beyond the subject before it was moved; None if nothing tells.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
@@ -30,6 +32,7 @@ class CapturedView:
     camera: Camera
     color: NDArray[np.float32]
     alpha: NDArray[np.float32] | None = None
+    mask_offset: MaskOffset | None = None
 
     def __post_init__(self) -> None:
         """Check sizes and values once."""

@@ -81,6 +81,7 @@ darken = changed(COLOR, lambda color: color // 2)  # of sRGB: 2.3 stops
         (changed(ALPHA, np.zeros_like), "c03/0001.png", "empty-mask", "warning"),
         (changed(ALPHA, np.zeros_like), "*/*", "empty-mask", "error"),
         (changed(ALPHA, lambda _: 255), "c03/*", "full-mask", "warning"),
+        (changed(ALPHA, lambda _: 255), "*/*", "full-mask", "warning"),
         (changed(ALPHA, lambda alpha: alpha // 255), "c03/*", "mask-range", "error"),
         (changed(ALPHA, lambda alpha: 255 - alpha), "c03/*", "inverted-mask", "warning"),
         (darken, "c03/*", "camera-exposure", "warning"),
