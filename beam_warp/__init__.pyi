@@ -13,7 +13,7 @@ from .render.deferred import DeferredRenderer as DeferredRenderer
 from .render.options import DeferredOptions as DeferredOptions
 from .render.path import PathOptions as PathOptions
 from .render.path import PathRenderer as PathRenderer
-from .schema.validator import validate as validate  # pyright: ignore[reportMissingImports]  (mapped folder)
+from .schema.validation.validator import validate as validate  # pyright: ignore[reportMissingImports]  (mapped folder)
 from .stage.stage import Stage as Stage
 from .trace.incident import irradiance as irradiance
 from .trace.occlusion import ambient_occlusion as ambient_occlusion

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tables import Rows, table
 
+from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.formats import FORMATS
-from beam_warp.converters.importers import IMPORTERS
 
 
 @table("formats")

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beam_warp.converters.common.frames import sequence_of
+from beam_warp.converters.common.importers import IMPORTERS
+from beam_warp.converters.common.options import Activation, MaterialActivation, ReadOptions
+from beam_warp.converters.common.options import WriteOptions as WriteOptions
 from beam_warp.converters.formats import FORMATS, decode, format_of, probe, suffix_of
 from beam_warp.converters.frame_files import write_frames
-from beam_warp.converters.frames import sequence_of
-from beam_warp.converters.importers import IMPORTERS
 from beam_warp.converters.numbering import files_at, require_no_stale_frames
 from beam_warp.converters.numbering import numbered_path as numbered_path
-from beam_warp.converters.options import Activation, MaterialActivation, ReadOptions
-from beam_warp.converters.options import WriteOptions as WriteOptions
 from beam_warp.converters.staging import folders_made, require_writable
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.gaussians import GaussianSequence

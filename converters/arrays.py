@@ -20,9 +20,8 @@ import numpy as np
 from numpy.lib import format as npy
 
 from beam_warp.checks import require_choice, require_number
-from beam_warp.converters.frame_files import FrameToWrite
-from beam_warp.converters.frames import DecodedFrame, sequence_of
-from beam_warp.converters.options import ReadOptions, WriteOptions
+from beam_warp.converters.common.frames import DecodedFrame, FrameToWrite, sequence_of
+from beam_warp.converters.common.options import ReadOptions, WriteOptions
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB
 from beam_warp.world.axes import require_axes

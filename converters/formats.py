@@ -1,9 +1,9 @@
 """The table of formats: which suffix is read and written by which module.
 
-A module that reads has ``decode(path, options)`` and ``probe(path)`` (see `beam_warp.converters.frames`), or, if its
-files hold sequences, ``read(path, options)``. A module that writes has ``encode(frame, path, options)`` (see
-`beam_warp.converters.frame_files`), or, if its files hold sequences, ``write(sequence, path, options)``. Modules are
-imported when their suffix is met, so that PLY costs no USD.
+A module that reads has ``decode(path, options)`` and ``probe(path)``, or, if its files hold sequences,
+``read(path, options)``. A module that writes has ``encode(frame, path, options)``, or, if its files hold sequences,
+``write(sequence, path, options)``. Frames in and out are described in `beam_warp.converters.common.frames`. Modules
+are imported when their suffix is met, so that PLY costs no USD.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.common.options import ReadOptions
 from beam_warp.errors import InvalidOptionError
 
 OF_ANY_FORMAT = frozenset({"source_axes", "meters_per_unit", "drop_invalid"})
-"""Options of `beam_warp.converters.options.ReadOptions` that say something of every format."""
+"""Options of `beam_warp.converters.common.options.ReadOptions` that say something of every format."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,15 +80,15 @@ _H5 = Format(name="HDF5", reader="arrays", holds_sequences=True)
 FORMATS: dict[str, Format] = {
     ".ply": Format(
         name="PLY",
-        reader="ply",
-        writer="ply_writer",
+        reader="ply.reader",
+        writer="ply.writer",
         read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
     ),
-    ".compressed.ply": Format(name="compressed PLY", reader="ply", writer="compressed_ply_writer"),
-    ".spz": Format(name="SPZ", reader="spz", writer="spz", axes="rub"),
-    **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf", writer="gltf_writer", axes="rub")),
-    ".sog": Format(name="SOG", reader="sog", writer="sog_writer"),
-    "meta.json": Format(name="SOG", reader="sog"),
+    ".compressed.ply": Format(name="compressed PLY", reader="ply.reader", writer="ply.compressed_writer"),
+    ".spz": Format(name="SPZ", reader="spz.reader", writer="spz.writer", axes="rub"),
+    **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf.reader", writer="gltf.writer", axes="rub")),
+    ".sog": Format(name="SOG", reader="sog.reader", writer="sog.writer"),
+    "meta.json": Format(name="SOG", reader="sog.reader"),
     ".splat": Format(name="splat", reader="splat", writer="splat"),
     ".ksplat": Format(name="ksplat", reader="ksplat"),
     ".npz": Format(name="NumPy", reader="arrays", writer="arrays", keeps_axes=True),
@@ -123,7 +123,7 @@ def format_of(path: Path) -> Format:
 
 
 def decode(path: Path, options: ReadOptions) -> Any:
-    """Read a file that holds one frame by the module of its format; a `beam_warp.converters.frames.DecodedFrame`."""
+    """Read a file that holds one frame by the module of its format; see `beam_warp.converters.common.frames`."""
     return format_of(path).of_reader("decode")(path, options)
 
 

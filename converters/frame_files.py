@@ -4,41 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+from beam_warp.converters.common.frames import FrameToWrite
+from beam_warp.converters.common.importers import IMPORTERS, RDF
+from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.formats import Format
-from beam_warp.converters.importers import IMPORTERS, RDF
 from beam_warp.converters.numbering import numbered_path
-from beam_warp.converters.options import WriteOptions
 from beam_warp.image.files import replacing
 from beam_warp.world.axes import change_axes
-from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import stated_raster
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameToWrite:
-    """One frame as a file is to hold it.
-
-    Attributes:
-        name: Name of the file without its suffix.
-        cloud: Gaussians in the axes and the units of the file.
-        number: Number of the frame, from 0.
-        frames_per_second: Playback rate.
-        units_per_meter: Units of the file in a metre.
-        raster: How splats are to be drawn: antialiased or not, and the low-pass [px²]; None if that is not stated.
-        beside: Returns the temporary place of another file, which appears under the given name together with this one.
-    """
-
-    name: str
-    cloud: GaussianCloud
-    number: int
-    frames_per_second: float
-    units_per_meter: float
-    raster: tuple[bool, float] | None
-    beside: Callable[[str], Path]
-
 
 Encode = Callable[[FrameToWrite, Path, WriteOptions], None]
 """Writes one frame to a file, whose place is temporary."""

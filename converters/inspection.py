@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from beam_warp.converters.common.frames import ASSUMED_AXES, DecodedFrame
+from beam_warp.converters.common.importers import RDF
+from beam_warp.converters.common.options import ReadOptions
+from beam_warp.converters.common.vertical import CONTRADICTION, likely_axes, vertical_of
 from beam_warp.converters.formats import format_of
-from beam_warp.converters.frames import ASSUMED_AXES, DecodedFrame
-from beam_warp.converters.importers import RDF
 from beam_warp.converters.numbering import files_at
-from beam_warp.converters.options import ReadOptions
-from beam_warp.converters.vertical import CONTRADICTION, likely_axes, vertical_of
 from beam_warp.world.axes import handedness
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud, GaussianSequence
 

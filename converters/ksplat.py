@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.checks import rows_at
-from beam_warp.converters.activations import dc_from_color
-from beam_warp.converters.frames import DecodedFrame
-from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.common.activations import dc_from_color
+from beam_warp.converters.common.frames import DecodedFrame
+from beam_warp.converters.common.options import ReadOptions
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB
 

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from beam_warp.checks import rows_at
-from beam_warp.converters.activations import color_from_dc, dc_from_color
-from beam_warp.converters.colors import display_radiance
-from beam_warp.converters.frame_files import FrameToWrite
-from beam_warp.converters.frames import DecodedFrame
-from beam_warp.converters.options import ReadOptions, WriteOptions
+from beam_warp.converters.common.activations import color_from_dc, dc_from_color
+from beam_warp.converters.common.colors import display_radiance
+from beam_warp.converters.common.frames import DecodedFrame, FrameToWrite
+from beam_warp.converters.common.options import ReadOptions, WriteOptions
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB
 

@@ -6,10 +6,10 @@ import dataclasses
 from functools import lru_cache
 from pathlib import Path
 
-from beam_warp.converters.colors import resize_bands
-from beam_warp.converters.frames import overruled
-from beam_warp.converters.importers import IMPORTERS
-from beam_warp.converters.options import ReadOptions, WriteOptions
+from beam_warp.converters.common.colors import resize_bands
+from beam_warp.converters.common.frames import overruled
+from beam_warp.converters.common.importers import IMPORTERS
+from beam_warp.converters.common.options import ReadOptions, WriteOptions
 from beam_warp.schema.files import unaligned_files
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters

@@ -13,9 +13,9 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
 from beam_warp.converters import formats
-from beam_warp.converters.frames import DecodedFrame, sequence_of
+from beam_warp.converters.common.frames import DecodedFrame, sequence_of
+from beam_warp.converters.common.options import ReadOptions
 from beam_warp.converters.numbering import holds_a_frame, in_order
-from beam_warp.converters.options import ReadOptions
 from beam_warp.errors import AssetFormatError
 from beam_warp.world.gaussians import GaussianSequence
 

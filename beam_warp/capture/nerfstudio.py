@@ -31,7 +31,7 @@ from beam_warp.capture.records import (
 )
 from beam_warp.capture.undistort import Intrinsics
 from beam_warp.checks import is_text
-from beam_warp.converters.ply_container import read_columns, read_header
+from beam_warp.converters.ply.container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.world.camera import OPENGL_TO_OPENCV

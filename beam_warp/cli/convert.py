@@ -16,10 +16,10 @@ from beam_warp import __version__, converters
 from beam_warp.cli.common.console import escaped, options_named, print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
+from beam_warp.converters.common.importers import IMPORTERS
+from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
 from beam_warp.converters.formats import FORMATS, format_of
-from beam_warp.converters.importers import IMPORTERS
 from beam_warp.converters.numbering import numbered_path
-from beam_warp.converters.options import Activation, MaterialActivation, Profile
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -14,7 +14,7 @@ from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.physical_rules import Measured
-    from beam_warp.schema.report import Report
+    from beam_warp.schema.validation.report import Report
 
 _EPILOG = """\
 exit code: 0 valid (warnings allowed), 1 a rule of severity error is broken, 2 the file cannot be read
@@ -54,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     from beam_warp.converters.numbering import files_at
-    from beam_warp.schema.mending import mend
-    from beam_warp.schema.sarif import write_sarif
-    from beam_warp.schema.validator import validate
+    from beam_warp.schema.validation.mending import mend
+    from beam_warp.schema.validation.sarif import write_sarif
+    from beam_warp.schema.validation.validator import validate
 
     options.asset = str(files_at(Path(options.asset))[0])
     if options.sarif is not None and options.sarif.suffix not in (".sarif", ".json"):
@@ -110,8 +110,8 @@ def _say(asset: str, report: Report, measured: Sequence[Measured]) -> None:
 def _rules() -> list[dict[str, str]]:
     """Return id, severity and text of every rule, and what ``--fix`` does about it."""
     from beam_warp.evaluate.physical_rules import PHYSICAL_RULES
-    from beam_warp.schema.mends import mend_text
-    from beam_warp.schema.validator import ALL_RULES
+    from beam_warp.schema.validation.mends import mend_text
+    from beam_warp.schema.validation.validator import ALL_RULES
 
     rules = sorted([*ALL_RULES, *PHYSICAL_RULES], key=lambda rule: rule.id)
     return [{"id": rule.id, "severity": rule.severity, "text": rule.text, "fix": mend_text(rule.id)} for rule in rules]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.schema.layout import HALF_EPSILON
-from beam_warp.schema.report import BrokenRule, Severity
+from beam_warp.schema.validation.report import BrokenRule, Severity
 
 FAR = 4.0
 """Standard errors beyond which an estimate counts as off."""

@@ -13,7 +13,7 @@ import pytest
 from beam_warp import __version__, converters
 from beam_warp.cli.convert import main
 from beam_warp.converters import WriteOptions
-from beam_warp.converters.importers import IMPORTERS
+from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from beam_warp.converters.clustering import codebook, nearest_codes, palette
+from beam_warp.converters.sog.clustering import codebook, nearest_codes, palette
 
 
 def mean_square(values, size=256):

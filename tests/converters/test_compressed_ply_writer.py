@@ -9,8 +9,8 @@ import pytest
 from beam_warp import converters
 from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.converters import WriteOptions
-from beam_warp.converters.compressed_ply import CHUNK_ROWS
-from beam_warp.converters.compressed_ply_writer import _between_bounds, _morton_order
+from beam_warp.converters.ply.compressed import CHUNK_ROWS
+from beam_warp.converters.ply.compressed_writer import _between_bounds, _morton_order
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.harmonics import SH_C0

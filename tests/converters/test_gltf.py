@@ -19,7 +19,8 @@ from reference.harmonics import sh_color
 from scipy.spatial.transform import Rotation
 
 from beam_warp import converters
-from beam_warp.converters import WriteOptions, gltf
+from beam_warp.converters import WriteOptions
+from beam_warp.converters.gltf import reader as gltf
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709, srgb_to_linear
 from beam_warp.world.axes import change_axes

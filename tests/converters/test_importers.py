@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
-from beam_warp.converters.importers import IMPORTERS
+from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.axes import AXIS_CODES

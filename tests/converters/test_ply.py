@@ -11,7 +11,7 @@ from reference.harmonics import sh_color
 from beam_warp import converters
 from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.converters import WriteOptions
-from beam_warp.converters.activations import LOGIT_LIMIT
+from beam_warp.converters.common.activations import LOGIT_LIMIT
 from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, SchemaVersionError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.gaussians import GaussianSequence
@@ -435,7 +435,7 @@ def test_a_later_schema_is_refused(columns, ply_file):
 
 
 def test_files_too_large_for_importers_are_refused(make_cloud, tmp_path, monkeypatch):
-    monkeypatch.setattr("beam_warp.converters.ply_writer.MAX_FILE_BYTES", 5000)
+    monkeypatch.setattr("beam_warp.converters.ply.writer.MAX_FILE_BYTES", 5000)
     with pytest.raises(OutputError, match=r"a PLY file must be under 2 GB for importers to read it, got 0\.00 GB"):
         write(make_cloud(), tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
@@ -445,7 +445,7 @@ def test_a_full_disk_leaves_nothing(make_cloud, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("beam_warp.converters.ply_writer._row_source", lambda *_: full)
+    monkeypatch.setattr("beam_warp.converters.ply.writer._row_source", lambda *_: full)
     message = r"output must be a writable file, got .*a\.ply \(.*No space left on device\)"
     with pytest.raises(OutputError, match=message):
         write(make_cloud(), tmp_path / "a.ply")

@@ -9,7 +9,7 @@ import pytest
 
 from beam_warp import converters
 from beam_warp.cli.convert import main
-from beam_warp.converters.ply_container import read_columns, read_header
+from beam_warp.converters.ply.container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 
 

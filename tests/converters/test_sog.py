@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from beam_warp import converters
-from beam_warp.converters import sog
-from beam_warp.converters.options import ReadOptions
+from beam_warp.converters.common.options import ReadOptions
+from beam_warp.converters.sog import reader as sog
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.world.metadata import stated_raster
 

@@ -16,7 +16,9 @@ from reference.covariances import covariances
 from reference.harmonics import sh_color
 
 from beam_warp import converters
-from beam_warp.converters import WriteOptions, spz
+from beam_warp.converters import WriteOptions
+from beam_warp.converters.spz import reader
+from beam_warp.converters.spz import writer as spz
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.axes import change_axes
@@ -229,7 +231,7 @@ def test_positions_fit_into_24_bits_and_are_fine_enough(reach):
 
 
 def test_other_axes_are_stated(make_cloud, tmp_path):
-    from beam_warp.converters.frame_files import FrameToWrite
+    from beam_warp.converters.common.frames import FrameToWrite
 
     facts = {
         "number": 0,
@@ -292,8 +294,8 @@ def test_cut_anywhere(tmp_path, version):
     bare = spz_bytes(ROWS, version)
     for size in range(len(bare)):
         with pytest.raises(AssetFormatError):
-            spz.probe(file_of(tmp_path, bare[:size]))
-    assert spz.probe(file_of(tmp_path, content)).count == spz.probe(file_of(tmp_path, bare)).count == 2
+            reader.probe(file_of(tmp_path, bare[:size]))
+    assert reader.probe(file_of(tmp_path, content)).count == reader.probe(file_of(tmp_path, bare)).count == 2
 
 
 EMPTY_RECORD = struct.pack("<II", COORDINATES, 4)

@@ -11,7 +11,7 @@ import pytest
 from beam_warp.errors import AssetFormatError, BeamError
 from beam_warp.schema.probe import fault
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.validator import validate
+from beam_warp.schema.validation.validator import validate
 from beam_warp.schema.writer import write_asset
 
 CUTTER = textwrap.dedent("""

@@ -7,7 +7,7 @@ from pxr import Sdr, Usd, UsdGeom, UsdShade
 from beam_warp.errors import BeamError
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.validator import validate_stage
+from beam_warp.schema.validation.validator import validate_stage
 from beam_warp.schema.writer import write_asset
 from beam_warp.world.gaussians import GaussianSequence
 

@@ -8,11 +8,11 @@ from support.broken_assets import BREAKERS, drop_material
 from beam_warp.errors import OutputError
 from beam_warp.schema.authoring import kernel_extent
 from beam_warp.schema.layout import to_vt
-from beam_warp.schema.mending import mend, mend_stage
-from beam_warp.schema.mends import CLIPPED_REACH, MENDS
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.report import Report
-from beam_warp.schema.validator import check_rules
+from beam_warp.schema.validation.mending import mend, mend_stage
+from beam_warp.schema.validation.mends import CLIPPED_REACH, MENDS
+from beam_warp.schema.validation.report import Report
+from beam_warp.schema.validation.validator import check_rules
 from beam_warp.world.gaussians import GaussianSequence
 
 ABOVE_ONE = 1.0 + CLIPPED_REACH
@@ -207,7 +207,7 @@ def test_nothing_is_left_behind_where_nothing_can_be_written(tmp_path, asset, mo
     def refuse(*_):
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr("beam_warp.schema.mending.publish", refuse)
+    monkeypatch.setattr("beam_warp.schema.validation.mending.publish", refuse)
     with pytest.raises(OutputError, match="the disk is full"):
         mend(tmp_path / "asset.usdc")
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files

@@ -8,9 +8,10 @@ import sys
 import pytest
 from pxr import Usd, UsdGeom, UsdVol
 
-from beam_warp.schema import MATERIAL_API, PLUGIN_FOLDER, SCHEMA_VERSION, SEQUENCE_API, generate, register
+from beam_warp.schema import MATERIAL_API, PLUGIN_FOLDER, SCHEMA_VERSION, SEQUENCE_API, register
 from beam_warp.schema.layout import CHANNELS
-from beam_warp.schema.rules import OPTIONAL_TOKENS, TOKENS
+from beam_warp.schema.validation import generate
+from beam_warp.schema.validation.rules import OPTIONAL_TOKENS, TOKENS
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ def test_generated_files_have_not_drifted(tmp_path):
     generate.generate(tmp_path)
     for name in generate.GENERATED:
         assert (tmp_path / name).read_text() == (PLUGIN_FOLDER / name).read_text(), (
-            f"{name} is stale: run python -m beam_warp.schema.generate"
+            f"{name} is stale: run python -m beam_warp.schema.validation.generate"
         )
 
 

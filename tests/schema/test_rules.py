@@ -6,8 +6,8 @@ from pxr import Usd, UsdValidation
 from support.broken_assets import BREAKERS, drop_material, low_pass, numbered
 
 from beam_warp.schema import PLUGIN_FOLDER
-from beam_warp.schema.report import Report
-from beam_warp.schema.validator import ALL_RULES, HOST_PLUGIN, check_rules, validate, validate_stage
+from beam_warp.schema.validation.report import Report
+from beam_warp.schema.validation.validator import ALL_RULES, HOST_PLUGIN, check_rules, validate, validate_stage
 from beam_warp.schema.writer import write_asset
 
 
@@ -119,7 +119,7 @@ def test_other_hosts_find_a_validator_for_each_rule():
     known = UsdValidation.ValidationRegistry().GetValidatorMetadataForKeyword("BeamValidators")
     docs = {data.name.removeprefix(f"{HOST_PLUGIN}:"): data.doc for data in known if not data.isSuite}
     assert docs == {rule.id: rule.text for rule in ALL_RULES}
-    assert (PLUGIN_FOLDER / "host_validator.py").is_file()
+    assert (PLUGIN_FOLDER / "validation" / "host_validator.py").is_file()
 
 
 @pytest.mark.parametrize("rule", BREAKERS)

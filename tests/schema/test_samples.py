@@ -12,7 +12,7 @@ from beam_warp.image.metrics import psnr
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.validator import validate_stage
+from beam_warp.schema.validation.validator import validate_stage
 from beam_warp.world.axes import change_axes
 from beam_warp.world.harmonics import sh_basis
 from beam_warp.world.shot import Shot

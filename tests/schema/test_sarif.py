@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from beam_warp.errors import OutputError
-from beam_warp.schema.report import BrokenRule, Report
-from beam_warp.schema.sarif import sarif_log, write_sarif
+from beam_warp.schema.validation.report import BrokenRule, Report
+from beam_warp.schema.validation.sarif import sarif_log, write_sarif
 
 TEXTS = {"BEAM-GEO-004": "extent is authored.", "BEAM-GEO-012": "Orientations are unit quaternions."}
 LENGTH = BrokenRule("BEAM-GEO-012", "error", "vectors must have unit length.", "/A", "orientations", 3.0, 2)

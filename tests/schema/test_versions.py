@@ -9,7 +9,7 @@ from pxr import Usd
 from beam_warp.schema import reader
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.validator import validate_stage
+from beam_warp.schema.validation.validator import validate_stage
 from beam_warp.schema.writer import write_asset
 from beam_warp.world.metadata import stated_capture_frames, stated_raster
 

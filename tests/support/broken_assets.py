@@ -5,7 +5,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API
 from beam_warp.schema.layout import to_vt
-from beam_warp.schema.validator import check_rules
+from beam_warp.schema.validation.validator import check_rules
 from beam_warp.schema.writer import write_asset
 from beam_warp.world.gaussians import GaussianSequence
 

@@ -25,8 +25,8 @@ from PIL import Image
 from web.probe import EYE, FIELD_OF_VIEW, SIDE, TARGET, tripod
 
 from beam_warp.converters import WriteOptions, write
+from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.formats import FORMATS, suffix_of
-from beam_warp.converters.importers import IMPORTERS
 from beam_warp.world.axes import axes_matrix
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -61,7 +61,7 @@ class Viewer:
         name: What people call it.
         package: Its package of npm.
         page: The page that opens it, beside this file.
-        importer: Its name for ``--for``, in `beam_warp.converters.importers.IMPORTERS`, which says what it reads.
+        importer: Its name for ``--for``, in `beam_warp.converters.common.importers`, which says what it reads.
         placement: How a file that is written for it stands.
         others: The same for endings of files that stand otherwise.
         colors_wrong: Endings of which it shows view-dependent colour wrongly, whoever wrote the file.

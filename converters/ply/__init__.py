@@ -1,0 +1,1 @@
+"""PLY in and out: full, compressed, and with the materials of other producers."""

@@ -1,0 +1,1 @@
+"""SOG in and out: a palette-coded splat in WebP images."""

@@ -1,0 +1,1 @@
+"""The rules of the specification, what runs them, and what mends what breaks them."""
