@@ -76,6 +76,9 @@ class FakeSteps:
     def options(self):
         return {"count": self.count, "seed": self.seed}
 
+    def refine_rig(self, names, views, progress):
+        return None
+
     def begin(self, views, progress):
         level = self.level(views)
         self.calls.append("begin")
