@@ -5,8 +5,10 @@ All conditions are phrased positively (``not (value >= low)``), so that NaN fail
 
 from __future__ import annotations
 
+import os
 import re
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -18,6 +20,10 @@ _SURROGATE = re.compile(r"[\ud800-\udfff]")
 
 UNIT_TOLERANCE = 1e-3
 """Largest | |v| - 1 | accepted as unit length; half-precision quaternions, the coarsest input, are within it."""
+
+
+NAME_BYTES = 255
+"""Longest name of a file or folder on usual file systems [byte]."""
 
 
 def rows_at(bad: NDArray[np.bool_]) -> str:
@@ -103,6 +109,40 @@ def require_number(name: str, value: float, low: float = -np.inf, high: float = 
 def is_text(value: object) -> TypeGuard[str]:
     """Return True for a text that is not empty and can be a file's name: no null, no half of a surrogate pair."""
     return isinstance(value, str) and bool(value) and "\0" not in value and not _SURROGATE.search(value)
+
+
+def require_path(name: str, value: object, *, room: int = 0) -> Path:
+    """Return a path after checking that a file can have such a name.
+
+    Args:
+        name: The argument, for the message.
+        value: A text or an `os.PathLike` of text.
+        room: Bytes that must be left for what is added to the name.
+
+    Raises:
+        InvalidOptionError: Anything else, also bytes; an empty text; a null character; what is not UTF-8; or a part
+            that is longer than `NAME_BYTES`.
+    """
+    text = os.fspath(value) if isinstance(value, os.PathLike) else value
+    if not isinstance(text, str) or not text:
+        raise InvalidOptionError(f"{name} must be a path as a text or pathlib.Path, got {value!r}. Pass one.")
+    try:
+        longest = max(map(len, text.encode().split(b"/")))
+    except UnicodeEncodeError:
+        raise InvalidOptionError(f"{name} must be a name in UTF-8, got {text!r}. Rename the file.") from None
+    if "\0" in text:
+        raise InvalidOptionError(f"{name} must be a name without null characters, got {text!r}. Rename it.")
+    if longest > NAME_BYTES - room:
+        raise InvalidOptionError(
+            f"{name} must have names of at most {NAME_BYTES - room} bytes, got {longest} in {shortened(text)}. "
+            "Shorten it."
+        )
+    return Path(text)
+
+
+def shortened(text: str) -> str:
+    """Return the ends of a text that is too long for a message."""
+    return text if len(text) <= 80 else f"{text[:40]}…{text[-36:]}"
 
 
 def require_choice(name: str, value: str, choices: tuple[str, ...]) -> str:

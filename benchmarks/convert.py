@@ -35,11 +35,12 @@ import record
 import warp as wp
 from convert_looks import Looks, difference, looks_of_cloud, looks_of_ply
 from timing import spread
+from write_lcc import write_lcc, write_lcc2
 
-from beam_warp.converters import read, write
+from beam_warp.converters import WriteOptions, read, write
 from beam_warp.converters.formats import FORMATS, suffix_of
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.world.axes import axes_matrix
+from beam_warp.world.axes import axes_matrix, change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 Row = dict[str, Any]
@@ -54,6 +55,9 @@ THEIR_AXES = {".glb": "luf"}
 """Axes in which splat-transform writes such a cloud, which it does not state; into other formats it copies numbers."""
 
 KSPLAT_LEVELS = (0, 1, 2)
+
+SCENES = (".lcc", ".lcc2", "lod-meta.json")
+"""Endings of indices of scenes with levels, the finest of which is read."""
 
 PATTERNS = ("splats/**/*", "fixtures/splat_transform/*", "sequences/wave_sog/wave_0*01.sog")
 """Files of other producers, in the folder of data."""
@@ -138,11 +142,14 @@ def ours(source: Path, target: Path) -> list[str]:
 def theirs(bench: Bench, source: Path, target: Path) -> list[str]:
     """Return splat-transform's command for a conversion; like ours, it writes SPZ 3, and no GPU is used."""
     options = ["-q", "-w", *(["-g", "cpu"] if target.name.endswith((".sog", ".json")) else [])]
+    tags = ["-l", "0"] if target.name == "lod-meta.json" else []
     return [
         *bench.theirs,
         *options,
+        *(["-L", "0"] if suffix_of(source.name) in SCENES else []),
         *(["--spz-version", "3"] if target.suffix == ".spz" else []),
         str(source),
+        *tags,
         str(target),
     ]
 
@@ -307,15 +314,17 @@ def errors(bench: Bench) -> Iterator[Row]:
     source = source_file(bench, bench.error_count)
     truth = looks_of_ply(source)
     rows: list[Row] = []
-    for name, path, axes in _files_of_both(bench, source):
+    for name, path, axes in (*_files_of_both(bench, source), *_scenes_of_both(bench, source)):
         ending = suffix_of(path.name)
+        is_scene = ending in SCENES  # which have a folder of their own
         row: Row = {
             "name": name,
-            "bytes": path.stat().st_size,
+            "bytes": sum(file.stat().st_size for file in (path.parent.rglob("*") if is_scene else [path])),
             "written": difference(our_reading_turned(path, axes), truth),
         }
         if ending in bench.reads:
-            row["readings"] = difference(our_reading(path), their_reading(bench, path))
+            ours = our_reading_turned(path, None) if is_scene else our_reading(path)
+            row["readings"] = difference(ours, their_reading(bench, path))
         rows.append(row)
         yield {"gaussians": bench.error_count, "rows": rows}
 
@@ -338,6 +347,32 @@ def _files_of_both(bench: Bench, source: Path) -> Iterator[tuple[str, Path, str 
                 path = bench.folder / f"level{level}.ksplat"
                 write_ksplat(source, path, level)
                 yield f"{ending}, level {level}", path, AXES
+
+
+def _scenes_of_both(bench: Bench, source: Path) -> Iterator[tuple[str, Path, None]]:
+    """Yield scenes with levels that hold what a PLY does, as `_files_of_both` yields files."""
+    path = bench.folder / "ours_streamed" / "lod-meta.json"
+    write(read(source), path)
+    yield f"{path.name}, ours", path, None
+    if path.name in bench.writes:
+        path = bench.folder / "theirs_streamed" / path.name
+        path.parent.mkdir(exist_ok=True)
+        run(theirs(bench, source, path))
+        yield f"{path.name}, theirs", path, None
+    cloud = change_axes(read(source)[0], "rfu")
+    path = bench.folder / "lcc" / "meta.lcc"
+    path.parent.mkdir(exist_ok=True)
+    write_lcc(cloud, path)
+    yield ".lcc", path, None
+    for kind in (".sog", ".spz"):
+        path = bench.folder / f"lcc2_{kind[1:]}" / "meta.lcc2"
+        write_lcc2(cloud, path, kind, functools.partial(_write_numbers, axes=FORMATS[kind].axes or cloud.axes))
+        yield f".lcc2 of {kind}", path, None
+
+
+def _write_numbers(cloud: GaussianCloud, path: Path, axes: str) -> None:
+    """Write a cloud as if it had other axes."""
+    write(GaussianSequence.from_clouds([cloud.with_arrays(axes=axes)]), path, WriteOptions(axes=axes))
 
 
 def files(bench: Bench) -> Iterator[Row]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tables import Row, Rows, cell, table
+
+from beam_warp.converters.formats import FORMATS
 
 CONVERT = "convert_cpu.json"
 VIEWERS = "viewers_chromium.json"
@@ -25,15 +28,25 @@ def _rows(result: Row, part: str) -> list[Row]:
 
 @table("convert_formats", CONVERT)
 def convert_formats(result: Row) -> Rows:
-    """Return who reads and who writes which files: a column a format, and who does what as rows."""
-    groups: dict[str, list[Row]] = {}
-    for row in result["formats"]:
-        groups.setdefault(row["format"] or row["name"], []).append(row)
-    rows: list[list[Any]] = [["", *(f"`{name}`" if name[0] in ".l" else name for name in groups)]]
-    for program, named in zip(PROGRAMS, ("beam-convert", f"splat-transform {result['splat_transform']}"), strict=True):
+    """Return who reads and who writes which files: a column a format, and who does what as rows.
+
+    What we do is in our own table of formats, and what splat-transform does was found with the measurement.
+    """
+    theirs = {row["name"]: row["theirs"] for row in result["formats"]}
+    groups: dict[str, list[str]] = {}
+    for ending in dict.fromkeys([*FORMATS, *theirs]):
+        groups.setdefault(FORMATS[ending].name if ending in FORMATS else ending, []).append(ending)
+    known: dict[str, Callable[[str], Sequence[object]]] = {
+        "beam-convert": lambda ending: (
+            (FORMATS[ending].reader, FORMATS[ending].writer) if ending in FORMATS else (0, 0)
+        ),
+        f"splat-transform {result['splat_transform']}": lambda ending: theirs.get(ending, (0, 0)),
+    }
+    rows: list[list[Any]] = [["", *(f"`{name}`" if name[0] == "." else name for name in groups)]]
+    for program, roles in known.items():
         for way, does in enumerate(("reads", "writes")):
-            cells = (any(member[program][way] for member in members) for members in groups.values())
-            rows.append([f"{named} {does}", *("yes" if known else "" for known in cells)])
+            cells = (any(roles(ending)[way] for ending in endings) for endings in groups.values())
+            rows.append([f"{program} {does}", *("yes" if does_it else "" for does_it in cells)])
     return rows
 
 

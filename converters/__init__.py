@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beam_warp.checks import require_path
 from beam_warp.converters.common.frames import sequence_of
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.common.options import Activation, MaterialActivation, ReadOptions
@@ -51,7 +52,7 @@ def read(
         AssetFormatError: The content is malformed; the message names file, place and remedy.
         InvalidOptionError: An option or the suffix is not one.
     """
-    source = Path(path)
+    source = require_path("path", path)
     options = ReadOptions(
         source_axes=source_axes,
         meters_per_unit=meters_per_unit,
@@ -88,9 +89,10 @@ def require_output(path: Path, options: WriteOptions = WriteOptions()) -> None: 
         )
     if options.target is not None:
         IMPORTERS[options.target].require_reads(path, suffix_of(path.name))
-    if form.axes is not None and options.axes not in (None, form.axes):
+    if options.axes and form.axes_to_write and options.axes not in form.axes_to_write:
+        allowed = " or ".join(form.axes_to_write)
         raise InvalidOptionError(
-            f"axes must be {form.axes} for {form.name}, which fixes them, got {options.axes}. Leave them out."
+            f"axes must be {allowed} for {form.name}, which fixes them, got {options.axes}. Leave them out."
         )
     require_writable(path, is_made=True)
 
@@ -110,12 +112,17 @@ def write(sequence: GaussianSequence, path: str | Path, options: WriteOptions = 
         InvalidOptionError: The suffix or an option does not fit.
         OutputError: The folder is closed, a file would be too large, or older frames are in the way.
     """
-    final = Path(path)
+    final = require_path("path", path)
     require_output(final, options)
     form = format_of(final)
     with folders_made(final.parent):
         if form.holds_sequences:
             return form.of_writer("write")(sequence, final, options)
+        if len(sequence) > 1 and form.is_index:
+            raise InvalidOptionError(
+                f"output must have a file for each of {len(sequence)} frames, got {final.name}, which describes one "
+                "frame. Write .sog files, or frames to folders of their own."
+            )
         if len(sequence) > 1:
             require_no_stale_frames(final, len(sequence))
         return write_frames(sequence, final, options, form)

@@ -10,15 +10,19 @@ from __future__ import annotations
 import math
 import re
 import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
+from beam_warp.archives import open_zip
 from beam_warp.checks import require_choice, require_number
 from beam_warp.converters.common.frames import DecodedFrame, FrameToWrite, sequence_of
 from beam_warp.converters.common.options import ReadOptions, WriteOptions
@@ -45,6 +49,9 @@ MAX_FREE_BYTES, MAX_RATIO = 64 * 2**20, 8
 MAX_FRAMES = 100_000
 """Most frames of a file, an hour at 30 a second."""
 
+MAX_NAMES = 2**14
+"""Most arrays and groups of an HDF5 file, and so most frames where each has a group."""
+
 
 Header = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
@@ -58,7 +65,7 @@ def probe(path: Path) -> dict[str, tuple[zipfile.ZipInfo, Header]]:
     """
     found = {}
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(".npy")
                 if name in ATTRIBUTES or name in STATEMENTS:
@@ -78,6 +85,8 @@ _BROKEN = (
     KeyError,
     TypeError,
     EOFError,
+    SyntaxError,
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
@@ -92,7 +101,9 @@ def _malformed(path: Path, contract: str, got: str) -> AssetFormatError:
 def _header(stream: Any, size: int) -> Header:
     """Return shape and type of an array, after checking that its data are as long as they say."""
     version = npy.read_magic(stream)
-    shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(stream)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Python's parser, about texts that are no header
+        shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(stream)
     if dtype.kind not in "fiuU" or math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise ValueError(f"{size} bytes for {dtype} of shape {shape}")
     return shape, dtype
@@ -124,7 +135,7 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     del options  # settled by the caller
     found = probe(path)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             arrays = {}
             for name, (entry, _) in found.items():
                 with archive.open(entry) as stream:
@@ -180,47 +191,56 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
     layout = _layout(path)
     count = len(layout)
     names = [path.name if count == 1 else f"{path.name}, frame {frame}" for frame in range(count)]
-    return sequence_of(path.name, names, lambda frame: _h5_frame(path, layout[frame]), options)
+    return sequence_of(path.name, names, lambda frame: _h5_frame(path, *layout[frame]), options)
 
 
 Place = tuple[str, int | None]
-"""Where an array of a frame is: its dataset, and its row in there if that has an axis of frames."""
+"""Where a frame is: its group, and its row in the arrays that have an axis of frames."""
 
 
-def _layout(path: Path) -> list[dict[str, Place]]:
-    """Return the place of every array of every frame, from the headers alone."""
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file; what the library finds broken in it becomes an error of ours."""
     import h5py
 
     try:
         with h5py.File(path, "r") as file:
-            root = _datasets(path, file)
-            groups = [str(name) for name in file if file.get(name, getclass=True) is h5py.Group]
-            groups.sort(key=_by_number)
-            frames: list[dict[str, Place]]
-            lengths = {name: file[name].shape[0] for name in root if file[name].ndim == _dimensions(name) + 1}
-            if len(set(lengths.values())) > 1 or (lengths and groups):
-                got = ", ".join(f"{name} {length}" for name, length in lengths.items())
-                raise _malformed(path, "must have one number of frames", f"{got} beside {len(groups)} groups")
-            if groups:
-                shared: dict[str, Place] = {name: (name, None) for name in root}
-                frames = [
-                    shared | {name: (f"{group}/{name}", None) for name in _datasets(path, file[group])}
-                    for group in groups
-                ]
-            else:
-                count = next(iter(lengths.values()), 1)
-                if not 1 <= count <= MAX_FRAMES:
-                    raise _malformed(path, f"must have 1 to {MAX_FRAMES} frames", f"{count}")
-                frames = [{name: (name, frame if name in lengths else None) for name in root} for frame in range(count)]
-            for places in frames[:1]:
-                _require_arrays(path, places)
+            yield file
     except _BROKEN as error:
         if isinstance(error, BeamError):
             raise
         if not path.is_file():
             raise MissingFileError(f"input must be an existing file, got {path}. Check the path.") from error
         raise _malformed(path, "must be an HDF5 file with arrays of numbers", str(error)) from error
-    return frames
+
+
+def _layout(path: Path) -> list[Place]:
+    """Return the place of every frame, from the headers at the root alone."""
+    import h5py
+
+    with _opened(path) as file:
+        if len(file) > MAX_NAMES:
+            raise _malformed(path, f"must have at most {MAX_NAMES} arrays and groups", f"{len(file)}")
+        lengths = {n: each.shape[0] for n, each in _datasets(path, file).items() if each.ndim == _dimensions(n) + 1}
+        groups = [str(name) for name in file if _is_own(file, name, h5py.Group)]
+    if len(set(lengths.values())) > 1 or (lengths and groups):
+        got = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise _malformed(path, "must have one number of frames", f"{got} beside {len(groups)} groups")
+    if groups:
+        return [(group, None) for group in sorted(groups, key=_by_number)]
+    if not lengths:
+        return [("/", None)]
+    count = next(iter(lengths.values()))
+    if not 1 <= count <= MAX_FRAMES:
+        raise _malformed(path, f"must have 1 to {MAX_FRAMES} frames", f"{count}")
+    return [("/", row) for row in range(count)]
+
+
+def _is_own(group: Any, name: str, kind: type) -> bool:
+    """Return whether a name stands for an object of a kind in the file itself; links elsewhere are not followed."""
+    import h5py
+
+    return isinstance(group.get(name, getlink=True), h5py.HardLink) and group.get(name, getclass=True) is kind
 
 
 def _by_number(name: str) -> tuple[int, str]:
@@ -234,40 +254,38 @@ def _dimensions(name: str) -> int:
     return 1 + len(ATTRIBUTES[name].trailing)
 
 
-def _datasets(path: Path, group: Any) -> list[str]:
+def _datasets(path: Path, group: Any) -> dict[str, Any]:
     """Return the arrays of a group that we know, after checking that they lie in this file and hold numbers."""
     import h5py
 
-    names = [name for name in group if name in ATTRIBUTES]
-    for name in names:
-        link = isinstance(group.get(name, getlink=True), h5py.HardLink)
-        if not link or not isinstance(group[name], h5py.Dataset) or group[name].external or group[name].is_virtual:
+    found = {}
+    for name in (name for name in group if name in ATTRIBUTES):
+        if not _is_own(group, name, h5py.Dataset) or group[name].external or group[name].is_virtual:
             raise _malformed(path, "must hold its arrays itself", f"{name} as a group or link")
-        if group[name].chunks is None and group[name].id.get_storage_size() < group[name].nbytes:
+        array = found[name] = group[name]
+        if array.chunks is None and array.id.get_storage_size() < (array.nbytes or 0):
             raise _malformed(path, "must hold its arrays whole", f"{name} without its data")
-        if group[name].dtype.kind not in "fiu" or group[name].ndim not in (_dimensions(name), _dimensions(name) + 1):
-            got = f"{group[name].dtype} of shape {group[name].shape}"
+        if array.dtype.kind not in "fiu" or array.ndim not in (_dimensions(name), _dimensions(name) + 1):
+            got = f"{array.dtype} of shape {array.shape}"
             raise _malformed(path, f"must have numbers with {_dimensions(name)} axes in {name}", got)
-    return names
+        if array.chunks and math.prod(array.chunks) * array.dtype.itemsize > MAX_FREE_BYTES:
+            got = f"{array.chunks} of {name}"
+            raise _malformed(path, f"must have chunks of at most {MAX_FREE_BYTES >> 20} MiB", got)
+    return found
 
 
-def _h5_frame(path: Path, places: Mapping[str, Place]) -> DecodedFrame:
-    """Read one frame."""
+def _h5_frame(path: Path, group: str, row: int | None) -> DecodedFrame:
+    """Read one frame: the arrays of its group or row, and those at the root that all frames share."""
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            _require_arrays(path, places)
-            found: dict[str, tuple[Any, int | None]] = {name: (file[at], row) for name, (at, row) in places.items()}
-            shapes = {name: it.shape if row is None else it.shape[1:] for name, (it, row) in found.items()}
-            _require_frame(path, {name: (shapes[name], it.dtype) for name, (it, _) in found.items()})
-            fields = {name: it[() if row is None else row] for name, (it, row) in found.items()}
-            said = {name: file.attrs[name] for name in STATEMENTS if name in file.attrs}
-            names = [str(name) for name in file if name not in ATTRIBUTES]
-            left_out = [name for name in names if isinstance(file.get(name), h5py.Dataset)]
-    except _BROKEN as error:
-        if isinstance(error, BeamError):
-            raise
-        raise _malformed(path, "must be an HDF5 file with arrays of numbers", str(error)) from error
+    with _opened(path) as file:
+        found = _datasets(path, file) | (_datasets(path, file[group]) if row is None else {})
+        rows = {name: row if array.ndim > _dimensions(name) else None for name, array in found.items()}
+        _require_arrays(path, found)
+        shapes = {name: array.shape[rows[name] is not None :] for name, array in found.items()}
+        _require_frame(path, {name: (shapes[name], array.dtype) for name, array in found.items()})
+        fields = {name: array[() if rows[name] is None else rows[name]] for name, array in found.items()}
+        said = {name: file.attrs[name] for name in STATEMENTS if name in file.attrs}
+        left_out = [str(name) for name in file if name not in ATTRIBUTES and _is_own(file, name, h5py.Dataset)]
     said = {name: value.decode() if isinstance(value, bytes) else value for name, value in said.items()}
     return _frame(path, fields, said, left_out, "HDF5 arrays by name")

@@ -31,7 +31,9 @@ class Format:
         reader: Module of this package that reads it; None if it is only written.
         writer: Module of this package that writes it; None if it is only read.
         holds_sequences: True if one file holds all frames.
-        axes: Axes that the format fixes, for the writer; None if a file may have any.
+        is_index: True if the file describes one frame whose Gaussians lie in files beside it or in folders there.
+        axes: Axes that the format's text asks for; None if it says nothing.
+        axes_to_write: Axes that a file may be written in; None if any.
         keeps_axes: True if a file states its axes and no viewer reads it, so that it is written in those of the cloud.
         read_options: Options of `ReadOptions` that mean something for it.
     """
@@ -40,7 +42,9 @@ class Format:
     reader: str | None = None
     writer: str | None = None
     holds_sequences: bool = False
+    is_index: bool = False
     axes: str | None = None
+    axes_to_write: tuple[str, ...] | None = None
     keeps_axes: bool = False
     read_options: frozenset[str] = OF_ANY_FORMAT
 
@@ -73,7 +77,15 @@ _USD = Format(
     writer="usd",
     holds_sequences=True,
     axes="rub",
+    axes_to_write=("rub",),
     read_options=OF_ANY_FORMAT - {"drop_invalid"},
+)
+_GLTF = Format(
+    name="glTF",
+    reader="gltf.reader",
+    writer="gltf.writer",
+    axes="rub",
+    axes_to_write=("rub", "luf", "bul", "fur"),  # those with y up of a right hand
 )
 _H5 = Format(name="HDF5", reader="arrays", holds_sequences=True)
 
@@ -86,9 +98,12 @@ FORMATS: dict[str, Format] = {
     ),
     ".compressed.ply": Format(name="compressed PLY", reader="ply.reader", writer="ply.compressed_writer"),
     ".spz": Format(name="SPZ", reader="spz.reader", writer="spz.writer", axes="rub"),
-    **dict.fromkeys((".gltf", ".glb"), Format(name="glTF", reader="gltf.reader", writer="gltf.writer", axes="rub")),
+    **dict.fromkeys((".gltf", ".glb"), _GLTF),
     ".sog": Format(name="SOG", reader="sog.reader", writer="sog.writer"),
-    "meta.json": Format(name="SOG", reader="sog.reader"),
+    "meta.json": Format(name="SOG", reader="sog.reader", writer="sog.writer", is_index=True),
+    "lod-meta.json": Format(name="streamed SOG", reader="sog.streamed", writer="sog.streamed_writer", is_index=True),
+    ".lcc": Format(name="LCC", reader="lcc", is_index=True),
+    ".lcc2": Format(name="LCC2", reader="lcc2", is_index=True),
     ".splat": Format(name="splat", reader="splat", writer="splat"),
     ".ksplat": Format(name="ksplat", reader="ksplat"),
     ".npz": Format(name="NumPy", reader="arrays", writer="arrays", keeps_axes=True),

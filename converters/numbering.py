@@ -13,8 +13,11 @@ from beam_warp.errors import AssetFormatError, MissingFileError, OutputError
 ASSET_NAME = "asset.usda"
 """Name of the asset in a folder that `beam run` wrote."""
 
-SOG_NAME = "meta.json"
-"""Name of the file that describes the images of a SOG in a folder."""
+SOG_NAMES = ("lod-meta.json", "meta.json")
+"""Names of the files that describe a streamed SOG, and the images of a SOG, in a folder."""
+
+LCC_SUFFIXES = (".lcc", ".lcc2")
+"""Ends of the names of indices that a folder holds once, whatever they are called."""
 
 DIGITS = 6
 """Digits of the frame numbers that are written: prefix000000.ply."""
@@ -48,8 +51,8 @@ def holds_a_frame(name: str) -> bool:
 def files_at(path: Path) -> list[Path]:
     """Return the files of Gaussians at a path: the file itself, or of a folder its asset, its SOG or its frames.
 
-    A folder with ``asset.usda`` is that asset, one with ``meta.json`` that SOG, and any other a numbered sequence. This
-    is the only place that decides it.
+    A folder with ``asset.usda`` is that asset, one with ``lod-meta.json`` or ``meta.json`` that SOG, one with a single
+    index of LCC that scene, and any other a numbered sequence. This is the only place that decides it.
 
     Raises:
         MissingFileError: A folder cannot be listed.
@@ -57,22 +60,24 @@ def files_at(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    whole = next((path / name for name in (ASSET_NAME, SOG_NAME) if (path / name).is_file()), None)
-    return [whole] if whole is not None else _numbered_files(path)
+    whole = next((path / name for name in (ASSET_NAME, *SOG_NAMES) if (path / name).is_file()), None)
+    return [whole] if whole is not None else _files_in(path)
 
 
 def holds_gaussians(folder: Path) -> bool:
     """Return True if a folder holds an asset, a SOG, or files of Gaussians, whether or not their names are in order."""
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
-    return any(name in (ASSET_NAME, SOG_NAME) or holds_a_frame(name) for name in names)
+    return any(name == ASSET_NAME or holds_a_frame(name) for name in names)
 
 
-def _numbered_files(folder: Path) -> list[Path]:
+def _files_in(folder: Path) -> list[Path]:
+    """Return the only index of a folder, or its numbered files."""
     try:
         entries = list(folder.iterdir())
     except OSError as error:
         raise MissingFileError(f"input folder must be readable, got {error.strerror} at {folder}. Check it.") from error
-    return in_order(entries, f"folder {folder.name}")
+    indices = [file for file in entries if suffix_of(file.name) in LCC_SUFFIXES]
+    return indices if len(indices) == 1 else in_order(entries, f"folder {folder.name}")
 
 
 def in_order(files: Iterable[Path], folder: str) -> list[Path]:
@@ -88,8 +93,8 @@ def in_order(files: Iterable[Path], folder: str) -> list[Path]:
     found = [(match, path) for path in files if (match := _frame_of(path))]
     if not found:
         raise AssetFormatError(
-            f"{folder} must hold {ASSET_NAME}, {SOG_NAME} or numbered files (walk000000.ply, walk000001.ply, …), got "
-            "none. Pass a file, or another folder."
+            f"{folder} must hold {ASSET_NAME}, {SOG_NAMES[1]} or numbered files (walk000000.ply, walk000001.ply, …), "
+            "got none. Pass a file, or another folder."
         )
     prefixes = sorted({match["prefix"] for match, _ in found})
     if len(prefixes) > 1:

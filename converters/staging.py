@@ -24,7 +24,8 @@ def require_writable(path: Path, *, is_made: bool = False) -> None:
     if is_made:
         folder = next((place for place in path.absolute().parents if place.exists()), folder)
     if not folder.is_dir():
-        raise OutputError(f"output folder must exist, got {folder} for {path.name}. Create it first.")
+        contract, remedy = ("be a folder", "Choose another") if folder.exists() else ("exist", "Create it first")
+        raise OutputError(f"output folder must {contract}, got {folder} for {path.name}. {remedy}.")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"output folder must be writable, got {folder}. Choose another or change its permissions.")
     if path.is_dir():

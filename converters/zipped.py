@@ -1,6 +1,7 @@
 """Zipped frames: an archive of numbered files in any format that keeps one frame a file, or of one such file.
 
-A frame is unpacked when it is asked for, under its own name in a temporary folder, and removed after it was read.
+A frame is unpacked when it is asked for, under its own name in a temporary folder, and removed after it was read. With
+``walk0.gltf`` comes ``walk0.bin`` from the same folder of the archive, which holds its arrays.
 """
 
 from __future__ import annotations
@@ -9,9 +10,12 @@ import shutil
 import struct
 import zipfile
 import zlib
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
+from beam_warp.archives import MANY_FILES, open_zip
 from beam_warp.converters import formats
 from beam_warp.converters.common.frames import DecodedFrame, sequence_of
 from beam_warp.converters.common.options import ReadOptions
@@ -19,10 +23,10 @@ from beam_warp.converters.numbering import holds_a_frame, in_order
 from beam_warp.errors import AssetFormatError
 from beam_warp.world.gaussians import GaussianSequence
 
-MAX_ENTRIES = 2**16
+MAX_ENTRIES = 2**14
 """Most files in an archive."""
 
-MAX_FREE_BYTES, MAX_RATIO = 64 * 2**20, 32
+MAX_FREE_BYTES, MAX_RATIO = 16 * 2**20, 32
 """A frame may unpack to so many bytes, and so many more for each byte that it takes in the archive."""
 
 _BROKEN = (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error, struct.error)
@@ -36,17 +40,17 @@ def read(path: Path, options: ReadOptions) -> GaussianSequence:
         AssetFormatError: It is malformed, encrypted, or holds no frames.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path, MANY_FILES) as archive:
             entries = archive.infolist()
     except _BROKEN as error:
         raise _malformed(path, "must be a whole zip archive", str(error)) from error
     if len(entries) > MAX_ENTRIES:
         raise _malformed(path, f"must hold at most {MAX_ENTRIES} files", f"{len(entries)}")
     files = {Path(entry.filename): entry for entry in entries if _is_shown(entry)}
-    frames = [files[name] for name in _frames(path, files)]
-    for entry in frames:
+    frames = [[files[name] for name in (frame, *_beside(frame)) if name in files] for frame in _frames(path, files)]
+    for entry in chain(*frames):
         _require_safe(path, entry)
-    names = [f"{path.name}: {entry.filename}" for entry in frames]
+    names = [f"{path.name}: {entry.filename}" for entry, *_ in frames]
     return sequence_of(path.name, names, lambda frame: _decoded(path, frames[frame], options), options)
 
 
@@ -57,14 +61,19 @@ def _malformed(path: Path, contract: str, got: str) -> AssetFormatError:
 def _is_shown(entry: zipfile.ZipInfo) -> bool:
     """Return False for folders, and for files that systems add without asking."""
     parts = PurePosixPath(entry.filename).parts
-    return not entry.is_dir() and "__MACOSX" not in parts and not any(part.startswith(".") for part in parts[-1:])
+    is_file = parts != () and not entry.is_dir()
+    return is_file and "__MACOSX" not in parts and not parts[-1].startswith(".")
 
 
 def _frames(path: Path, files: dict[Path, zipfile.ZipInfo]) -> list[Path]:
-    """Return the frames in order; an archive of one file needs no number."""
-    if len(files) == 1 and holds_a_frame(next(iter(files)).name):
-        return list(files)
-    return in_order(files, path.name)
+    """Return the frames in order; one alone needs no number."""
+    found = [name for name in files if holds_a_frame(name.name)]
+    return found if len(found) == 1 else in_order(files, path.name)
+
+
+def _beside(frame: Path) -> list[Path]:
+    """Return the files that a frame needs beside itself."""
+    return [frame.with_suffix(".bin")] if frame.suffix.lower() == ".gltf" else []
 
 
 def _require_safe(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -79,13 +88,14 @@ def _require_safe(path: Path, entry: zipfile.ZipInfo) -> None:
         raise _malformed(path, f"must unpack to at most {MAX_RATIO} × its size", f"{entry.filename!r} of {got}")
 
 
-def _decoded(path: Path, entry: zipfile.ZipInfo, options: ReadOptions) -> DecodedFrame:
-    """Unpack a frame and read it."""
+def _decoded(path: Path, entries: Sequence[zipfile.ZipInfo], options: ReadOptions) -> DecodedFrame:
+    """Unpack the files of a frame and read the first of them."""
     with TemporaryDirectory(prefix="beam_warp_") as folder:
-        place = Path(folder) / PurePosixPath(entry.filename).name
-        try:
-            with zipfile.ZipFile(path) as archive, archive.open(entry) as source, place.open("wb") as target:
-                shutil.copyfileobj(source, target, 1 << 20)
-        except _BROKEN as error:
-            raise _malformed(path, "must hold whole files", f"{entry.filename!r} ({error})") from error
-        return formats.decode(place, options)
+        places = [Path(folder) / PurePosixPath(entry.filename).name for entry in entries]
+        for entry, place in zip(entries, places, strict=True):
+            try:
+                with open_zip(path, MANY_FILES) as archive, archive.open(entry) as source, place.open("wb") as target:
+                    shutil.copyfileobj(source, target, 1 << 20)
+            except _BROKEN as error:
+                raise _malformed(path, "must hold whole files", f"{entry.filename!r} ({error})") from error
+        return formats.decode(places[0], options)

@@ -16,6 +16,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from beam_warp.archives import MANY_FILES, open_zip
+from beam_warp.checks import require_path
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -42,7 +44,7 @@ def require_asset_file(path: str | Path) -> Path:
         MissingFileError: There is no such file, or it cannot be read.
         AssetFormatError: It is truncated or no USD file.
     """
-    source = Path(path).absolute()
+    source = require_path("path", path).absolute()
     if source.suffix.lower() not in SUFFIXES:
         raise AssetFormatError(
             f"{source} must end in {', '.join(SUFFIXES)}, got {source.suffix or 'no suffix'}. "
@@ -140,9 +142,9 @@ def run_child(module: str, path: Path, seconds: float, *arguments: str) -> dict[
 def _require_whole_package(path: Path) -> None:
     """Refuse a package that is cut short or compressed, or that names files outside itself."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path, MANY_FILES) as archive:
             entries = archive.infolist()
-    except (zipfile.BadZipFile, ValueError, OSError, struct.error) as error:
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, struct.error) as error:
         raise _broken(path, "must be a whole zip archive", str(error)) from error
     if not 0 < len(entries) <= MAX_PACKAGE_ENTRIES:
         raise _broken(path, f"must hold 1 to {MAX_PACKAGE_ENTRIES} files", f"{len(entries)}")
@@ -177,7 +179,7 @@ def unaligned_files(path: Path) -> list[str]:
 
     OpenUSD opens such a package; readers that map its files may not.
     """
-    with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+    with open_zip(path, MANY_FILES) as archive, path.open("rb") as stream:
         return [entry.filename for entry in archive.infolist() if (_start_of(stream, entry) or 1) % ZIP_ALIGNMENT]
 
 

@@ -37,6 +37,7 @@ class Placement:
         """True if `apply` would change no bit."""
         return self.scale == 1.0 and np.array_equal(self.orthogonal, np.eye(3)) and not self.translation.any()
 
+    @np.errstate(over="ignore", invalid="ignore")  # what is not finite stays so, and is refused by a cloud
     def apply(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Transform every array that depends on position, size or direction.
 
@@ -50,7 +51,8 @@ class Placement:
         )
         moved["scales"] = self.scale * arrays["scales"].astype(np.float64)
         turned = product(rotation, arrays["orientations"].astype(np.float64))
-        moved["orientations"] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+        moved["orientations"] = turned / np.where(lengths == 0.0, 1.0, lengths)  # a cloud refuses a length of 0
         if "normals" in arrays:
             moved["normals"] = arrays["normals"].astype(np.float64) @ self.orthogonal.T
         if "radiance" in arrays:

@@ -12,6 +12,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
+from beam_warp.outputs import keep_original, keeps_originals
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API, register
 from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, UP_AXES, Channel
@@ -47,7 +48,11 @@ def open_asset(path: str | Path, *, trusted: bool) -> tuple[Path, Usd.Stage]:
         require_opens(source)
     register()
     try:
-        return source, Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+        stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+        if keeps_originals():
+            layers, textures, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(source)))
+            keep_original(source, *(Path(layer.realPath) for layer in layers), *map(Path, textures))
+        return source, stage
     except Tf.ErrorException as error:
         raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,6 +11,7 @@ from pathlib import Path
 from pxr import Sdf, Tf
 
 from beam_warp.errors import OutputError
+from beam_warp.outputs import require_apart, temporary_path
 
 
 @contextmanager
@@ -23,7 +24,8 @@ def staged_folder(target: Path) -> Iterator[Path]:
     if target.is_dir():
         raise OutputError(f"{target} must be a file, got a folder. Choose another name.")
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
+        folder = temporary_path(target)
+        folder.mkdir()
     except OSError as error:
         raise OutputError(
             f"{target.parent} must be a folder that can be written, got {error.strerror}. "
@@ -61,6 +63,33 @@ def publish(folder: Path, names: list[str], destination: Path) -> list[Path]:
         raise
     _reload_layers(published)
     return published
+
+
+def publish_asset(folder: Path, names: list[str], destination: Path) -> list[Path]:
+    """Publish an asset in place of an earlier one of its name, and remove layers that this one had and no longer has.
+
+    Raises:
+        InvalidOptionError: A file to be replaced is one that is read.
+    """
+    require_apart(destination / name for name in names)
+    stale = [destination / name for name in _layers_of_ours(destination / names[-1]) if name not in names]
+    published = publish(folder, names, destination)
+    for path in stale:
+        with suppress(OSError):
+            path.unlink()
+    return published
+
+
+def _layers_of_ours(root: Path) -> list[str]:
+    """Return the layers that a text root names as `beam_warp.schema.writer` does, without opening it."""
+    named = re.compile(
+        rf"@\./({re.escape(root.stem)}\.(?:(?:static|frames|albedo|\d{{6}})\.usdc|(?:manifest|plain)\.usda))@"
+    )
+    try:
+        text = root.read_text(encoding="utf-8") if root.suffix == ".usda" else ""
+    except (OSError, UnicodeError):
+        return []
+    return named.findall(text) if text.startswith("#usda") else []
 
 
 def _reload_layers(paths: list[Path]) -> None:

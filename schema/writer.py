@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pxr import Sdf
 
-from beam_warp.checks import require_count
+from beam_warp.checks import require_count, require_path
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.schema import register
 from beam_warp.schema.authoring import (
@@ -27,7 +27,7 @@ from beam_warp.schema.authoring import (
     static_layer,
 )
 from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
-from beam_warp.schema.staging import publish, staged_folder
+from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.schema.survey import survey_sequence
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -53,7 +53,7 @@ def write_asset(
     Every frame is read twice, first to find what varies and which precision is safe; one segment is in memory at once.
     Arrays that are the same in every frame are written once. Arrays are written in half precision if that is safe
     (see `beam_warp.schema.layout`); positions are always in float. Files of an earlier asset with the same names are
-    replaced; its other segments stay, unused.
+    replaced, and its layers that this one lacks are removed.
 
     Args:
         sequence: Clouds with axes ``rub`` (stage y up) or ``rfu`` (stage z up), in metres. The metadata keys
@@ -102,7 +102,7 @@ def write_asset(
             names += _write_variants(contents, folder, target.stem, root, segment_length)
         if target.suffix == ".usdz":
             names = [_pack(folder, names, target)]
-        return publish(folder, names, target.parent)
+        return publish_asset(folder, names, target.parent)
 
 
 def _write_single(contents: AssetContents, folder: Path, name: str, save_every: int) -> list[str]:
@@ -212,7 +212,7 @@ def _require_below_limit(target: Path, size: int) -> None:
 
 def _require_target(path: str | Path) -> Path:
     """Refuse names that USD's asset paths cannot express."""
-    target = Path(path)
+    target = require_path("path", path)
     if target.suffix not in SUFFIXES:
         raise InvalidOptionError(
             f"path must end in {', '.join(SUFFIXES)}, got {target.name!r}. Choose .usda for long sequences."

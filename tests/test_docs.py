@@ -65,7 +65,7 @@ def read_command(program, *words):
     if program == "beam":
         parse(COMMANDS[words[0]].load(words[0])[0], words[1:], program)
     elif program == "beam-validate":
-        validate.main([*words, "--rules", "--quiet"])
+        parse(validate.Validate, words, program)
     elif words[0] == "inspect":
         parse(convert.InspectCommand, words[1:], program)
     else:

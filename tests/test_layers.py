@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FLOORS = """
-errors checks digests blocks kernels
+errors checks digests archives blocks outputs kernels
 image device
 world
 light schema jobs
@@ -35,10 +35,28 @@ render materials reconstruction
 """
 """Families of kernels from the bottom up."""
 
-ALLOWED = {("checks", "errors"), ("digests", "errors"), ("digests", "checks"), ("interop", "_version")}
+ALLOWED = {
+    ("checks", "errors"),
+    ("digests", "errors"),
+    ("digests", "checks"),
+    ("outputs", "errors"),
+    ("interop", "_version"),
+}
 """Imports within a floor."""
 
-WITHOUT_WARP = {"errors", "checks", "digests", "blocks", "image", "world", "schema", "converters", "capture"}
+WITHOUT_WARP = {
+    "errors",
+    "checks",
+    "digests",
+    "archives",
+    "blocks",
+    "outputs",
+    "image",
+    "world",
+    "schema",
+    "converters",
+    "capture",
+}
 """Packages that a converter or validator waits for: none of them imports Warp."""
 
 

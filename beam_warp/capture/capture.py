@@ -6,13 +6,12 @@ Distorted photographs are undistorted as they are read, so that every camera is 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 from beam_warp.capture import colmap, nerfstudio, projections
 from beam_warp.capture.records import CaptureContents
 from beam_warp.capture.records import CaptureRecord as CaptureRecord
 from beam_warp.capture.records import SparsePoints as SparsePoints
-from beam_warp.checks import require_number
+from beam_warp.checks import require_number, require_path
 from beam_warp.errors import MissingFileError
 
 
@@ -41,7 +40,7 @@ class Capture(CaptureContents):
             InvalidOptionError: ``keep`` is out of range.
         """
         require_number("keep", keep, 0.0, 1.0)
-        path = Path(folder)
+        path = require_path("folder", folder)
         transforms = path / nerfstudio.FILE_NAME if path.is_dir() else path
         if transforms.is_file():
             return cls(**vars(nerfstudio.read(transforms, keep)))

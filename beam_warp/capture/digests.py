@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 
 from beam_warp.capture.capture import CaptureRecord
 from beam_warp.digests import content_digest, described, fields_of
-from beam_warp.errors import MissingFileError
+from beam_warp.errors import MissingFileError, OutputError
+from beam_warp.outputs import replacing
 
 UNREAD_FIELDS = frozenset({"truth_path", "relit_paths"})
 """Fields of a record that reconstruction never reads."""
@@ -84,7 +84,5 @@ def _remembered(path: Path) -> dict[str, list[Any]]:
 
 def _remember(path: Path, content: Mapping[str, Any]) -> None:
     """Keep what is known; a failure to do so only costs time later."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OutputError), replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        temporary.replace(path)

@@ -138,6 +138,7 @@ def _numbered_views(args: DrawChannel, sequence: GaussianSequence) -> list[Plann
     target = parse_target(args.out)
     if isinstance(target, Still):
         if len(frames) == 1:
+            require_folder(target)
             return [PlannedView(frames[0], camera, args.out)]
         target = numbered(target)
     assert isinstance(target, FramePattern)

@@ -14,10 +14,11 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number, require_package
 from beam_warp.cli.common.console import print_json, progress
-from beam_warp.cli.common.flags import Device, Json, Quiet, SourceAxes, make_folder
+from beam_warp.cli.common.flags import Device, Json, Quiet, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress
+from beam_warp.jobs.store import make_folders
 from beam_warp.study.page import write_page
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import Settings, Study, Table, read_table, run_study, table_paths
@@ -186,7 +187,7 @@ def chart(command: Chart) -> int:
     skipped: list[Settings] = []
     if args.from_csv is not None:
         table = read_table(args.from_csv)
-        make_folder(args.out)
+        make_folders(args.out)
     else:
         with progress(args.quiet or args.json) as report:
             measure = _measure if isinstance(args, TracingChart) else _measure_materials
@@ -223,7 +224,7 @@ def _measure(args: TracingChart, report: NotedProgress) -> tuple[Table, list[Set
         require_count("frame", args.frame, 0, len(sequence) - 1)
         cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
     resolve_device(args.device)  # an unknown device is refused before a folder is made
-    make_folder(args.out)
+    make_folders(args.out)
     started = time.perf_counter()
     study = tracing_study(
         cloud,
@@ -266,7 +267,7 @@ def _measure_materials(args: MaterialsChart, report: NotedProgress) -> tuple[Tab
     resolve_device(args.device)  # an unknown device is refused before a folder is made
     with tempfile.TemporaryDirectory() as folder:
         subject = _materials_subject(args, Path(folder), report)
-        make_folder(args.out)
+        make_folders(args.out)
         study = materials_study(subject, plan, device=args.device)
         return _run(study, args.out, args.budget_seconds, report)
 

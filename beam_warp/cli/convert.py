@@ -5,22 +5,26 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from beam_warp import __version__, converters
+from beam_warp.checks import require_path
 from beam_warp.cli.common.console import escaped, options_named, print_json, print_notes, progress, run_command
 from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
 from beam_warp.cli.common.pages import parse
+from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
 from beam_warp.converters.formats import FORMATS, format_of
-from beam_warp.converters.numbering import numbered_path
+from beam_warp.converters.frame_files import written_axes
+from beam_warp.converters.numbering import holds_a_frame, numbered_path
 from beam_warp.errors import InvalidOptionError
+from beam_warp.outputs import require_apart
 from beam_warp.world.gaussians import GaussianCloud
 
 READ = f"File ({', '.join(FORMATS)}), or a folder with asset.usda, meta.json or numbered files."
@@ -89,17 +93,16 @@ class InspectCommand:
 
 
 def _require_apart(source: Path, output: Path, frame_count: int) -> None:
-    """Refuse to write over the input: a conversion that goes wrong must not cost the original."""
-    taken = {path.resolve() for path in (source.iterdir() if source.is_dir() else [source])}
-    planned = [output] if frame_count == 1 else [numbered_path(output, n) for n in range(frame_count)]
-    clash = next((path for path in planned if path.resolve() in taken), None)
-    if clash is not None:
+    """Refuse frames that would replace those of the input, or end up among them."""
+    planned = [numbered_path(output, frame) for frame in range(frame_count)]
+    require_path("output", planned[-1])
+    require_apart(planned)
+    if source.is_dir() and output.parent.resolve() == source.resolve() and holds_a_frame(output.name):
         raise InvalidOptionError(
-            f"output must be another file than the input, got {clash} for both. Choose another name."
+            f"output must be in another folder than the frames that are read, got {output}. Choose another folder."
         )
 
 
-@options_named(ConvertCommand)
 def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
@@ -123,7 +126,8 @@ def convert(command: ConvertCommand) -> int:
     )
     form = format_of(command.output)
     is_numbered = len(sequence) > 1 and not form.holds_sequences
-    _require_apart(command.input, command.output, len(sequence) if is_numbered else 1)
+    if is_numbered:
+        _require_apart(command.input, command.output, len(sequence))
     first = sequence[0]
     with progress(command.quiet or command.json, compiles=False) as report:
 
@@ -144,6 +148,9 @@ def convert(command: ConvertCommand) -> int:
         and first.base_color is not None
     ):
         notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
+    axes = written_axes(command.output, options, form)
+    if form.axes is not None and axes != form.axes:
+        notes.append(f"{form.name} means {form.axes}; this file is in {axes} and states it, which few readers heed")
     if command.target is not None:
         notes.append(f"in {IMPORTERS[command.target].name}: {IMPORTERS[command.target].to_do}")
     seconds = time.perf_counter() - started
@@ -169,7 +176,6 @@ def convert(command: ConvertCommand) -> int:
     return 0
 
 
-@options_named(InspectCommand)
 def inspect(command: InspectCommand) -> int:
     """Print what a file holds."""
     found = converters.inspect(command.input)
@@ -188,6 +194,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[:1] == ["inspect"]:
         asked = parse(InspectCommand, words[1:], "beam-convert inspect")
-        return run_command(lambda: inspect(asked))
+        return run_command(lambda: _run(inspect, asked))
     command = parse(ConvertCommand, words, "beam-convert")
-    return run_command(lambda: convert(command))
+    return run_command(lambda: _run(convert, command))
+
+
+def _run(function: Callable[[Any], int], command: Any) -> int:
+    with options_named(type(command)), paths_checked(command):
+        return function(command)

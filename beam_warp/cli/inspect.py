@@ -14,7 +14,7 @@ from beam_warp.capture.page import write_page
 from beam_warp.capture.picture import headline, verdict, write_picture
 from beam_warp.checks import require_package
 from beam_warp.cli.common.console import escaped, print_json, progress
-from beam_warp.cli.common.flags import make_folder
+from beam_warp.jobs.store import make_folders
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def inspect(args: Inspect) -> int:
         report = inspect_capture(Capture.read(args.capture), max_images=args.max_images, progress=advance)
     files = []
     if args.out is not None:
-        make_folder(args.out)
+        make_folders(args.out)
         files = [args.out / "capture.png", args.out / "capture.html"]
         write_picture(report, files[0])
         write_page(report, files[1])

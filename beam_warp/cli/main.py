@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from beam_warp._version import __version__
 from beam_warp.cli.common.console import options_named, run_command
 from beam_warp.cli.common.pages import parse
+from beam_warp.cli.common.paths import paths_checked
 from beam_warp.errors import InvalidOptionError
 
 _HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.
@@ -81,4 +82,6 @@ def _run(word: str, words: list[str]) -> int:
             raise InvalidOptionError(f"{option[2:]} must be drawn by a command of its own. Use {now}.")
     record, function = COMMANDS[word].load(word)
     with options_named(record):
-        return function(parse(record, words, f"beam {word}"))
+        options = parse(record, words, f"beam {word}")
+        with paths_checked(options):
+            return function(options)

@@ -54,7 +54,7 @@ class Mesh:
     sequence: Annotated[
         Positional[Path], arg(metavar="SEQUENCE", help="File of Gaussians, or a folder of numbered files.")
     ]
-    out: Annotated[Path, arg(metavar="DIR", help="Folder for the meshes; made if its parent exists.")]
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the meshes; made if it does not exist.")]
     capture: Annotated[
         Path | None, arg(metavar="DIR", help="Use the cameras of this capture, of the same frame and split.")
     ] = None

@@ -9,13 +9,14 @@ from pathlib import Path
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import raster_options, require_apart, stated
+from beam_warp.cli.common.flags import raster_options, stated
 from beam_warp.cli.drawing.checks import require_consistent
 from beam_warp.cli.drawing.flags import Render
 from beam_warp.cli.drawing.stage import staged
 from beam_warp.cli.drawing.views import capture_views, image_size
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
+from beam_warp.outputs import require_apart
 from beam_warp.render.options import LAYERS, DeferredOptions
 from beam_warp.render.path import PathOptions
 from beam_warp.stage.frame_times import FrameTimes, frame_times
@@ -68,9 +69,7 @@ def render(args: Render) -> int:
     picture, notes = _picture(args)
     with progress(args.quiet or args.json) as report:
         plan = _plan(args, stage, frame_count) if capture is None else _plan_of_capture(args, stage, capture)
-        layers = (path for asset in stage.assets for files in asset.files for path in files)
-        named = (args.light.environment, args.light.lights, args.camera.camera, *args.assets.asset)
-        require_apart(plan.outputs, (*named, *layers))
+        require_apart(plan.outputs, "out")
         job = RenderJob(stage, renderer, PictureWriter(picture), report)
         tally = _carry_out(plan, job, overwrite=args.output.overwrite)
     said = list(dict.fromkeys((*stage.notes, *notes, *plan.notes)))

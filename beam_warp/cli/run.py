@@ -17,7 +17,7 @@ from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit,
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
-from beam_warp.converters.numbering import SOG_NAME, holds_gaussians
+from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.world.environment import EnvironmentMap
@@ -103,7 +103,7 @@ def run(args: Run) -> int:
 
 def capture_at(path: Path) -> Capture | None:
     """Return the capture at a path; None if there is none, but perhaps Gaussians."""
-    if not (path.is_dir() or path.suffix == ".json") or path.name == SOG_NAME:
+    if not (path.is_dir() or path.suffix == ".json") or path.name in SOG_NAMES:
         return None
     try:
         return Capture.read(path)

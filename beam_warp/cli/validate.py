@@ -2,91 +2,106 @@
 
 from __future__ import annotations
 
-import argparse
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
 
 from beam_warp._version import __version__
-from beam_warp.cli.common.console import escaped, print_json, progress, run_command
+from beam_warp.cli.common.console import escaped, options_named, print_json, progress, run_command
+from beam_warp.cli.common.flags import Json, Quiet
+from beam_warp.cli.common.pages import parse
+from beam_warp.cli.common.paths import paths_checked
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from beam_warp.evaluate.physical_rules import Measured
     from beam_warp.schema.validation.report import Report
 
-_EPILOG = """\
-exit code: 0 valid (warnings allowed), 1 a rule of severity error is broken, 2 the file cannot be read
 
-example:
-  beam-validate dancer.usda
-  beam-validate dancer.usda --fix
-  beam-validate dancer.usda --physical --sarif dancer.sarif
-  beam-validate dancer.usdz --json | jq '.findings[].rule'
-"""
+@dataclass(frozen=True)
+class Validate:
+    """Check a relightable 4D Gaussian asset against the rules of its schema, and by the validators of OpenUSD.
+
+    Example: beam-validate dancer.usda --fix
+
+    The exit code is 0 for a valid asset, warnings allowed; 1 if a rule of severity error is broken; 2 if the file
+    cannot be read. For programs: beam-validate dancer.usdz --json | jq '.findings[].rule'. `beam-validate --version`
+    prints the version.
+    """
+
+    asset: Annotated[
+        Positional[Path | None],
+        arg(metavar="ASSET", help="File to check (.usd, .usda, .usdc, .usdz), or the folder of an asset."),
+    ] = None
+    fix: Annotated[bool, arg(help="Mend in place what is safe to mend, then check.")] = False
+    physical: Annotated[bool, arg(help="Also trace the asset and judge it by physics, which is slower.")] = False
+    device: Annotated[
+        str | None, arg(help="cpu, cuda:0, … for --physical; the first GPU by default, if there is one.")
+    ] = None
+    sarif: Annotated[Path | None, arg(metavar="FILE", help="Also write the report as SARIF 2.1.0, for CI.")] = None
+    rules: Annotated[bool, arg(help="List every rule and stop.")] = False
+    quiet: Quiet = False
+    json: Json = False
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="beam-validate",
-        description="Check a relightable 4D Gaussian asset (.usd, .usda, .usdc, .usdz).",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("asset", nargs="?", help="the file to check, or the folder of an asset")
-    parser.add_argument("--fix", action="store_true", help="mend in place what is safe to mend, then check")
-    parser.add_argument("--physical", action="store_true", help="also trace the asset and judge it by physics (slower)")
-    parser.add_argument("--device", help="cpu, cuda:0, … for --physical; the first GPU by default, if there is one")
-    parser.add_argument("--sarif", metavar="FILE", type=Path, help="also write the report as SARIF 2.1.0, for CI")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    parser.add_argument("--quiet", action="store_true", help="print nothing; only the exit code answers")
-    parser.add_argument("--rules", action="store_true", help="list every rule and stop")
-    parser.add_argument("--version", action="version", version=f"beam-validate {__version__}")
-    options = parser.parse_args(arguments)
-    if options.rules:
-        return run_command(lambda: _list_rules(options.json))
-    if options.asset is None:
-        parser.error("asset must be given, got none. Name a .usd, .usda, .usdc or .usdz file.")
-    return run_command(lambda: _validate(options))
+    """Run ``beam-validate``; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"beam-validate {__version__}")
+        return 0
+    command = parse(Validate, words, "beam-validate")
+    return run_command(lambda: _list_rules(command.json) if command.rules else _checked(command))
 
 
-def _validate(options: argparse.Namespace) -> int:
+def _checked(command: Validate) -> int:
+    with paths_checked(command):
+        return validate(command)
+
+
+@options_named(Validate)
+def validate(command: Validate) -> int:
+    """Check an asset, mending it first if that is asked for, and say what was found."""
     from beam_warp.converters.numbering import files_at
+    from beam_warp.schema.validation import validator
     from beam_warp.schema.validation.mending import mend
     from beam_warp.schema.validation.sarif import write_sarif
-    from beam_warp.schema.validation.validator import validate
 
-    options.asset = str(files_at(Path(options.asset))[0])
-    if options.sarif is not None and options.sarif.suffix not in (".sarif", ".json"):
-        raise InvalidOptionError(f"--sarif must name a .sarif or .json file, got {options.sarif}. Choose another name.")
-    report = mend(options.asset) if options.fix else validate(options.asset)
+    if command.asset is None:
+        raise InvalidOptionError("asset must be given, got none. Name a .usd, .usda, .usdc or .usdz file.")
+    if command.sarif is not None and command.sarif.suffix not in (".sarif", ".json"):
+        raise InvalidOptionError(f"sarif must name a .sarif or .json file, got {command.sarif}. Choose another name.")
+    asset = str(files_at(command.asset)[0])
+    report = mend(asset) if command.fix else validator.validate(asset)
     measured: list[Measured] = []
-    if options.physical:
-        report, measured = _with_physics(report, options)
-    if options.sarif is not None:
-        write_sarif(report, {rule["id"]: rule["text"] for rule in _rules()}, options.sarif)
-    if options.json and not options.quiet:
+    if command.physical:
+        report, measured = _with_physics(asset, report, command)
+    if command.sarif is not None:
+        write_sarif(report, {rule["id"]: rule["text"] for rule in _rules()}, command.sarif)
+    if command.json and not command.quiet:
         print_json({**report.as_dict(), "physical": [asdict(each) for each in measured]})
-    elif not options.quiet:
-        _say(options.asset, report, measured)
+    elif not command.quiet:
+        _say(asset, report, measured)
     return 0 if report.is_valid else 1
 
 
-def _with_physics(report: Report, options: argparse.Namespace) -> tuple[Report, list[Measured]]:
+def _with_physics(asset: str, report: Report, command: Validate) -> tuple[Report, list[Measured]]:
     """Measure an asset that keeps all other rules, and add the rules of physics that it breaks to its report."""
     if not report.is_valid:
         raise InvalidOptionError(
-            f"--physical must be given a valid asset, got one that breaks {report.findings[0].rule}. "
+            f"physical must be given a valid asset, got one that breaks {report.findings[0].rule}. "
             "Mend what beam-validate reports without it first."
         )
     from beam_warp.evaluate.physical import measure_physics
     from beam_warp.evaluate.physical_rules import broken
     from beam_warp.schema.reader import read_asset
 
-    with progress(options.quiet or options.json) as listener:
-        measured = measure_physics(read_asset(options.asset, trusted=True), device=options.device, progress=listener)
+    with progress(command.quiet or command.json) as listener:
+        measured = measure_physics(read_asset(asset, trusted=True), device=command.device, progress=listener)
     findings = sorted((*report.findings, *broken(measured)), key=lambda found: found.severity)
     return replace(report, findings=tuple(findings)), measured
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from beam_warp.jobs.store import frame_key, read_frame, write_frame
 from beam_warp.materials.base_color import BaseColor
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
+
+_STORED = re.compile(r"(?:frame|solution)_(\d{6,})\.h5")
 
 EVIDENCE = "evidence_"
 """Prefix of the stored arrays of evidence."""
@@ -95,6 +98,15 @@ class FrameArchive:
     def solution(self, number: int) -> dict[str, NDArray[Any]]:
         """Return base colour, its standard error and observability of a frame, as arrays of a cloud."""
         return read_frame(self._solution(number))
+
+    def remove_beyond(self, count: int) -> list[str]:
+        """Remove the frames that an earlier, longer sequence left, and say so in a note, if there were any."""
+        numbered = ((_STORED.fullmatch(path.name), path) for path in self.folder.iterdir())
+        stale = [path for match, path in numbered if match and int(match[1]) >= count and frame_key(path) is not None]
+        for path in stale:
+            path.unlink(missing_ok=True)
+        files = f"file{'s'[: len(stale) > 1]}"
+        return [f"removed {len(stale)} stored {files} of an earlier sequence of more frames"] if stale else []
 
     def _frame(self, number: int) -> Path:
         return self.folder / f"frame_{number:06d}.h5"

@@ -23,7 +23,9 @@ from typing import Any
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.checks import require_path
 from beam_warp.converters.numbering import ASSET_NAME
+from beam_warp.converters.staging import require_writable
 from beam_warp.decomposition.archive import FrameArchive
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.decomposition.capture_light import light_findings, prepare_light
@@ -39,12 +41,16 @@ from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.progress import JobLog
-from beam_warp.jobs.report import write_report
+from beam_warp.jobs.report import REPORT_NAME, write_report
 from beam_warp.jobs.store import make_folders
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.materials.roughness_source import RoughnessTexture
+from beam_warp.outputs import remove_leftovers
+from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
+
+OVERVIEW_NAME = "overview.png"
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ def run(
         sequence: Frames with captured radiance, in any axes.
         environment: The light of the capture, in the world "rfu". Where it is not known, another one: base colour
             explains the captured colour by it, and relightings by it are not comparable with what was captured.
-        out: Folder; made if its parent exists.
+        out: Folder; made if it does not exist.
         options: See `RunOptions`.
         capture: The images that the Gaussians were reconstructed from: light is gathered where they show the surface,
             and base colour explains what they show. None takes the Gaussians' own colour for it.
@@ -103,13 +109,16 @@ def run(
     started = time.perf_counter()
     chosen = options or RunOptions()
     device = resolve_device(chosen.device)  # before a folder is made that would then stay empty
-    out = Path(out)
+    out = require_path("out", out)
     images = None if capture is None else CaptureImages(capture, sequence)
     if chosen.images is not None and images is None:
         raise InvalidOptionError(
             "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
         )
+    for name in (ASSET_NAME, OVERVIEW_NAME, REPORT_NAME):
+        require_writable(out / name, is_made=True)
     folder, digests = make_folders(out, "frames", "digests")
+    notes = remove_leftovers(out, folder, digests)
     log = JobLog(progress, len(sequence), device)
     source = Source(
         sequence=sequence, images=images, options=chosen, digests=CaptureDigests(digests), device=str(device), log=log
@@ -123,6 +132,7 @@ def run(
         key=array_digest(light.environment.radiance, text=described),
         archive=FrameArchive(folder, source.first.cloud.radiance_color_space),
     )
+    notes += plan.archive.remove_beyond(len(sequence))
     first_key = source.key(plan.key, source.first)
     findings = light_findings(source.first, light.environment, folder / "findings.json", first_key)
     roughness = RoughnessFinder(plan)
@@ -132,17 +142,19 @@ def run(
     else:
         solved = solve_jointly(plan, frames) if plan.persistent else solve_each(plan, frames)
     relightable = relightable_sequence(plan, solved)
-    asset, picture = out / ASSET_NAME, out / "overview.png"
-    with log.timer("write asset"):
-        converters.write(relightable, asset)
-    with log.timer("overview"):
-        progress("overview", 0, 1)
-        draw_overview(picture, relightable, plan, overview or OverviewOptions())
-        progress("overview", 1, 1)
-    seconds = time.perf_counter() - started
-    report = run_report(plan, frames, solved, findings=findings, roughness=roughness.report, seconds=seconds)
-    write_report(out, report)
-    return RunResult(asset, picture, relightable, light.environment, report)
+    with staged_folder(out / "results") as staged:  # all of them appear, or none
+        with log.timer("write asset"):
+            layers = converters.write(relightable, staged / ASSET_NAME)
+        with log.timer("overview"):
+            progress("overview", 0, 1)
+            draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview or OverviewOptions())
+            progress("overview", 1, 1)
+        seconds = time.perf_counter() - started
+        report = run_report(plan, frames, solved, findings=findings, roughness=roughness.report, seconds=seconds)
+        report["input"]["notes"] += notes
+        write_report(staged, report)
+        publish_asset(staged, [REPORT_NAME, OVERVIEW_NAME, *(path.name for path in layers)], out)
+    return RunResult(out / ASSET_NAME, out / OVERVIEW_NAME, relightable, light.environment, report)
 
 
 def _described(options: RunOptions, images: CaptureImages | None, *, is_cuda: bool) -> str:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from beam_warp.checks import require_number
+from beam_warp.checks import require_count, require_number
 from beam_warp.errors import InvalidOptionError
 from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.render.sheet import Relighting
+from beam_warp.world.camera import MAX_SIDE
 
 ESTIMATE = "estimate"
 
@@ -32,7 +33,7 @@ class RunOptions:
         device: Warp device; None takes the first CUDA device, or the CPU.
 
     Raises:
-        InvalidOptionError: The exposure is out of range, or both paths have options.
+        InvalidOptionError: The exposure or the roughness is out of range, or both paths have options.
     """
 
     materials: MaterialOptions | None = None
@@ -43,7 +44,7 @@ class RunOptions:
     device: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the exposure, and that one path alone has options, which check themselves."""
+        """Check each option, and that one path alone has options, which check themselves."""
         if self.materials is not None and self.images is not None:
             default = asdict(MaterialOptions())
             stated = [f"{key} {value}" for key, value in asdict(self.materials).items() if value != default[key]]
@@ -51,6 +52,8 @@ class RunOptions:
                 "materials (sample_count, offset, bounce and so on) must be left out on the image path, which has "
                 f"options of its own, got {', '.join(stated) or 'defaults'}. Drop them, or take the direct path."
             )
+        if not isinstance(self.roughness, RoughnessTexture) and self.roughness != ESTIMATE:
+            require_number("roughness", self.roughness, 0.0, 1.0)
         if self.exposure != "auto":
             require_number("exposure", self.exposure, -32.0, 32.0)
 
@@ -90,9 +93,18 @@ class OverviewOptions:
         azimuth: Camera angle; 0 looks along +y [degree].
         elevation: Camera angle above the horizon [degree].
         height: Height of a panel [pixel].
+
+    Raises:
+        InvalidOptionError: A number is out of range.
     """
 
     second_light: Relighting | None = None
     azimuth: float = 0.0
     elevation: float = 5.0
     height: int = 640
+
+    def __post_init__(self) -> None:
+        """Check the numbers before hours of work end in a picture that cannot be drawn."""
+        require_number("azimuth", self.azimuth, -3600.0, 3600.0)
+        require_number("elevation", self.elevation, -90.0, 90.0)
+        require_count("height", self.height, 1, MAX_SIDE)

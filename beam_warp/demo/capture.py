@@ -26,6 +26,7 @@ from beam_warp.demo.lights import studio
 from beam_warp.errors import OutputError
 from beam_warp.image.files import write_exr
 from beam_warp.jobs.listeners import StageProgress, no_progress
+from beam_warp.outputs import temporary_path
 from beam_warp.trace.mesh_paths import TracedMesh, trace_channels, trace_radiance
 from beam_warp.world.camera import MAX_SIDE, OPENGL_TO_OPENCV, Camera
 from beam_warp.world.environment import EnvironmentMap
@@ -270,7 +271,7 @@ def replacing_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
         OutputError: ``folder`` holds files already, or cannot be written.
     """
     target = require_free(folder)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
+    temporary = temporary_path(target)
     try:
         temporary.mkdir()
         yield temporary

@@ -54,9 +54,9 @@ def evaluate_asset(
         sequence: See `score_materials`.
         capture: See `score_materials`.
         options: See `EvaluateOptions`.
-        out: Folder for ``evaluation.json`` and ``evaluation.png``; made if its parent exists.
+        out: Folder for ``evaluation.json`` and ``evaluation.png``; made if it does not exist.
         renders: Folder for the images: ``CAMERA_FRAME.exr`` with the layers of the capture's truth, R, G, B being the
-            captured colour, and ``RELIGHTER_LIGHT/CAMERA_FRAME.exr``; made if its parent exists.
+            captured colour, and ``RELIGHTER_LIGHT/CAMERA_FRAME.exr``; made if it does not exist.
         progress: Called with (stage, done, total).
 
     Raises:

@@ -16,7 +16,7 @@ from beam_warp.checks import require_count
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.evaluate import physical_rules as rules
-from beam_warp.evaluate.physical_rules import Measured
+from beam_warp.evaluate.physical_rules import LEAST_OPACITY, Measured
 from beam_warp.evaluate.steadiness import RunningVariance
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.light.ggx import TABLE_SIZE, specular_albedo
@@ -39,9 +39,6 @@ MOST_FRAMES = 16
 
 STREAM = 0x9E3779B9
 """Added to the seed, so that random numbers are not those of ``beam run``."""
-
-LEAST_OPACITY = 0.5
-"""Opacity below which a Gaussian is no surface."""
 
 LEAST_CONFIDENCE = 0.5
 """Confidence below which a normal is not judged."""
@@ -105,6 +102,7 @@ def measure_cloud(cloud: GaussianCloud, *, device: str | None = None, seed: int 
     stream = ((seed + STREAM) % 2**32, frame)
 
     rows = _some(rng, seen)
+    # All of a kernel is below this height, the place among it included at which views saw the surface.
     reaches = KERNEL_EXTENT * cloud.scales[rows].max(axis=1)
     fresh, errors = _visibility(scene, cloud, rows, stream, lifts=(np.zeros(len(rows)), reaches))
     stated = np.zeros(len(cloud)) if cloud.ambient_occlusion_error is None else cloud.ambient_occlusion_error

@@ -26,6 +26,13 @@ CHEBYSHEV, CANTELLI = 1.0 / FAR**2, 1.0 / (1.0 + FAR**2)
 BRIGHTEST = 10.0**-0.05
 """Reflectance of the white patch of a ColorChecker, whose optical density is 0.05; what is whiter is rare."""
 
+LEAST_OPACITY = 0.5
+"""Opacity below which a Gaussian is no surface."""
+
+CLOSED = (1.0 - LEAST_OPACITY) ** 2
+"""Visibility below which a side is the inside of a body: the Gaussians of a surface overlap, so that light from outside
+passes two of them at least. A sheet, such as a floor, has two open sides, and either may be the right one."""
+
 LEAST_COUNT = 32
 """Gaussians below which a share means nothing: two of them are 1/16."""
 
@@ -69,7 +76,7 @@ FURNACE, OCCLUSION, FACING, SHAPE, COLOR, STEADY = PHYSICAL_RULES = (
     PhysicalRule(
         "BEAM-PHYS-003",
         "error",
-        "No normal points to the side that is less open by four standard errors, but for 1/17.",
+        "No normal points into a body, to a closed side that is less open by four standard errors, but for 1/17.",
         "Turn the normals to the open side.",
         "beam:normals",
     ),
@@ -173,7 +180,7 @@ def occlusion(stored: FloatArray, stored_error: FloatArray, fresh: FloatArray, f
 def facing(open_side: FloatArray, open_error: FloatArray, back: FloatArray, back_error: FloatArray) -> Measured:
     """Judge visibilities about normals, and about their opposites, all ``(M,)``, with their standard errors."""
     errors = np.hypot(open_error, back_error)
-    return _share(FACING, back - open_side > FAR * errors, CANTELLI, "turned inward")
+    return _share(FACING, (open_side < CLOSED) & (back - open_side > FAR * errors), CANTELLI, "turned inward")
 
 
 def shape(cosines: FloatArray) -> Measured:

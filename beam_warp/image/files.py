@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import require_array, require_choice, require_finite, require_number
-from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, MissingFileError, OutputError
+from beam_warp.checks import require_array, require_choice, require_finite, require_number, require_path
+from beam_warp.errors import AssetFormatError, InvalidArrayError, MissingFileError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709, linear_to_srgb, srgb_to_linear
 from beam_warp.image.hdr import radiance_hdr_size, read_radiance_hdr
+from beam_warp.outputs import replacing as replacing
 
 MAX_SIDE = 32_768
 """Largest width or height read or written [px]."""
@@ -149,7 +150,7 @@ def read_image(path: str | os.PathLike[str], *, color_space: str | None = None, 
         AssetFormatError: The file is damaged, larger than `MAX_SIDE`, ``max_pixels`` or `MAX_CHANNELS`, or of a kind
             (deep, multi-part, subsampled, CMYK, ...) that is not read. NaN and infinity in an EXR are kept.
     """
-    path = Path(path)
+    path = require_path("path", path)
     if color_space is not None:
         require_choice("color_space", color_space, COLOR_SPACES)
     suffix = path.suffix.lower()
@@ -170,7 +171,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         MissingFileError: There is no such file, or it cannot be read.
         AssetFormatError: The header is not that of an image that `read_image` reads.
     """
-    path = Path(path)
+    path = require_path("path", path)
     _require_file(path)
     suffix = path.suffix.lower()
     if suffix == ".hdr":
@@ -321,24 +322,6 @@ def _read_pillow(path: Path, max_pixels: int) -> dict[str, NDArray[np.float32]]:
     return {name: values[..., index].astype(np.float32) / np.float32(full) for index, name in enumerate(names)}
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path``; the file replaces ``path`` on success and is removed on failure."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except BeamError:  # says already what is wrong
-        raise
-    except (OSError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise OutputError(
-            f"output must be a writable file, got {path} ({reason}). Choose a folder that exists and has room."
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *, half: bool = False) -> None:
     """Write an EXR of named channels, ZIP-compressed; readers see the old file or the complete new one.
 
@@ -353,7 +336,7 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, ArrayLike], *
     """
     import OpenEXR
 
-    path = Path(path)
+    path = require_path("path", path)
     if not channels:
         raise InvalidArrayError("channels must hold at least one channel, got none. Pass name → (H, W) arrays.")
     arrays = {name: require_array(name, value, (None, None)) for name, value in channels.items()}
@@ -390,7 +373,7 @@ def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
     """
     from PIL import Image as PillowImage
 
-    path = Path(path)
+    path = require_path("path", path)
     array = np.asarray(pixels)
     if (
         array.dtype != np.uint8

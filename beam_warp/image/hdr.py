@@ -22,6 +22,9 @@ MAX_HEADER_BYTES = 65536
 MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 32767
 """Range of widths for which the new run-length encoding is defined."""
 
+UNCHECKED_PIXELS = 2**24
+"""Pixels of the largest picture, 192 MiB, for which memory is taken before all scanlines are known to be whole."""
+
 _RESOLUTION = re.compile(rb"([+-])Y (\d{1,9}) ([+-])X (\d{1,9})\n")
 
 
@@ -45,6 +48,9 @@ def read_radiance_hdr(path: Path, require_size: Callable[[Path, int, int], None]
     # A scanline takes at least one four-byte entry: refuse what cannot be complete before allocating for it.
     if len(data) - start < 4 * height:
         raise _truncated(path, 0)
+    if width * height > UNCHECKED_PIXELS:
+        for _ in _scanlines(path, data, start, height, width):
+            pass  # a damaged picture is refused before memory is taken for all of it
     scale = np.ldexp(1.0 / exposure, np.arange(256) - 136)
     scale[0] = 0.0  # exponent 0 is black by definition
     radiance = np.empty((height, width, 3), np.float32)

@@ -20,7 +20,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_count, require_number
+from beam_warp.checks import require_count, require_number, require_path
 from beam_warp.errors import InvalidArrayError, OutputError
 from beam_warp.image.files import replacing
 
@@ -91,7 +91,7 @@ def require_encoder(ffmpeg: str) -> None:
         )
 
 
-def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOptions, *, ffmpeg: str) -> int:
+def write_mp4(path: str | Path, frames: Iterable[NDArray[np.uint8]], options: VideoOptions, *, ffmpeg: str) -> int:
     """Encode a video, which appears complete or not at all.
 
     Args:
@@ -108,7 +108,7 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], options: VideoOpt
         InvalidArrayError: There is no frame, or one differs in type or shape from the first.
         OutputError: ffmpeg cannot be run or fails; the message quotes its last line.
     """
-    images = iter(frames)
+    path, images = require_path("path", path), iter(frames)
     first = next(images, None)
     if first is None:
         raise InvalidArrayError("frames must hold at least one image, got none. Render some first.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -15,8 +14,10 @@ import warp as wp
 
 from beam_warp._version import __version__
 from beam_warp.digests import code_digest
-from beam_warp.errors import OutputError
 from beam_warp.kernels.common.launching import thread_count
+from beam_warp.outputs import replacing
+
+REPORT_NAME = "report.json"
 
 
 def versions() -> dict[str, str]:
@@ -42,7 +43,7 @@ def device_facts(device: Any) -> dict[str, Any]:
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:
     """Write ``out/report.json`` whole or not at all."""
-    write_json(out / "report.json", report)
+    write_json(out / REPORT_NAME, report)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -51,10 +52,5 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         OutputError: The file cannot be written; nothing is left behind.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path} must be writable, got {error.strerror}. Free space or choose another.") from error

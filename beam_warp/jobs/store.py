@@ -6,31 +6,31 @@ reader compares that key, so a stale file is never taken for a fresh one.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.errors import AssetFormatError, OutputError
+from beam_warp.outputs import replacing
 
-KEY = "beam_key"
+KEY, CHECKSUM = "beam_key", "crc32"
 
 
 def make_folders(out: Path, *names: str) -> list[Path]:
-    """Make a folder for results and the named folders in it; those that exist stay as they are.
+    """Make a folder for results, those above it and the named ones in it; those that exist stay as they are.
 
     Raises:
-        OutputError: One of them cannot be made, or ``out`` has no parent.
+        OutputError: One of them cannot be made.
     """
     folders = [out / name for name in names]
     try:
         for folder in (out, *folders):
-            folder.mkdir(exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"out must be a folder that can be made, got {out} ({error.strerror}). Choose another place."
@@ -44,17 +44,13 @@ def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> Non
     Raises:
         OutputError: The file cannot be written; nothing is left behind.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with h5py.File(temporary, "w") as file:
-            file.attrs[KEY] = key
-            for name, array in arrays.items():
-                file.create_dataset(name, data=np.asarray(array, order="C"), track_times=False)  # same bytes again
-        temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path} must be writable, got {error}. Free space or choose another folder.") from error
+    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs[KEY] = key
+        for name, array in arrays.items():
+            data = np.asarray(array, order="C")
+            file.create_dataset(name, data=data, track_times=False).attrs[CHECKSUM] = _checksum(
+                data
+            )  # same bytes again
 
 
 def frame_key(path: Path) -> str | None:
@@ -81,12 +77,24 @@ def read_frame(path: Path, names: tuple[str, ...] | None = None) -> dict[str, ND
     try:
         with h5py.File(path, "r") as file:
             wanted = tuple(file) if names is None else names
-            return {name: np.asarray(file[name]) for name in wanted}
+            return {name: _checked(file[name]) for name in wanted}
     except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
         reason = " ".join(str(error).split())
         raise AssetFormatError(
             f"stored frame must be whole, got a damaged file at {path} ({reason}). Delete it; it is made again."
         ) from error
+
+
+def _checksum(array: NDArray[Any]) -> int:
+    return crc32(array.data if array.size else b"")
+
+
+def _checked(dataset: Any) -> NDArray[Any]:
+    """Read an array, and compare it with its checksum: zeros in a damaged file would be values like any others."""
+    array = np.asarray(dataset)
+    if _checksum(np.ascontiguousarray(array)) != dataset.attrs[CHECKSUM]:
+        raise ValueError(f"another checksum of {dataset.name[1:]}")
+    return array
 
 
 def kept_frame(path: Path, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_choice, require_count
+from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
@@ -106,6 +106,8 @@ class MaterialOptions:
         require_choice("sampler", self.sampler, SAMPLERS)
         require_choice("density", self.density, DENSITIES)
         require_count("seed", self.seed, 0, 2**32 - 1)
+        if self.offset != "auto":
+            require_number("offset", self.offset)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

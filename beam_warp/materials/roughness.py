@@ -40,6 +40,7 @@ from beam_warp.materials.direct import MaterialOptions, light_batches, lit_point
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
+from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianCloud
 
 CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.85, 1.0)
@@ -253,7 +254,7 @@ def solve_roughness(
         report = {"near": _Evidence(0.0, 0.0), "wide": _Evidence(0.0, 0.0), "step": 0.0, "frames": profile.frames}
         return _estimate(means, errors, np.zeros(len(places), bool), chosen, moments, report)
     seen = places[known]
-    tree = cKDTree(seen[_morton_order(seen)][::CLUSTER])
+    tree = cKDTree(seen[_along_curve(seen)][::CLUSTER])
     clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], tree.query(seen, workers=-1)[1], tree.n)
     resample = CubicSpline(CANDIDATES, np.eye(len(CANDIDATES)))(GRID).T
     near, wide = (_sums_around(tree, clusters, count) @ resample for count in (NEAR, WIDE))
@@ -416,12 +417,8 @@ def _nearest(tree: cKDTree, places: NDArray[np.float64]) -> tuple[NDArray[np.flo
     return weight / weight.sum(axis=1, keepdims=True), index
 
 
-def _morton_order(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the order of points along a space-filling curve of 1024 cells a side."""
     low = points.min(axis=0)
-    cells = ((points - low) * (1023.0 / max(float(np.ptp(points, axis=0).max()), 1e-30))).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    cells = (points - low) * (1023.0 / max(float(np.ptp(points, axis=0).max()), 1e-30))
+    return morton_order(cells.astype(np.uint32))

@@ -22,10 +22,20 @@ MAX_TEXELS = 1 << 26
 
 @dataclass(frozen=True)
 class RoughnessTexture:
-    """A roughness texture and the mesh whose texture coordinates it follows, in the axes and units of the input."""
+    """A roughness texture and the mesh whose texture coordinates it follows, in the axes and units of the input.
+
+    Raises:
+        MissingFileError: One of the files is not there.
+    """
 
     texture: Path
     mesh: Path
+
+    def __post_init__(self) -> None:
+        """Look for both files before any work."""
+        for path in (self.texture, self.mesh):
+            if not path.is_file():
+                raise MissingFileError(f"roughness texture and mesh must be files, got {path}. Check the path.")
 
 
 def stated_roughness(cloud: GaussianCloud, source: float | RoughnessTexture) -> NDArray[np.float32]:

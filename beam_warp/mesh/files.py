@@ -7,13 +7,13 @@ glTF fixes its own: y up, -z forward. A GLB is turned by a quarter about x when 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from beam_warp.checks import require_path
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError
 from beam_warp.image.files import replacing
 
@@ -37,7 +37,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
         InvalidOptionError: The suffix is another one.
         OutputError: The file cannot be written; nothing is left behind.
     """
-    target = Path(path)
+    target = require_path("path", path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise InvalidOptionError(f"mesh must end in one of {', '.join(SUFFIXES)}, got {target.name}. Rename it.")
@@ -58,7 +58,7 @@ def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
         MissingFileError: There is no such file.
         AssetFormatError: It cannot be read, or holds no triangle.
     """
-    source = Path(path)
+    source = require_path("path", path)
     if not source.is_file():
         raise MissingFileError(f"mesh must be an existing file, got {source}. Check the path.")
     try:

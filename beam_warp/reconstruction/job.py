@@ -21,9 +21,9 @@ bytes.
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,11 +35,12 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
 from beam_warp.capture.views import CapturedView
-from beam_warp.checks import require_choice, require_count
+from beam_warp.checks import require_choice, require_count, require_path
+from beam_warp.converters.staging import require_writable
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import InvalidOptionError
+from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress, no_progress
-from beam_warp.jobs.report import device_facts, versions, write_json, write_report
+from beam_warp.jobs.report import REPORT_NAME, device_facts, versions, write_json, write_report
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.model import model_frame, within
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
@@ -136,7 +137,7 @@ def reconstruct(
 
     Args:
         capture: Images and cameras; its world is that of the Gaussians.
-        out: Folder; made if its parent exists.
+        out: Folder; made if it does not exist.
         steps: How the Gaussians of a frame are found.
         options: See `ReconstructOptions`.
         progress: Called with (stage, done, total, note).
@@ -149,7 +150,7 @@ def reconstruct(
         BeamError: An image is damaged, or a step refuses its input.
     """
     started = time.perf_counter()
-    folder, chosen = Path(out), options or ReconstructOptions()
+    folder, chosen = require_path("out", out), options or ReconstructOptions()
     job = _prepare(capture, folder, steps, chosen, progress)
     resumed = _reconstruct_segments(job, job.plan.segments)
     progress("write asset", 0, 1)
@@ -194,7 +195,7 @@ def reconstruct_part(
             f"segment_length must be at least 1 to work in parts, got 0 with part {part.number}/{part.count}: there is "
             "one segment only. State the length of the segments."
         )
-    job = _prepare(capture, Path(out), steps, chosen, progress)
+    job = _prepare(capture, require_path("out", out), steps, chosen, progress)
     segments = job.plan.segments[part.number - 1 :: part.count]
     _reconstruct_segments(job, segments)
     return tuple(frame for segment in segments for frame in segment)
@@ -218,6 +219,8 @@ def _prepare(
 ) -> _Job:
     """Check everything, and then make the folders."""
     device = resolve_device(steps.device)
+    for name in (ASSET_NAME, REPORT_NAME):
+        require_writable(out / name, is_made=True)
     plan = plan_frames(capture, options.frames, options.segment_length)
     job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
     rig = _refined_rig(job, out) if options.cameras == "refine" else None
@@ -235,7 +238,9 @@ def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
         return None
     with FrameReader(job.plan.records, job.store.digests) as reader:
         key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "cameras")
-        known = read_corrections(out, key)
+        known = None
+        with suppress(AssetFormatError):  # what is damaged is found anew
+            known = read_corrections(out, key)
         if known is None:
             names = [record.camera_name for record in records]
             known = job.steps.refine_rig(names, reader.views(frame), within(job.progress, "cameras", frame))
@@ -260,7 +265,6 @@ def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
 def _reconstruct_segments(job: _Job, segments: Sequence[Sequence[int]]) -> int:
     """Bring the frames of some segments into the store, those of each in their order; return how many were there."""
     order = [step for segment in segments for step in zip(segment, (None, *segment), strict=False)]
-    job.store.remove_leftovers({frame for frame, _ in order})
     job.progress("frames", 0, len(order))
     key, resumed = "", 0
     with FrameReader(job.plan.records, job.store.digests) as reader:
@@ -307,12 +311,7 @@ def _preview(job: _Job, frame: int, views: Sequence[CapturedView] | None) -> NDA
 
 
 def _write_asset(job: _Job, out: Path, frames_per_second: float) -> tuple[Path, GaussianSequence]:
-    """Write the asset, after removing what a killed call left half written of it and of the report."""
-    for path in [*out.glob(f".{Path(ASSET_NAME).stem}.*"), *out.glob(".report.json.*.tmp")]:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    """Write the asset of all frames."""
     frames = tuple(job.plan.records)
     sequence = stored_sequence(
         [job.store.path(frame) for frame in frames],
@@ -340,5 +339,5 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
         "cameras": None if job.rig is None else job.rig.as_dict(),
         **sequence_facts(frames),
         "findings": [vars(finding) for finding in findings],
-        "warnings": [*(finding.what for finding in findings), *warnings_of(frames)],
+        "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],
     }

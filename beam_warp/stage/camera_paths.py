@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from beam_warp.checks import require_array, require_choice, require_finite, require_number
+from beam_warp.checks import require_array, require_choice, require_finite, require_number, require_path
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.stage.fields import Fields, placed, read_json, shown
 from beam_warp.world.camera import OPENGL_TO_OPENCV, Camera, focal_length
@@ -381,7 +381,7 @@ def catmull_rom(
     return mixed(1, 2, mixed(0, 2, one, two), mixed(1, 3, two, three))
 
 
-def read_camera_path(path: Path, *, prim_path: str | None = None) -> CameraPath:
+def read_camera_path(path: str | Path, *, prim_path: str | None = None) -> CameraPath:
     """Read a camera path: key frames of ours or of nerfstudio's viewer as ``.json``, or the camera of a USD stage.
 
     Args:
@@ -392,6 +392,7 @@ def read_camera_path(path: Path, *, prim_path: str | None = None) -> CameraPath:
         MissingFileError: It cannot be read.
         AssetFormatError: It is malformed; names the file and the key frame.
     """
+    path = require_path("path", path)
     if path.suffix.lower() in USD_SUFFIXES:
         from beam_warp.schema.cameras import read_usd_camera  # brings OpenUSD along, which no other path needs
 

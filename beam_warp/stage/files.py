@@ -8,7 +8,8 @@ from typing import Any
 
 from beam_warp import converters
 from beam_warp.checks import require_number
-from beam_warp.converters.numbering import SOG_NAME, files_at
+from beam_warp.converters.formats import format_of
+from beam_warp.converters.numbering import files_at
 from beam_warp.errors import AssetFormatError, SchemaVersionError
 from beam_warp.stage.assets import StageAsset, placement_of
 from beam_warp.stage.camera_paths import (
@@ -45,7 +46,7 @@ FIELDS = ("fps", "duration", "assets", "meshes", "lights", "environment", "camer
 _PLACE = ("translate", "rotate", "scale")
 
 ASSET_FIELDS = (
-    *("path", "name", "source_axes", "drop_invalid", *_PLACE),
+    *("path", "name", "source_axes", "meters_per_unit", "drop_invalid", *_PLACE),
     *("on_ground", "centered", "start", "speed", "loop", "blend"),
 )
 
@@ -95,13 +96,20 @@ def read_stage_file(path: Path) -> dict[str, Any]:
 
 
 def read_stage_asset(
-    path: Path, *, source_axes: str | None = None, drop_invalid: bool = False, name: str | None = None, **place: Any
+    path: Path,
+    *,
+    source_axes: str | None = None,
+    meters_per_unit: float | None = None,
+    drop_invalid: bool = False,
+    name: str | None = None,
+    **place: Any,
 ) -> StageAsset:
     """Read an asset and put it on a stage.
 
     Args:
         path: A file or folder of Gaussians, as `beam_warp.converters.read` takes it.
         source_axes: Axes of the file; None takes its word.
+        meters_per_unit: Length of the file's unit [m]; None takes its word.
         drop_invalid: Leave out rows that are no Gaussians.
         name: Name of the asset in messages; the file's name if None.
         place: Further attributes of a `StageAsset`.
@@ -109,7 +117,9 @@ def read_stage_asset(
     Raises:
         BeamError: It cannot be read, or is not relightable.
     """
-    sequence = converters.read(path, source_axes=source_axes, drop_invalid=drop_invalid)
+    sequence = converters.read(
+        path, source_axes=source_axes, meters_per_unit=meters_per_unit, drop_invalid=drop_invalid
+    )
     return StageAsset(sequence=sequence, name=name or path.name, files=source_files(path), **place)
 
 
@@ -120,8 +130,8 @@ def source_files(path: Path) -> tuple[tuple[Path, ...], ...]:
         from beam_warp.schema.stage_queries import layer_files  # brings OpenUSD along
 
         return (tuple(layer_files(files[0])),)
-    if files[0].name == SOG_NAME:
-        return (tuple(sorted(file for file in files[0].parent.iterdir() if file.is_file())),)
+    if format_of(files[0]).is_index:
+        return (tuple(sorted(file for file in files[0].parent.rglob("*") if file.is_file())),)
     return tuple((file,) for file in files)
 
 
@@ -130,7 +140,7 @@ def _asset(record: Any, where: str, folder: Path) -> StageAsset:
     fields = Fields({"path": record} if isinstance(record, str) else record, where, ASSET_FIELDS)
     path = fields.path("path", folder, folders=True)
     options = fields.given(
-        **dict.fromkeys(("start", "speed"), "number"),
+        **dict.fromkeys(("start", "speed", "meters_per_unit"), "number"),
         **dict.fromkeys(("on_ground", "centered", "loop", "drop_invalid"), "flag"),
         **dict.fromkeys(("name", "blend", "source_axes"), "text"),
     )

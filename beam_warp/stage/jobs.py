@@ -17,7 +17,7 @@ from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
 from beam_warp.jobs.listeners import CountProgress, NotedProgress
-from beam_warp.stage.output import Film, FrameLog, FramePattern, require_folder
+from beam_warp.stage.output import Film, FrameLog, FramePattern, Still, require_folder
 from beam_warp.stage.pictures import PictureWriter
 from beam_warp.stage.shot_digests import ShotDigests
 from beam_warp.stage.stage import Stage
@@ -109,6 +109,7 @@ class RenderJob:
         tally = RenderTally()
         try:
             for frame, path in images:
+                require_folder(Still(path))
                 self._draw(frame, path, tally)
                 self._report("render", len(tally.rendered), len(images))
         except KeyboardInterrupt as error:

@@ -129,21 +129,18 @@ def numbered(still: Still) -> FramePattern:
 
 
 def require_folder(target: Target) -> None:
-    """Refuse an output that cannot be written, before any work is done; make the folder of numbered images.
+    """Refuse an output that cannot be written, before any work is done; make its folder and those above it.
 
     Raises:
-        OutputError: The folder is missing or closed to us, or the name is a folder's.
+        OutputError: The folder cannot be made or is closed to us, or the name is a folder's.
     """
     folder = target.folder if isinstance(target, FramePattern) else target.path.parent
     try:
-        if isinstance(target, FramePattern):
-            folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"out must be in a folder that exists or can be made, got {folder} ({error.strerror}). Create it first."
+            f"out must be in a folder that exists or can be made, got {folder} ({error.strerror}). Choose another."
         ) from error
-    if not folder.is_dir():
-        raise OutputError(f"out must be in a folder that exists, got {folder}. Create it first.")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"out must be in a folder that can be written, got {folder}. Choose another.")
     if not isinstance(target, FramePattern) and target.path.is_dir():

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_number
+from beam_warp.checks import require_number, require_path
 from beam_warp.digests import array_digest, content_digest, described
 from beam_warp.stage.assets import StageAsset, joined
 from beam_warp.stage.camera_paths import CameraPath, OrbitPath
@@ -86,7 +86,7 @@ class Stage:
             MissingFileError: The file, or one that it names, is not there.
             AssetFormatError: It is malformed; says which field and what to do.
         """
-        return cls(**read_stage_file(Path(path)))
+        return cls(**read_stage_file(require_path("path", path)))
 
     @classmethod
     def of(
@@ -96,6 +96,7 @@ class Stage:
         spacing: float | None = None,
         centered: bool = False,
         source_axes: str | None = None,
+        meters_per_unit: float | None = None,
         drop_invalid: bool = False,
         on_ground: bool = False,
         loop: bool = False,
@@ -107,7 +108,8 @@ class Stage:
             paths: Files or folders of Gaussians, as `beam_warp.converters.read` takes them.
             spacing: Put the assets in a row along x, this far apart [m], each centred.
             centered: Put the middle of every asset over the origin.
-            source_axes: Axes of PLY files that do not state them.
+            source_axes: Axes of the files; None takes their word.
+            meters_per_unit: Length of the files' unit [m]; None takes their word.
             drop_invalid: Leave out rows that are no Gaussians.
             on_ground: Put the lowest point of every asset at height 0.
             loop: Whether assets start again after their last frame.
@@ -120,8 +122,9 @@ class Stage:
             require_number("spacing", spacing, 0.0, 1e6)
         assets = [
             read_stage_asset(
-                Path(path),
+                require_path("path", path),
                 source_axes=source_axes,
+                meters_per_unit=meters_per_unit,
                 drop_invalid=drop_invalid,
                 on_ground=on_ground,
                 centered=centered or spacing is not None,
@@ -269,6 +272,7 @@ class Stage:
                     "frames": len(asset.sequence),
                     "topology": asset.sequence.topology,
                     "raster": _raster(asset),
+                    "read": [asset.sequence.metadata.get(key) for key in ("source_axes", "source_units", "notes")],
                     "placement": described(asset.placement, self._file_digest),
                 }
                 for asset in self.assets

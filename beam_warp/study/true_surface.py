@@ -19,6 +19,7 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.mesh import vertex_normals
@@ -75,7 +76,7 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
     areas = 0.5 * np.linalg.norm(crossed, axis=1)
     if not (areas.sum() > 0.0):
         raise InvalidArrayError("mesh must have an area above 0, got 0. Give one with faces.")
-    along = np.argsort(_morton_codes(points[corners].mean(axis=1)), kind="stable")
+    along = _along_curve(points[corners].mean(axis=1))
     reached = np.cumsum(areas[along])
     at = (np.arange(count) + 0.5) / count * reached[-1]
     chosen = along[np.minimum(np.searchsorted(reached, at), len(along) - 1)]
@@ -220,12 +221,7 @@ class _DrawnViews:
         return sums.numpy()[:, :3].astype(np.float64)
 
 
-def _morton_codes(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return where points lie on a Morton curve through their box, 10 bits a side."""
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the order of points along a Morton curve through their box, 10 bits a side."""
     low, high = points.min(axis=0), points.max(axis=0)
-    cells = ((points - low) / np.maximum(high - low, 1e-30) * 1023.0).astype(np.int64)
-    codes = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return codes
+    return morton_order(((points - low) / np.maximum(high - low, 1e-30) * 1023.0).astype(np.uint32))

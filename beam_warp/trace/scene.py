@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import warp as wp
@@ -156,6 +156,17 @@ class Scene:
         """Whether the cloud came with normals."""
         normals = self.occluders.gaussians.normals
         return normals is not None and len(normals) > 0
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse copies and pickles: what is on a device belongs to one process.
+
+        Raises:
+            InvalidOptionError: Always.
+        """
+        raise InvalidOptionError(
+            "scene must stay in the process that made it, got a copy or a pickle of it. Pass its cloud, and make it "
+            "there."
+        )
 
     def __len__(self) -> int:
         """Return the number of Gaussians, those that are not traced included."""

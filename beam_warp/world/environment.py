@@ -10,13 +10,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.checks import require_array, require_count, require_number
+from beam_warp.checks import require_array, require_count, require_number, require_path
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError
 from beam_warp.image.files import MAX_ENVIRONMENT_PIXELS, MAX_SIDE, read_image
 
@@ -61,7 +60,7 @@ class EnvironmentMap:
             AssetFormatError: It is no image, no HDR format, not 2:1, larger than `MAX_ENVIRONMENT_PIXELS`, or a texel
                 is negative, NaN or infinite.
         """
-        path = Path(path)
+        path = require_path("path", path)
         if path.suffix.lower() not in (".exr", ".hdr"):
             raise AssetFormatError(
                 f"environment must be an .exr or .hdr file, got {path}. A display-referred image lacks the range of "

@@ -24,7 +24,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.checks import require_array, require_finite, require_number, require_range
+from beam_warp.checks import require_array, require_finite, require_number, require_path, require_range
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, InvalidOptionError, MissingFileError
 
 SUN_DIAMETER = 0.53
@@ -170,13 +170,14 @@ def lights_to_json(lights: Sequence[Light]) -> list[dict[str, Any]]:
     return [{"type": light_entry(names, light), **asdict(light)} for light in lights]
 
 
-def read_lights(path: Path) -> tuple[Light, ...]:
+def read_lights(path: str | Path) -> tuple[Light, ...]:
     """Read a JSON file that holds a list of lights, or an object with such a list as ``lights``.
 
     Raises:
         MissingFileError: The file cannot be read.
         AssetFormatError: The file is not JSON, or its list is wrong: see `lights_from_json`.
     """
+    path = require_path("path", path)
     if not path.is_file():
         raise MissingFileError(f"lights must be a file, got {path} (no such file). Check its name.")
     try:

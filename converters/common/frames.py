@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -165,6 +165,7 @@ class FrameToWrite:
         units_per_meter: Units of the file in a metre.
         raster: How splats are to be drawn: antialiased or not, and the low-pass [px²]; None if that is not stated.
         beside: Returns the temporary place of another file, which appears under the given name together with this one.
+            A name may have folders in it, which are made.
     """
 
     name: str
@@ -174,3 +175,10 @@ class FrameToWrite:
     units_per_meter: float
     raster: tuple[bool, float] | None
     beside: Callable[[str], Path]
+
+    @property
+    def model(self) -> Literal["antialiased", "2dgs"] | None:
+        """What other programs must know to draw the splats: that all are flat along z, or else drawn antialiased."""
+        if len(self.cloud) and not self.cloud.scales[:, 2].any():
+            return "2dgs"
+        return "antialiased" if self.raster is not None and self.raster[0] else None

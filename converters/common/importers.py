@@ -6,7 +6,8 @@ which. Files are prepared by this table, and `docs/engines.md` prints it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from beam_warp.errors import InvalidOptionError
@@ -22,6 +23,7 @@ class Importer:
     Attributes:
         name: Name in words.
         axes: Axes to write, with which the picture stands upright and is not mirrored.
+        other_axes: The same for files with some endings, where they differ.
         units_per_meter: Units of the file in a metre.
         sh_degrees: Least and greatest degree of spherical harmonics that it reads rightly.
         suffixes: Ends of the names of files that it reads and `convert` may write.
@@ -32,12 +34,17 @@ class Importer:
 
     name: str
     axes: str = RDF
+    other_axes: Mapping[str, str] = field(default_factory=dict, hash=False)
     units_per_meter: float = 1.0
     sh_degrees: tuple[int, int] = (0, 3)
     suffixes: tuple[str, ...]
     to_do: str
     evidence: str
     was_run: str = ""
+
+    def axes_of(self, suffix: str) -> str:
+        """Return the axes to write to a file whose name ends so."""
+        return self.other_axes.get(suffix, self.axes)
 
     def sh_degree(self, stored: int, asked: int | None) -> int:
         """Return the degree to write: the one asked for, else the nearest to the stored one that is read rightly.
@@ -87,19 +94,21 @@ _NANOGS = Importer(
 IMPORTERS: dict[str, Importer] = {
     "supersplat": Importer(
         name="SuperSplat",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".sog"),  # of SPZ it takes rdf, against the format
+        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
         to_do="Nothing.",
-        evidence="source, cc6e86a: a PLY is turned by 180° about z when it is loaded",
+        evidence="source, cc6e86a, and pull request 885: a file is turned by 180° about z when it is loaded, SPZ too",
     ),
     "playcanvas": Importer(
         name="PlayCanvas 2.23",
-        suffixes=(".ply", ".compressed.ply", ".sog"),
-        to_do="`entity.setLocalEulerAngles(0, 0, 180)`",
+        other_axes={".glb": "luf"},
+        suffixes=(".ply", ".compressed.ply", ".sog", ".glb"),
+        to_do="`entity.setLocalEulerAngles(0, 0, 180)`, but not for GLB, which is written as that leaves a PLY.",
         evidence="source, npm 2.23.0: values are taken as they are, in a world with y up",
         was_run=_IN_CHROMIUM,
     ),
     "spark": Importer(
         name="Spark 2.2 (three.js)",
+        other_axes={".spz": "rub"},
         suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz"),
         to_do="`splats.quaternion.set(1, 0, 0, 0)`, but not for SPZ, which has y up.",
         evidence="documentation, npm 2.2.0: its examples turn the mesh by 180° about x",
@@ -114,9 +123,10 @@ IMPORTERS: dict[str, Importer] = {
     ),
     "babylon": Importer(
         name="Babylon.js 9",
-        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".glb"),
-        to_do="Nothing. An SPZ would stand on its head: its numbers are taken as RDF.",
-        evidence="source, npm 8.56.2: y is negated, in a left-handed world with y up",
+        other_axes={".glb": "luf"},
+        suffixes=(".ply", ".compressed.ply", ".splat", ".sog", ".spz", ".glb"),
+        to_do="Nothing.",
+        evidence="source, npm 8.56.2: y is negated, of SPZ too, in a left-handed world with y up; of GLB, x is",
         was_run=_IN_CHROMIUM,
     ),
     "aras-p": _ARAS_P,

@@ -54,8 +54,8 @@ class WriteOptions:
 
     Attributes:
         target: Importer that the file is for, by its name in `beam_warp.converters.common.importers.IMPORTERS`: its
-            axes, units and spherical harmonics are written. None writes ``rdf`` in metres, unless the format fixes
-            its axes.
+            axes, units and spherical harmonics are written. None writes ``rdf`` in metres, unless the format asks
+            for others.
         axes: Axis code to write, whatever the importer; None for the importer's.
         profile: PLY only. ``standard`` is what every importer reads; ``beam`` appends the material channels.
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.

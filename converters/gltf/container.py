@@ -92,6 +92,20 @@ class GltfFile:
             raise self.error(f"{key} must be {len(default)} finite numbers", repr(values))
         return np.array(values, np.float64)
 
+    def held(self) -> int:
+        """Return the bytes that the file and those beside it have, each file counted once.
+
+        Raises:
+            AssetFormatError: Buffers state far more.
+        """
+        buffers = [self.item("buffers", index) for index in range(len(self.items(self.content, "buffers")))]
+        names = {uri for b in buffers if isinstance(uri := b.get("uri"), str) and not uri.startswith("data:")}
+        held = sum(os.path.getsize(place) for place in {self.path, *map(self._beside, names)} if os.path.isfile(place))  # noqa: PTH113, PTH202
+        stated = sum(self.number(buffer, "byteLength") for buffer in buffers)
+        if stated > 2 * held:  # one file in two buffers is sound
+            raise self.error(f"buffers must have at most twice the {held} bytes of their files", str(stated))
+        return held
+
     def buffer(self, index: int) -> NDArray[np.uint8]:
         """Return the bytes of a buffer."""
         if index not in self._buffers:

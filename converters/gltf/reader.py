@@ -1,13 +1,14 @@
 """glTF splats: reader of the extension KHR_gaussian_splatting in ``.gltf`` and ``.glb``, its SPZ form included.
 
 Primitives of the scene are joined in the order of its nodes, each moved by its node's transform. glTF is right-handed
-with y up; as for meshes, x is taken as right and -z as forward, which is also how its cameras look.
+with y up, the front of an asset faces +z, and its own left is +x. Whoever faces that front has x to the right and z
+towards them, and so has a camera: these are the axes here, as for meshes.
 
 A writer of ours adds materials as attributes that other readers skip (`MATERIALS`), and in the primitive's ``extras``
-an object ``beam`` with ``radiance_meaning``, ``raster`` and ``frames_per_second``.
+an object ``beam`` with ``radiance_meaning``, ``raster``, ``frames_per_second``, and ``axes`` if they are others.
 
-Source: Khronos, "KHR_gaussian_splatting", release candidate of 2026, and the draft
-"KHR_gaussian_splatting_compression_spz_2", whose bytes are taken as they are stored, as CesiumJS takes them.
+Source: Khronos, glTF 2.0, "Coordinate System and Units"; "KHR_gaussian_splatting", release candidate of 2026, and the
+draft "KHR_gaussian_splatting_compression_spz_2", whose bytes are taken as they are stored, as CesiumJS takes them.
 """
 
 from __future__ import annotations
@@ -30,11 +31,16 @@ from beam_warp.converters.spz import reader as spz
 from beam_warp.errors import AssetFormatError, BeamError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.schema.placement import Placement, placement_of
+from beam_warp.world.axes import require_axes
 from beam_warp.world.gaussians import MAX_SH_DEGREE
 from beam_warp.world.metadata import LOW_PASS_RANGE
 from beam_warp.world.quaternions import rotation_matrices
 
 AXES = "rub"
+"""Axes of a file that states no others."""
+
+_TURNING = "splat-transform"
+"""Generator whose files face the other way than ours; both stand upright."""
 
 EXTENSION = "KHR_gaussian_splatting"
 
@@ -66,8 +72,11 @@ _KNOWN = (EXTENSION, *_SPZ, _OLDER_SPZ, "KHR_mesh_quantization")
 _UNIT_ROUNDING = 1e-6
 """Largest difference of a length from 1 that is float32 rounding; such quaternions are kept bit for bit."""
 
-_MOST_NODES, _MOST_PRIMITIVES, _MOST_REPEATED = 10_000, 1000, 1 << 20
-"""Most nodes and primitives of a scene, and Gaussians that it may have if they are more than the file's bytes."""
+_MOST_NODES, _MOST_PRIMITIVES = 10_000, 1000
+"""Most nodes and primitives of a scene."""
+
+_MOST_REPEATED, _LEAST_BYTES = 1 << 18, 8
+"""Gaussians that any scene may have, and bytes of a file for each where there are more: SPZ has ten, accessors 56."""
 
 
 def harmonic(degree: int, order: int) -> str:
@@ -89,6 +98,7 @@ def probe(path: Path) -> int:
     return sum(_count(file, splats.primitive) for splats in _splats(file))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused by a cloud
 def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     """Read the Gaussians of a file.
 
@@ -101,18 +111,20 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
     found = _splats(file)
     notes: list[str] = []
     parts = [_part(file, splats, notes) for splats in found]
-    meaning, raster, rate = _statements(file, found[0].primitive)
+    meaning, raster, rate, axes = _statements(file, found[0].primitive)
     fields = _joined(file, parts, notes)
     if meaning == NO_COLOR or (meaning == BASE_COLOR_ONLY and "base_color" in fields):
         del fields["radiance"]
     else:
         fields["radiance_color_space"] = _color_space(file, [splats.primitive for splats in found], notes)
     generator = file.object(file.content, "asset").get("generator")
+    if isinstance(generator, str) and generator.startswith(_TURNING):
+        notes.append(f"{_TURNING} turns its input by 180° about z: pass --source-axes luf to undo it")
     return DecodedFrame(
         fields=fields,
         format="glTF, " + ("JSON" if file.chunk is None else "binary"),
         producer=f"{_shown(generator)} (asset.generator)" if isinstance(generator, str) else "unknown",
-        axes=AXES,
+        axes=axes,
         frames_per_second=rate,
         color_space_is_stated=True,
         radiance_meaning=meaning,
@@ -147,11 +159,9 @@ def _splats(file: GltfFile) -> list[_Splats]:
         got = f"{len(file.items(file.content, 'meshes'))} meshes without it"
         raise file.error(f"the scene must have points with {EXTENSION}", got, "Train Gaussians from a mesh first.")
     total = sum(_count(file, splats.primitive) for splats in found)
-    held = sum(
-        file.number(file.item("buffers", n), "byteLength") for n in range(len(file.items(file.content, "buffers")))
-    )
-    if total > max(_MOST_REPEATED, held):
-        raise file.error(f"the scene must have at most {max(_MOST_REPEATED, held)} Gaussians", str(total))
+    most = max(_MOST_REPEATED, file.held() // _LEAST_BYTES)
+    if total > most:
+        raise file.error(f"the scene must have at most {most} Gaussians", str(total), "Export it without repetition.")
     return found
 
 
@@ -296,8 +306,8 @@ def _color_space(file: GltfFile, primitives: list[dict[str, Any]], notes: list[s
     return space
 
 
-def _statements(file: GltfFile, primitive: dict[str, Any]) -> tuple[str | None, tuple[bool, float] | None, float]:
-    """Return what our writer states: the meaning of the colour, how splats are drawn, and the playback rate."""
+def _statements(file: GltfFile, primitive: dict[str, Any]) -> tuple[str | None, tuple[bool, float] | None, float, str]:
+    """Return what our writer states: the meaning of the colour, how splats are drawn, the playback rate, the axes."""
     said = file.object(file.object(primitive, "extras"), "beam")
     meaning, raster = said.get("radiance_meaning"), said.get("raster")
     try:
@@ -306,6 +316,7 @@ def _statements(file: GltfFile, primitive: dict[str, Any]) -> tuple[str | None, 
         if raster is not None:
             antialiased, low_pass = raster
             raster = (bool(antialiased), require_number("raster", low_pass, *LOW_PASS_RANGE))
-        return meaning, raster, require_number("frames_per_second", said.get("frames_per_second", 30.0), 1e-3, 1e6)
+        rate = require_number("frames_per_second", said.get("frames_per_second", 30.0), 1e-3, 1e6)
+        return meaning, raster, rate, require_axes("axes", said.get("axes", AXES))
     except (BeamError, TypeError, ValueError) as error:
         raise AssetFormatError(f"{file.path.name}: extras.beam: {error}") from error

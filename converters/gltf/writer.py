@@ -19,7 +19,7 @@ from beam_warp.converters.common.colors import display_radiance, resize_bands
 from beam_warp.converters.common.frames import FrameToWrite
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.gltf.container import FLOAT, GLB_CHUNK, GLB_HEADER, UNSIGNED_BYTE, WIDTHS
-from beam_warp.converters.gltf.reader import COLOR_SPACES, EXTENSION, GEOMETRY, MATERIALS, harmonic
+from beam_warp.converters.gltf.reader import AXES, COLOR_SPACES, EXTENSION, GEOMETRY, MATERIALS, harmonic
 from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
 from beam_warp.world.gaussians import GaussianCloud, sh_degree_of
@@ -46,6 +46,8 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
         radiance, space = cloud.radiance, cloud.radiance_color_space
     arrays = _arrays(cloud, resize_bands(radiance, options.sh_degree), space, materials)
     said: dict[str, Any] = {"radiance_meaning": meaning, "frames_per_second": frame.frames_per_second}
+    if cloud.axes != AXES:
+        said["axes"] = cloud.axes
     if frame.raster is not None:
         said["raster"] = list(frame.raster)
     document = _document(arrays, {"beam": said}, space)

@@ -32,6 +32,7 @@ from beam_warp.converters.ply.compressed import (
 from beam_warp.converters.ply.writer import comments_of, header_of
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.world.curve import CELLS, morton_order
 from beam_warp.world.gaussians import GaussianCloud
 
 _LEAST_LOG_SCALE = -20.0
@@ -55,7 +56,7 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
     radiance = resize_bands(shown, options.sh_degree)
     if radiance.shape[1] > _MAX_COEFFICIENTS:
         raise InvalidOptionError("sh_degree must be at most 3 for compressed PLY, got 4. Pass --sh-degree 3.")
-    bounds, words, bands = _packed(cloud, radiance, _morton_order(cloud.positions))
+    bounds, words, bands = _packed(cloud, radiance, morton_order(_cells(cloud.positions)))
     header = header_of(
         comments_of(frame, options, DISPLAY_SRGB, meaning),
         {
@@ -121,29 +122,14 @@ def _band_bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.where(place < 0.75, 0.0, np.where(place > 255.25, 255.0, inner)).astype(np.uint8)
 
 
-def _morton_order(positions: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return the order along a Morton curve of 2^21 cells an axis."""
-    if not len(positions):
-        return np.empty(0, np.intp)
-    low = positions.min(axis=0).astype(np.float64)
-    extent = positions.max(axis=0) - low
-    keys = np.empty(len(positions), np.uint64)
+def _cells(positions: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Return the cells of positions on the grid of `CELLS` over their box."""
+    cells = np.empty(positions.shape, np.uint32)
+    low = positions.min(axis=0, initial=np.inf).astype(np.float64)
+    extent = positions.max(axis=0, initial=-np.inf) - low
 
-    def interleave(part: slice) -> None:
-        spread = ((positions[part] - low) / np.where(extent > 0.0, extent, 1.0) * (2**21 - 1)).astype(np.uint64)
-        for shift, mask in _SPREADING:
-            spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-        keys[part] = spread @ np.array([1, 2, 4], np.uint64)
+    def fill(part: slice) -> None:
+        cells[part] = (positions[part] - low) / np.where(extent > 0.0, extent, 1.0) * (CELLS - 1)
 
-    for_each_block(interleave, len(positions))
-    return np.argsort(keys, kind="stable")
-
-
-_SPREADING = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
-"""Shifts and masks that put two zeros before each of 21 bits."""
+    for_each_block(fill, len(positions))
+    return cells

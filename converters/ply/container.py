@@ -44,6 +44,8 @@ SCALAR_TYPES = {
 }
 """NumPy code of each type word, old or new."""
 
+_RENDER_MODE = re.compile(r"splatrendermode:?\s+(default|mip|2dgs)|antialiased\s+([01])")
+
 RASTER_WORDS = {False: "classic", True: "antialiased"}
 """First word of the comment ``beam_raster``, by whether splats are drawn antialiased."""
 
@@ -101,6 +103,18 @@ class PlyHeader:
         """Comments of the form ``beam_<key> <value>``, by which our own writer describes a file."""
         pairs = (comment.partition(" ") for comment in self.comments if comment.startswith("beam_"))
         return {key: value.strip() for key, _, value in pairs}
+
+    @property
+    def render_mode(self) -> str:
+        """How the splats are to be drawn: ``default``, ``mip`` or ``2dgs``, by the last comment that says it.
+
+        Brush writes ``SplatRenderMode: mip``, and Postshot ``antialiased 1``.
+        """
+        mode = "default"
+        for comment in self.comments:
+            if said := _RENDER_MODE.fullmatch(comment.lower()):
+                mode = said[1] or ("mip" if said[2] == "1" else "default")
+        return mode
 
 
 def _header_lines(path: Path, start: bytes) -> tuple[list[str], int]:
@@ -268,8 +282,8 @@ def open_columns(header: PlyHeader, name: str) -> tuple[Element, ReadBlock]:
     """
     element, offset = _require_plain_rows(header, name)
     is_text, order = header.encoding == "ascii", ENCODINGS[header.encoding]
-    kind = np.dtype([(column.name, "f4" if is_text else order + column.code) for column in element.properties])
-    text = _ascii_rows(header, element, offset).view(kind)[:, 0] if is_text else None
+    kind = np.dtype([(column.name, order + column.code) for column in element.properties])
+    text = _ascii_rows(header, element, kind, offset) if is_text else None
 
     def read(part: slice, matrices: Sequence[tuple[Sequence[str], NDArray[Any]]]) -> None:
         rows = _binary_rows(header, kind, offset, part) if text is None else text[part]
@@ -319,26 +333,26 @@ def _binary_rows(header: PlyHeader, kind: np.dtype[Any], offset: int, part: slic
     return rows
 
 
-def _ascii_rows(header: PlyHeader, element: Element, skipped_rows: int) -> NDArray[np.float32]:
+def _ascii_rows(header: PlyHeader, element: Element, kind: np.dtype[Any], skipped_rows: int) -> NDArray[Any]:
+    """Return the rows of an element in text; each number is read as the type that the header gives it."""
     if not element.count:
-        return np.empty((0, len(element.properties)), np.float32)
+        return np.empty(0, kind)
     with header.path.open("rb") as file, warnings.catch_warnings():
         file.seek(header.data_start)
         text = io.TextIOWrapper(file, encoding="ascii", errors="replace")
         try:
             warnings.simplefilter("ignore", UserWarning)  # of blank lines and missing rows: counted below
-            rows = np.loadtxt(
-                text, dtype=np.float32, comments=None, skiprows=skipped_rows, max_rows=element.count, ndmin=2
-            )
+            rows = np.loadtxt(text, dtype=kind, comments=None, skiprows=skipped_rows, max_rows=element.count, ndmin=1)
         except ValueError as error:
+            said = re.sub(r"^the dtype .* but (\d+) were found (at row \d+);.*", r"\1 \2", str(error)).rstrip(".")
             raise malformed(
-                header.path, f"element {element.name} must hold rows of numbers", str(error), "Export the file again."
+                header.path,
+                f"element {element.name} must hold rows of {len(element.properties)} numbers of its types",
+                said,
+                "Export the file again.",
             ) from error
-    if rows.shape != (element.count, len(element.properties)):
+    if len(rows) != element.count:
         raise malformed(
-            header.path,
-            f"element {element.name} must hold {element.count} rows of {len(element.properties)} numbers",
-            f"{rows.shape[0]} rows of {rows.shape[1]}",
-            "Export or download it again.",
+            header.path, f"element {element.name} must hold {element.count} rows", str(len(rows)), "Export it again."
         )
     return rows

@@ -33,7 +33,7 @@ from beam_warp.converters.ply.producers import (
 from beam_warp.errors import AssetFormatError, BeamError, SchemaVersionError
 from beam_warp.image.color import COLOR_SPACES, DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.world.axes import AXIS_CODES
-from beam_warp.world.metadata import LOW_PASS_RANGE
+from beam_warp.world.metadata import LOW_PASS_RANGE, UNSTATED_RASTER
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -64,6 +64,9 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
             del fields["radiance"], fields["radiance_color_space"]
     else:
         fields = _decode(header, options, statements, notes)
+    if header.render_mode == "2dgs" and fields["scales"][:, 2].any():
+        fields["scales"][:, 2] = 0.0
+        notes.append("SplatRenderMode 2dgs: read as 2D Gaussians of thickness 0")
     return DecodedFrame(
         fields=fields,
         format=_format(header),
@@ -87,7 +90,7 @@ def _format(header: PlyHeader) -> str:
 
 @dataclass(frozen=True)
 class _Statements:
-    """Values that the comments of our own writer state, checked."""
+    """Values that comments state, nearly all of them those of our own writer; checked."""
 
     axes: str | None
     meters_per_unit: float
@@ -119,7 +122,8 @@ class _Statements:
             units = require_number("beam_meters_per_unit", said.get("beam_meters_per_unit", 1.0), 1e-6, 1e6)  # type: ignore[arg-type]
             rate = said.get("beam_frame", "0 30").rpartition(" ")[2]
             frames_per_second = require_number("beam_frame's rate", rate, 1e-3, 1e6)  # type: ignore[arg-type]
-            raster = _raster(said["beam_raster"]) if "beam_raster" in said else None
+            mip = (True, UNSTATED_RASTER[1]) if header.render_mode == "mip" else None
+            raster = _raster(said["beam_raster"]) if "beam_raster" in said else mip
         except BeamError as error:
             raise AssetFormatError(f"{header.path.name}: {error}") from error
         return cls(

@@ -94,6 +94,8 @@ def comments_of(frame: FrameToWrite, options: WriteOptions, color_space: str, me
     if frame.raster is not None:
         antialiased, low_pass = frame.raster
         comments.append(f"beam_raster {RASTER_WORDS[antialiased]} {np.float32(low_pass)!s}")
+    if frame.model is not None:
+        comments.append(f"SplatRenderMode: {'mip' if frame.model == 'antialiased' else frame.model}")
     return comments
 
 

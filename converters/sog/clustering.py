@@ -114,14 +114,16 @@ def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float3
     rng = np.random.default_rng(_SEED)
     coarse = max(1, round(np.sqrt(size)))
     sample = vectors[rng.choice(len(vectors), min(_SAMPLE, len(vectors)), replace=False)]
-    centers = _means(sample, sample[:coarse].copy())[0]
+    different = rng.permutation(np.unique(sample, axis=0))  # equal starts would leave most vectors in one group
+    centers = _means(sample, different[:coarse])[0]
+    coarse = len(centers)
     groups, distances = _nearest(vectors, centers)
     order = np.argsort(groups, kind="stable")
     ends = np.cumsum(np.bincount(groups, minlength=coarse))
     shares = _shares(np.bincount(groups, np.sqrt(distances), minlength=coarse), np.diff(ends, prepend=0), size)
     rows = np.split(order, ends[:-1])
     starts = [vectors[rng.choice(part, share, replace=False)] for part, share in zip(rows, shares, strict=True)]
-    labels, entries = np.empty(len(vectors), np.intp), np.empty((size, vectors.shape[1]), np.float32)
+    labels, entries = np.empty(len(vectors), np.intp), np.zeros((size, vectors.shape[1]), np.float32)
 
     def divide(rows: NDArray[np.intp], start: NDArray[np.float32], first: int) -> None:
         entries[first : first + len(start)], own = _means(vectors[rows], start)
@@ -133,10 +135,14 @@ def _divided(vectors: NDArray[np.float32], size: int) -> tuple[NDArray[np.float3
 
 
 def _shares(weights: NDArray[np.number], counts: NDArray[np.integer], size: int) -> NDArray[np.intp]:
-    """Divide entries among groups by weight; a group gets no more than it has members, and at least one if it has."""
+    """Divide entries among groups by weight; a group gets no more than it has members, and at least one if it has.
+
+    A group without weight, whose members are equal, gets no more than one: entries may be left over.
+    """
     shares = np.minimum(np.maximum(1, np.floor(weights / max(weights.sum(), 1e-300) * size)), counts).astype(np.intp)
+    most = np.where(weights > 0.0, counts, np.minimum(1, counts))
     for group in np.argsort(-weights, kind="stable"):  # what remains, or is too much by the least of one
-        shares[group] = np.clip(shares[group] + size - shares.sum(), min(1, counts[group]), counts[group])
+        shares[group] = np.clip(shares[group] + size - shares.sum(), min(1, counts[group]), most[group])
     return shares
 
 

@@ -8,7 +8,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.archives import open_zip
 from beam_warp.converters.common.errors import malformed
 from beam_warp.errors import AssetFormatError, MissingFileError
 
@@ -23,9 +24,6 @@ META = "meta.json"
 
 MAX_META_BYTES = 2**20
 """Largest meta.json read [byte]; one with three codebooks has 16 KiB."""
-
-_MAX_DIRECTORY_BYTES = 2**16
-"""Largest directory of a bundle [byte]: eight files need under 1 KiB."""
 
 _HEAD_BYTES = 2**12
 """Bytes of a texture that are read for its size."""
@@ -177,28 +175,14 @@ def open_sog(path: Path) -> Iterator[SogFiles]:
     elif path.name.lower().endswith(".json"):
         yield SogFiles(path, path.parent, path.name)
     else:
-        try:
-            _require_small_directory(path)
-            archive = zipfile.ZipFile(path)
-        except AssetFormatError:
-            raise
-        except OSError as error:
-            raise MissingFileError(f"input must be an existing file, got {path} ({error.strerror}).") from error
-        except (ValueError, NotImplementedError, struct.error, zipfile.BadZipFile) as error:
-            raise malformed(path, "a SOG bundle must be a zip archive", _reason(error), "Export it again.") from error
-        with archive:
+        with ExitStack() as opened:
+            try:
+                archive = opened.enter_context(open_zip(path))
+            except OSError as error:
+                raise MissingFileError(f"input must be an existing file, got {path} ({error.strerror}).") from error
+            except (ValueError, NotImplementedError, struct.error, zipfile.BadZipFile) as error:
+                got = _reason(error)
+                raise malformed(
+                    path, "a SOG bundle must be a zip archive of few files", got, "Export it again."
+                ) from error
             yield SogFiles(path, archive)
-
-
-def _require_small_directory(path: Path) -> None:
-    """Refuse an archive whose directory would take much memory to read."""
-    with path.open("rb") as stream:
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(0, size - 2**16 - 22))
-        tail = stream.read()
-    end = tail.rfind(b"PK\5\6")
-    listed = int.from_bytes(tail[end + 12 : end + 16], "little") if end >= 0 else 0
-    if listed > _MAX_DIRECTORY_BYTES or b"PK\6\7" in tail[max(0, end - 20) : max(0, end)]:
-        raise malformed(
-            path, "a SOG bundle must list its eight files", f"a directory of {listed} bytes", "Export it again."
-        )

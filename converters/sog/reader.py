@@ -46,7 +46,7 @@ LARGEST_AT_CODE = 252
 
 _CODES = np.arange(256) / 255.0
 
-_FREE_COUNT = 2**20
+_FREE_COUNT = 2**18
 """Gaussians that a SOG of any size may have."""
 
 _COUNT_PER_BYTE = 4

@@ -1,4 +1,4 @@
-"""Writer of SOG bundles, version 2; the format is described in `beam_warp.converters.sog.reader`.
+"""Writer of SOG, version 2, as bundles and in folders; the format is described in `beam_warp.converters.sog.reader`.
 
 All codes are the nearest ones. Gaussians are put in Morton order of their 16-bit positions, so that neighbouring pixels
 are alike, and textures small. The same Gaussians give the same bytes.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from beam_warp.converters.sog.clustering import codebook, nearest_codes, palette
 from beam_warp.converters.sog.files import META
 from beam_warp.converters.sog.reader import COEFFICIENTS, LARGEST_AT_CODE, PALETTE_COLUMNS, PALETTE_LIMIT
 from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianCloud
 
 MAX_SIDE = 16_380
@@ -36,14 +37,38 @@ _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes; it is the first that zip knows."""
 
 
+Textures = Mapping[str, NDArray[np.uint8]]
+"""Textures by the name of their file."""
+
+
 def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
-    """Write one frame as a bundle.
+    """Write one frame: as a bundle, or, to a ``meta.json``, as files beside it.
 
     Raises:
         InvalidOptionError: Material channels or degree 4 are asked for, which the format cannot hold.
         OutputError: There are more Gaussians than a texture has pixels.
     """
-    cloud = frame.cloud
+    meta, textures = sog_of(frame.cloud, frame, options)
+    if path.suffix == ".json":
+        write_folder(path, meta, textures, frame.beside)
+    else:
+        _write_bundle(path, meta, textures)
+
+
+def sog_of(
+    cloud: GaussianCloud, frame: FrameToWrite, options: WriteOptions, runs: NDArray[np.integer] | None = None
+) -> tuple[dict[str, Any], Textures]:
+    """Return meta.json and the textures of Gaussians.
+
+    Args:
+        cloud: The Gaussians.
+        frame: What the file is to say beside them.
+        options: Degree and profile.
+        runs: A number for each Gaussian, ``(N,)``: those of a lower one come first. None for Morton order alone.
+
+    Raises:
+        InvalidOptionError, OutputError: As for `encode`.
+    """
     if options.profile != "standard":
         raise InvalidOptionError(
             f"profile must be standard for SOG, which has no materials, got {options.profile}. Leave it out."
@@ -55,12 +80,14 @@ def encode(frame: FrameToWrite, path: Path, options: WriteOptions) -> None:
     if radiance.shape[1] - 1 not in (0, *COEFFICIENTS.values()):
         raise InvalidOptionError("sh_degree must be at most 3 for SOG, got 4. Pass --sh-degree 3.")
     codes, log_bounds = _position_codes(cloud.positions)
-    order = np.argsort(_morton_keys(codes), kind="stable")
+    order = morton_order(codes)
+    if runs is not None:
+        order = order[np.argsort(runs[order], kind="stable")]
     textures, meta = _textures(cloud, radiance, codes, log_bounds, order)
     meta["beam"] = {"axes": cloud.axes, "framesPerSecond": frame.frames_per_second, "radianceMeaning": meaning}
-    if frame.raster is not None and frame.raster[0]:
-        meta["model"] = "antialiased"
-    _write_bundle(path, meta, textures)
+    if frame.model is not None:
+        meta["model"] = frame.model
+    return meta, textures
 
 
 def _textures(
@@ -112,14 +139,6 @@ def _position_codes(positions: NDArray[np.float32]) -> tuple[NDArray[np.uint16],
     return np.rint((logs - bounds[0]) / np.where(extent > 0.0, extent, 1.0) * 65535.0).astype(np.uint16), bounds
 
 
-def _morton_keys(codes: NDArray[np.uint16]) -> NDArray[np.uint64]:
-    """Interleave the 16 bits of three axes."""
-    spread = codes.astype(np.uint64)
-    for shift, mask in ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249)):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
-
-
 def _rotation_codes(orientations: NDArray[np.float32]) -> NDArray[np.uint8]:
     smaller, largest_at = to_smaller(orientations[:, [3, 0, 1, 2]])
     fraction = np.clip(smaller / SMALLER_LIMIT, -1.0, 1.0) * 0.5 + 0.5
@@ -163,9 +182,17 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     return stream.getvalue()
 
 
-def _write_bundle(path: Path, meta: Mapping[str, Any], textures: Mapping[str, NDArray[np.uint8]]) -> None:
+def _write_bundle(path: Path, meta: Mapping[str, Any], textures: Textures) -> None:
     """Write a zip archive of meta.json and the textures, which are compressed already."""
     with ThreadPoolExecutor() as threads, zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as bundle:
         bundle.writestr(zipfile.ZipInfo(META, _ZIP_TIME), json.dumps(meta, separators=(",", ":")))
         for name, content in zip(textures, threads.map(_webp, textures.values()), strict=True):
             bundle.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content)
+
+
+def write_folder(path: Path, meta: Mapping[str, Any], textures: Textures, beside: Callable[[str], Path]) -> None:
+    """Write meta.json, and the textures to the places that ``beside`` gives their names."""
+    path.write_text(json.dumps(meta, separators=(",", ":")), encoding="utf-8")
+    with ThreadPoolExecutor() as threads:
+        for name, content in zip(textures, threads.map(_webp, textures.values()), strict=True):
+            beside(name).write_bytes(content)

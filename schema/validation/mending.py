@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd
 
+from beam_warp.checks import require_path
 from beam_warp.errors import AssetFormatError, OutputError
 from beam_warp.schema import register
 from beam_warp.schema.files import require_asset_file, run_child
@@ -49,7 +50,7 @@ def mend(path: str | Path) -> Report:
         AssetFormatError: The file cannot be opened at all.
         OutputError: A layer cannot be written. The asset is as before.
     """
-    source = require_asset_file(Path(path).resolve())
+    source = require_asset_file(require_path("path", path).resolve())
     with staged_folder(source) as folder:
         answer = run_child("beam_warp.schema.validation.mending", source, 4.0 * time_limit(source), str(folder))
         if "error" in answer:

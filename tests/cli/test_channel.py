@@ -96,7 +96,7 @@ def test_a_channel_from_the_cameras_of_a_capture(judged, tmp_path):
         (["roughness", "--capture", "c", "--width", "9"], "width must be left out with --capture, got 9"),
         (["roughness", "--frame", "1"], "frame must be an integer in [0, 0], got 1"),
         (["roughness", "--out", "x.mp4"], "out must end in .png or .exr for a channel, got x.mp4"),
-        (["roughness", "--out", "no/x.png"], "out must be in a folder that exists, got no"),
+        (["roughness", "--out", "ball.ply/x.png"], "output folder must be a folder, got"),
     ],
 )
 def test_refusals_are_one_line(tmp_path, monkeypatch, refused, words, message):

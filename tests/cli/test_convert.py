@@ -60,6 +60,15 @@ def test_a_file(person, capsys, word, name):
     assert converters.read(person / "out" / "a.ply")[0].axes == "ruf"
 
 
+def test_axes_that_the_format_does_not_mean(person, capsys):
+    code, _, err = run(person / "person.ply", person / "out" / "a.spz", "--axes", "rdf", capsys=capsys)
+    assert code == 0
+    assert "note: SPZ means rub; this file is in rdf and states it, which few readers heed\n" in err
+    code, _, err = run(person / "person.ply", person / "out" / "a.spz", "--for", "gsplat-unity", capsys=capsys)
+    assert code == 0
+    assert "means" not in err
+
+
 def test_spz_and_gltf(person, capsys):
     out = person / "out"
     code, said, err = run(person / "person.ply", out / "a.spz", "--spz-version", "4", "--sh-degree", 0, capsys=capsys)
@@ -111,7 +120,7 @@ def test_the_input_is_never_written_over(person, capsys):
     spelled = person / "out" / ".." / "person.ply"
     code, _, err = run(person / "person.ply", spelled, capsys=capsys)
     assert code == 2
-    assert err.startswith("error: output must be another file than the input, got ")
+    assert err.startswith("error: output must be another file than those that are read, got ")
     assert (person / "person.ply").read_bytes() == before
     code, _, err = run(person / "take", person / "take" / "f.ply", capsys=capsys)
     assert code == 2

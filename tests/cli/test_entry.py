@@ -124,3 +124,23 @@ def test_nobody_reads_the_output():
         child.stdout.close()
         assert child.stderr is not None
         assert b"Traceback" not in child.stderr.read()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is KiB on Linux alone")
+@pytest.mark.parametrize("columns", ["1", "-5", "100000000"])
+def test_help_in_any_width(columns):
+    """Help in one column took 100 s and 914 MiB."""
+    code = (
+        "import resource, sys; from beam_warp.cli.main import main\n"
+        "begun = resource.getrusage(resource.RUSAGE_SELF)\n"
+        "try:\n    main(['run', '--help'])\n"
+        "finally:\n    used = resource.getrusage(resource.RUSAGE_SELF)\n"
+        "    print(used.ru_utime, used.ru_maxrss - begun.ru_maxrss, file=sys.stderr)\n"
+    )
+    command = [sys.executable, "-P", "-c", code]
+    options = {"capture_output": True, "text": True, "timeout": 90, "check": True}
+    done = subprocess.run(command, env={**os.environ, "COLUMNS": columns}, **options)
+    seconds, memory = map(float, done.stderr.split()[-2:])
+    assert "--environment" in done.stdout
+    assert seconds < 10.0
+    assert memory < 256 * 1024

@@ -333,8 +333,8 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
     [
         ("x.jpg", "out must end in .png, .exr or .mp4, got x.jpg. Rename it."),
         ("%d_%d.png", "out must have one integer field in the name of an image"),
-        ("no/no/%d.png", "out must be in a folder that exists, got no. Create it"),
-        ("nowhere/x.png", "out must be in a folder that exists, got nowhere"),
+        ("area.json/no/%d.png", "output folder must be a folder, got"),
+        ("area.json/x.png", "output folder must be a folder, got"),
         ("%d.png --frames 0:5", "frames must be some of the 4 that there are, 0:4, got 0:5"),
         ("%d.png --frames abc", "frames must be A:B or A:B:STEP, got abc"),
         ("%d.png --frames 0:4:2 --fps 20", "frames must have no step with seconds, fps or speed"),
@@ -400,7 +400,7 @@ def test_one_stage_or_several_assets(walk, light, tmp_path, refused):
 def test_a_folder_that_is_closed(common, tmp_path, refused, monkeypatch):
     monkeypatch.setattr("beam_warp.stage.output.os.access", lambda *_: False)
     words = [*common, "--out", tmp_path / "x.png", "--frame", 0]
-    refused("render", *words, says="out must be in a folder that can be written")
+    refused("render", *words, says="output folder must be writable, got")
 
 
 def test_commands_that_are_shown_are_commands(tmp_path, monkeypatch):

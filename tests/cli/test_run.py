@@ -73,7 +73,14 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
         ("ball.ply --environment sky.exr --roughness r.png", "roughness-mesh must be given"),
         ("ball.ply --environment sky.exr --samples 0", "--samples must be"),
         ("ball.ply --environment sky.exr --fps 0", "--fps must be"),
-        ("ball.ply --environment sky.exr --out missing/out", "out must be a folder that can be made"),
+        ("ball.ply --environment sky.exr --roughness 7", "--roughness must be a number in [0, 1], got 7.0"),
+        ("ball.ply --environment sky.exr --roughness r.png --roughness-mesh m.obj", "must be files, got r.png"),
+        ("ball.ply --environment sky.exr --offset nan", "--offset must be a number in"),
+        ("ball.ply --environment sky.exr --exposure 99", "--exposure must be a number in"),
+        ("ball.ply --environment sky.exr --seed -5", "--seed must be an integer in"),
+        ("ball.ply --environment sky.exr --orbit 0 nan", "elevation must be a number in"),
+        ("ball.ply --environment sky.exr --orbit inf 0", "azimuth must be a number in"),
+        ("ball.ply --environment sky.exr --out text.ply/out", "output folder must be a folder, got"),
     ],
 )
 def test_mistakes(ball, sky, tmp_path, monkeypatch, refused, words, says):
@@ -95,3 +102,12 @@ def test_environment_with_a_bad_texel(ball, tmp_path, refused, value):
 def test_version(capsys):
     assert beam("--version") == 0
     assert capsys.readouterr().out.startswith("beam 0.")
+
+
+@pytest.mark.parametrize("name", ["asset.usda", "report.json", "overview.png"])
+def test_results_appear_together_or_not_at_all(ball, sky, tmp_path, monkeypatch, refused, name):
+    """One of them cannot be written: nothing is begun."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out" / name).mkdir(parents=True)
+    words = ("ball.ply", "--environment", "sky.exr", "--out", "out", "--device", "cpu")
+    refused("run", *words, says="output must be a file, got the folder")

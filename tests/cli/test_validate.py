@@ -144,14 +144,14 @@ def test_rules_are_listed(capsys):
 
 
 def test_help_and_version(capsys):
-    for flag, text in (("--help", "beam-validate dancer.usda"), ("--version", "beam-validate 0.")):
-        with pytest.raises(SystemExit) as stopped:
-            main([flag])
-        assert stopped.value.code == 0
-        assert text in capsys.readouterr().out
     with pytest.raises(SystemExit) as stopped:
-        main([])
-    assert stopped.value.code == 2
+        main(["--help"])
+    assert stopped.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Example: beam-validate dancer.usda --fix" in said
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("beam-validate 0.")
+    assert main([]) == 2
     assert "asset must be given, got none" in capsys.readouterr().err
 
 

@@ -1,6 +1,7 @@
 """Arrays by name: ``.npz`` that NumPy writes, HDF5 in each layout, and files that lie about their size."""
 
 import io
+import os
 import zipfile
 
 import h5py
@@ -64,6 +65,7 @@ def test_npz_that_lie_or_hold_no_numbers_are_refused(tmp_path):
         (npy(np.zeros((2, 3)), shape=(-2, 3)), r"must be an \.npz file with arrays of numbers"),
         (sound["positions"][:-1], "must be an .npz file"),
         (b"\x93NUMPY\x01\x00", "must be an .npz file"),
+        (sound["positions"].replace(b"}", b" "), r"got .*EOF|never closed"),
         (npy(np.zeros((2, 4))), r"positions must have shape \(N, 3\), got \(2, 4\)"),
     ):
         npz(path, **sound | {"positions": member})
@@ -152,3 +154,36 @@ def test_hdf5_that_reaches_outside_or_disagrees_is_refused(tmp_path):
     path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64))
     with pytest.raises(AssetFormatError, match="must be an HDF5 file"):
         converters.read(path)
+
+
+def test_hdf5_follows_no_links_to_frames_and_unpacks_no_large_chunk(tmp_path):
+    path, elsewhere = tmp_path / "a.h5", tmp_path / "b.h5"
+    for name in (path, elsewhere):
+        with h5py.File(name, "w") as file:
+            for field, value in MINIMAL.items():
+                file[field] = value
+    os.mkfifo(tmp_path / "pipe.h5")  # who opens it waits
+    with h5py.File(path, "a") as file:
+        file["frame1"], file["frame2"] = h5py.ExternalLink("b.h5", "/"), h5py.ExternalLink("pipe.h5", "/")
+    assert len(converters.read(path)) == 1
+    with h5py.File(path, "a") as file:
+        del file["positions"]
+        large = {"chunks": (2**23, 3), "maxshape": (None, 3), "compression": "gzip"}
+        file.create_dataset("positions", data=MINIMAL["positions"], dtype="f4", **large)
+    with pytest.raises(AssetFormatError, match=r"must have chunks of at most 64 MiB, got \(8388608, 3\) of positions"):
+        converters.read(path)
+
+
+def test_archives_and_groups_without_end_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(4000):
+            archive.writestr(f"{number}.npy", b"")
+    with pytest.raises(AssetFormatError, match=r"got a directory of \d+ bytes"):
+        converters.read(path)
+    monkeypatch.setattr("beam_warp.converters.arrays.MAX_NAMES", 8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number in range(9):
+            file.create_group(f"frame{number}")
+    with pytest.raises(AssetFormatError, match="must have at most 8 arrays and groups, got 9"):
+        converters.read(tmp_path / "a.h5")

@@ -71,3 +71,13 @@ def test_a_palette_is_nearly_as_good_as_one_without_groups():
     samples = vectors[rng.choice(len(vectors), 1024, replace=False)]
     nearest, _ = cKDTree(samples).query(vectors)
     assert error < 0.95 * np.sqrt(np.mean(nearest**2) / 24)  # Gaussians taken at random, a sixth of which are exact
+
+
+def test_equal_vectors_among_many_share_one_entry():
+    """Nine of ten Gaussians without view-dependent colour: their group must not be compared with entries of its own."""
+    vectors = np.random.default_rng(4).normal(size=(10_000, 45)).astype(np.float32)
+    vectors[:9_000] = 0.0
+    entries, labels = palette(vectors, 1024)
+    assert len(np.unique(labels[:9_000])) == 1
+    assert not entries[labels[0]].any()
+    assert len(np.unique(labels[9_000:])) > 500

@@ -90,6 +90,20 @@ def test_fields_do_not_leak_into_each_other(tmp_path):
     assert read(tmp_path, packed_ply([CHUNK], [(0, IDENTITY, 0, colors[3])])).opacities[0] == 1.0
 
 
+def test_text_is_read_to_the_last_bit(tmp_path):
+    """Words of 32 bits, of which float32 would keep 24; a number that its type cannot hold is refused."""
+    chunk, words = [*CHUNK[:5], np.nextafter(np.float32(14.0), np.float32(15.0)), *CHUNK[6:]], 0x12345679
+    binary = packed_ply([chunk], [(words, IDENTITY + 5, words, words)], [[0, 1, 2, 253, 254, 255, 127, 128, 129]])
+    header, _, _ = binary.partition(b"end_header\n")
+    rows = [" ".join(f"{value:.9g}" for value in chunk), f"{words} {IDENTITY + 5} {words} {words}"]
+    text = header.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + "\n".join(rows).encode()
+    told, wanted = read(tmp_path, text + b"\n0 1 2 253 254 255 127 128 129\n"), read(tmp_path, binary)
+    for name, array in wanted.arrays().items():
+        assert np.array_equal(getattr(told, name), array), name
+    with pytest.raises(AssetFormatError, match=r"element sh must hold rows of 9 numbers of its types, got .*'256' to"):
+        read(tmp_path, text + b"\n0 1 2 253 254 256 127 128 129\n")
+
+
 def test_without_colour_bounds_a_byte_is_the_colour(tmp_path):
     cloud = read(tmp_path, packed_ply([CHUNK[:12]], [(0, IDENTITY, 0, 0xFF003300)], colors=False))
     assert np.allclose(0.5 + SH_C0 * cloud.radiance[0, 0], [1.0, 0.0, 0.2], atol=4 * EPSILON)

@@ -10,8 +10,9 @@ from beam_warp import converters
 from beam_warp.blocks import BLOCK_ROWS
 from beam_warp.converters import WriteOptions
 from beam_warp.converters.ply.compressed import CHUNK_ROWS
-from beam_warp.converters.ply.compressed_writer import _between_bounds, _morton_order
+from beam_warp.converters.ply.compressed_writer import _between_bounds, _cells
 from beam_warp.errors import InvalidOptionError
+from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -37,7 +38,7 @@ def test_errors_are_half_a_step(make_cloud, tmp_path, rng, monkeypatch, cores, c
     monkeypatch.setattr("beam_warp.blocks._core_count", lambda: cores)
     cloud = make_cloud(count, degree=degree, opacities=rng.uniform(size=count))
     write(cloud, tmp_path / "a.compressed.ply")
-    back, put = converters.read(tmp_path / "a.compressed.ply")[0], cloud.select(_morton_order(cloud.positions))
+    back, put = converters.read(tmp_path / "a.compressed.ply")[0], cloud.select(morton_order(_cells(cloud.positions)))
 
     # Beside half a step, values are rounded to float32 as bounds and once more when read.
     bound = chunk_range(put.positions) / (2 * STEPS) + 2 * EPSILON * np.abs(put.positions).max()
@@ -98,10 +99,10 @@ def test_every_byte_of_the_bands_comes_back(make_cloud, tmp_path):
     cloud = make_cloud(256, radiance=radiance)
     write(cloud, tmp_path / "a.compressed.ply")
     back = converters.read(tmp_path / "a.compressed.ply")[0]
-    assert np.array_equal(back.radiance[:, 1:], radiance[_morton_order(cloud.positions), 1:])
+    assert np.array_equal(back.radiance[:, 1:], radiance[morton_order(_cells(cloud.positions)), 1:])
     beyond = make_cloud(2, radiance=np.full((2, 4, 3), [[[9.0]], [[-9.0]]]))
     write(beyond, tmp_path / "a.compressed.ply")
-    back = converters.read(tmp_path / "a.compressed.ply")[0].radiance[_morton_order(beyond.positions), 1:]
+    back = converters.read(tmp_path / "a.compressed.ply")[0].radiance[morton_order(_cells(beyond.positions)), 1:]
     assert np.array_equal(back, np.clip(beyond.radiance[:, 1:], -4, 4))
 
 
@@ -113,8 +114,8 @@ def test_the_order_is_the_morton_curve(rng):
         cells = [int(c) for c in (position - low) / extent * (2**21 - 1)]
         return sum((cell >> bit & 1) << (3 * bit + axis) for axis, cell in enumerate(cells) for bit in range(21))
 
-    assert _morton_order(positions).tolist() == sorted(range(300), key=lambda row: key(positions[row]))
-    assert _morton_order(np.empty((0, 3), np.float32)).tolist() == []
+    assert morton_order(_cells(positions)).tolist() == sorted(range(300), key=lambda row: key(positions[row]))
+    assert morton_order(_cells(np.empty((0, 3), np.float32))).tolist() == []
 
 
 def test_limits_are_finite_in_a_file(make_cloud, tmp_path):

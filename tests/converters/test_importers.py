@@ -13,7 +13,7 @@ from beam_warp.converters import WriteOptions
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.world.axes import AXIS_CODES
+from beam_warp.world.axes import AXIS_CODES, change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -38,6 +38,13 @@ SHOWN = {
     "usd": (AS_IT_IS, UP, "right"),
 }
 SHOWN |= {"unity": SHOWN["aras-p"], "unreal": SHOWN["nanogs"]}
+
+# What they do with positions of files that they treat otherwise than a PLY.
+OTHERWISE = {
+    ("playcanvas", ".glb"): AS_IT_IS,
+    ("spark", ".spz"): AS_IT_IS,
+    ("babylon", ".glb"): np.diag([-1.0, 1.0, 1.0]),
+}
 
 
 @pytest.fixture
@@ -91,6 +98,29 @@ def test_the_tripod_stands_where_the_importer_shows_it(tripod, tmp_path, importe
     assert degree == (3 if importer in ("aras-p", "unity") else 2)
 
 
+@pytest.mark.parametrize(
+    ("importer", "suffix"),
+    [(name, end) for name, importer in IMPORTERS.items() for end in (".spz", ".glb") if end in importer.suffixes],
+)
+def test_other_formats_stand_where_a_ply_does(tripod, tmp_path, importer, suffix):
+    """The importer's axes outrank those of the format's text, and our own reader is told."""
+    for end in (".ply", suffix):
+        converters.write(tripod, tmp_path / f"a{end}", WriteOptions(target=importer))
+    to_world = SHOWN[importer][0]
+    stored_as = converters.read(tmp_path / f"a{suffix}")[0]  # rows keep their order in PLY, SPZ and GLB
+    shown = stored_as.positions @ OTHERWISE.get((importer, suffix), to_world).T
+    assert np.allclose(shown, converters.read(tmp_path / "a.ply")[0].positions @ to_world.T, atol=1 / 4096)
+    assert np.allclose(change_axes(stored_as, "rub").positions, tripod[0].positions, atol=1 / 4096)
+
+
+@pytest.mark.parametrize(("name", "axes"), [("a.spz", "rdf"), ("a.glb", "luf"), ("a.gltf", "bul")])
+def test_axes_against_the_text_of_the_format_are_stated(tripod, tmp_path, name, axes):
+    converters.write(tripod, tmp_path / name, WriteOptions(axes=axes))
+    back = converters.read(tmp_path / name)[0]
+    assert back.axes == axes
+    assert np.allclose(change_axes(back, "rub").positions, tripod[0].positions, atol=1 / 4096)
+
+
 def test_every_importer_has_an_emulation():
     assert set(SHOWN) == set(IMPORTERS)
 
@@ -137,4 +167,6 @@ def test_formats_that_an_importer_does_not_read_are_refused(tripod, tmp_path):
         converters.write(tripod, tmp_path / "a.ply", WriteOptions(target="usd"))
     with pytest.raises(InvalidOptionError, match=r"axes must be rub for USD, which fixes them, got rdf"):
         converters.write(tripod, tmp_path / "a.usdc", WriteOptions(axes="rdf"))
+    with pytest.raises(InvalidOptionError, match=r"axes must be rub or luf or bul or fur for glTF, .*, got ruf"):
+        converters.write(tripod, tmp_path / "a.glb", WriteOptions(axes="ruf"))
     assert not list(tmp_path.iterdir())

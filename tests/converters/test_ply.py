@@ -16,6 +16,7 @@ from beam_warp.errors import AssetFormatError, InvalidOptionError, OutputError, 
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.metadata import raster_metadata, stated_raster
 
 EPSILON = np.finfo(np.float32).eps
 
@@ -200,11 +201,12 @@ def test_flat_gaussians_and_missing_colour(columns, ply_file, tmp_path):
     flat, colorless = notes_of(sequence)[:2]
     assert flat == "no scale_2: read as 2D Gaussians of thickness 0"
     assert colorless == "no f_dc_0 … f_dc_2: read without colour"
-    # Written again, a flat Gaussian has the least scale that a log can say, and a colourless one stays colourless.
+    # Written again, a flat Gaussian has the least scale that a log can say, and comes back flat by the file's tag.
     converters.write(sequence, tmp_path / "b.ply")
     back = converters.read(tmp_path / "b.ply")[0]
     assert back.radiance is None
-    assert back.scales[:, 2].max() == np.float32(np.exp(-30.0))
+    assert plyfile.PlyData.read(str(tmp_path / "b.ply"))["vertex"]["scale_2"].tolist() == [-30.0] * 3
+    assert not back.scales[:, 2].any()
 
 
 def test_no_gaussians(columns, ply_file, tmp_path):
@@ -302,6 +304,37 @@ def test_nothing_is_said_of_drawing_without_a_word(make_cloud, columns, ply_byte
     (tmp_path / "other.ply").write_bytes(ply_bytes(columns))
     for name in ("ours", "other"):
         assert not [key for key in converters.read(tmp_path / f"{name}.ply").metadata if key.startswith("raster")]
+
+
+@pytest.mark.parametrize(
+    ("comments", "raster", "thickness"),
+    [
+        (["SplatRenderMode: mip"], (True, pytest.approx(0.3)), 7.0),
+        (["splatrendermode mip"], (True, pytest.approx(0.3)), 7.0),
+        (["antialiased 1"], (True, pytest.approx(0.3)), 7.0),
+        (["antialiased 1", "SplatRenderMode: default"], None, 7.0),
+        (["SplatRenderMode: mip", "beam_raster classic 0.1"], (False, pytest.approx(0.1)), 7.0),
+        (["antialiased 0"], None, 7.0),
+        (["SplatRenderMode: 2dgs"], None, np.inf),
+        (["SplatRenderMode: other"], None, 7.0),
+    ],
+)
+def test_the_tags_of_other_programs_are_read(comments, raster, thickness, columns, ply_file):
+    sequence = converters.read(ply_file(columns, comments=comments))
+    assert stated_raster(sequence.metadata) == raster
+    assert np.allclose(sequence[0].scales[:, 2], np.exp(-thickness))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog"])
+@pytest.mark.parametrize("is_flat", [False, True])
+def test_flat_and_antialiased_splats_are_tagged(suffix, is_flat, make_cloud, tmp_path):
+    cloud = make_cloud(8, 0)
+    cloud = cloud.with_arrays(scales=cloud.scales * np.array([1, 1, not is_flat], np.float32))
+    path = tmp_path / f"a{suffix}"
+    converters.write(GaussianSequence.from_clouds([cloud], metadata=raster_metadata(not is_flat, 0.3)), path)
+    words = {".sog": ('"model":"antialiased"', '"model":"2dgs"')}.get(suffix, ("RenderMode: mip", "RenderMode: 2dgs"))
+    assert [word.encode() in path.read_bytes() for word in words] == [not is_flat, is_flat]
+    assert (not converters.read(path)[0].scales[:, 2].any()) == is_flat
 
 
 @pytest.mark.parametrize("text", ["sharp 0.1", "antialiased", "classic nan"])

@@ -186,11 +186,11 @@ def test_wrong_statements(columns, ply_bytes, tmp_path, comment, message):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ("0 1\n2 x\n4 5\n", "element vertex must hold rows of numbers, got could not convert string"),
-        ("0.0 1\n2\n4 5\n", "element vertex must hold rows of numbers, got the number of columns changed"),
-        ("0 1\n2 3\n\n\n\n", "element vertex must hold 3 rows of 2 numbers, got 2 rows of 2"),
-        ("0 1 2\n3 4 5\n6 7 8\n", "element vertex must hold 3 rows of 2 numbers, got 3 rows of 3"),
-        ("\xff\xfe 1\n2 3\n4 5\n", "element vertex must hold rows of numbers"),
+        ("0 1\n2 x\n4 5\n", "element vertex must hold rows of 2 numbers of its types, got could not convert string"),
+        ("0.0 1\n2\n4 5\n", "element vertex must hold rows of 2 numbers of its types, got 1 at row 2. Export"),
+        ("0 1\n2 3\n\n\n\n", "element vertex must hold 3 rows, got 2"),
+        ("0 1 2\n3 4 5\n6 7 8\n", "element vertex must hold rows of 2 numbers of its types, got 3 at row 1. Export"),
+        ("\xff\xfe 1\n2 3\n4 5\n", "element vertex must hold rows of 2 numbers"),
         ("0 1\n", "the 3 rows that the header counts, got bytes for at most 1"),
     ],
 )

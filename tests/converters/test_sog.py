@@ -340,9 +340,7 @@ MALFORMED = {
     "other size": (replace("sh0.webp", lambda p: p[:2]), r"sh0\.webp must have 4 x 4 px like means_l\.webp, got 4 x 2"),
     "vast": (replace("means_l.webp", lambda _: vast(16384, 16384)), r"pixel for each of 11 .* 16384 x 16384 px"),
     "vast, believed": (
-        lambda files: files.update(
-            {n: vast(1000, 1000) for n in files if n not in ("meta.json", "shN_centroids.webp")}
-        ),
+        lambda files: files.update({n: vast(500, 500) for n in files if n not in ("meta.json", "shN_centroids.webp")}),
         r"means_l\.webp must be an intact picture",
     ),
 }
@@ -372,8 +370,11 @@ def test_tricks_of_archives(tmp_path):
     bundle(random_sog() | {"scales.webp": bytes(20_000_000)}, path, zipfile.ZIP_DEFLATED)
     with pytest.raises(AssetFormatError, match=r"scales\.webp must unpack to at most \d+ bytes, got more"):
         converters.read(path)
-    bundle(random_sog() | {f"{number}" * 9: b"" for number in range(2000)}, path)
-    with pytest.raises(AssetFormatError, match=r"^a\.sog: a SOG bundle must list its eight files, got a directory of"):
+    bundle(random_sog() | {f"{number}" * 9: b"" for number in range(4000)}, path)
+    with pytest.raises(
+        AssetFormatError,
+        match=r"^a\.sog: a SOG bundle must be a zip archive of few files, got .*a directory of \d+ bytes",
+    ):
         converters.read(path)
     content = bytearray(bundle(random_sog(), path).read_bytes())
     content[content.index(b"RIFF") + 40] ^= 255

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beam_warp import converters
-from beam_warp.errors import AssetFormatError
+from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.world.gaussians import GaussianSequence
 
 
@@ -48,6 +48,25 @@ def test_frames_of_any_format_are_read_in_order(frames, tmp_path, monkeypatch):
 def test_one_file_needs_no_number(columns, ply_bytes, tmp_path):
     path = zipped(tmp_path / "person.zip", **{"person.ply": ply_bytes(columns)})
     assert len(converters.read(path, source_axes="rub")[0]) == 3
+
+
+def test_an_entry_without_a_name_is_no_frame(columns, ply_bytes, tmp_path):
+    path = zipped(tmp_path / "person.zip", **{"person.ply": ply_bytes(columns)})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(zipfile.ZipInfo(""), b"")
+    assert len(converters.read(path, source_axes="rub")) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_gltf_brings_the_file_of_its_arrays(make_cloud, tmp_path, count):
+    clouds = [make_cloud(3, seed=number, axes="rub") for number in range(count)]
+    files = converters.write(GaussianSequence.from_clouds(clouds), tmp_path / "walk.gltf")
+    path = zipped(tmp_path / "walk.zip", **{f"take/{file.name}": file.read_bytes() for file in files})
+    sequence = converters.read(path)
+    assert len(sequence) == count
+    assert all(np.array_equal(sequence[n].positions, cloud.positions) for n, cloud in enumerate(clouds))
+    with pytest.raises(MissingFileError, match=r"file of buffer 0 must exist, got 'walk.*\.bin'"):
+        converters.read(zipped(path, **{files[0].name: files[0].read_bytes()}))
 
 
 def test_archives_that_are_no_frames_or_reach_outside(columns, ply_bytes, tmp_path):

@@ -231,7 +231,7 @@ def test_frames_without_radiance_or_gaussians_are_refused(tmp_path, light):
 
 def test_a_folder_that_cannot_be_made(tmp_path, light):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="out must be a folder that can be made"):
+    with pytest.raises(OutputError, match="output folder must be a folder, got"):
         job(frames(0.0), light, tmp_path / "file")
 
 

@@ -116,6 +116,22 @@ def test_stated_errors_are_taken_at_their_word(understated, passed):
     assert physical_rules.occlusion(stored, stated, fresh, 0.0 * fresh).passed is passed
 
 
+def test_a_sheet_may_be_more_open_below():
+    """A floor in the shade of a ball, whose underside nothing shades, has the normals of a floor all the same."""
+    x, y = np.meshgrid(*[np.arange(-1.4, 1.5, 0.2)] * 2)
+    floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.2)])
+    points, spacing = sphere_points(COUNT)
+    up = np.broadcast_to([0.0, 0.0, 1.0], floor.shape)
+    places, normals = np.vstack([points, floor]), np.vstack([points, up])
+    arrays = {"normals": normals, "base_color": np.full((len(places), 3), 0.5), "roughness": np.full(len(places), 0.5)}
+    arrays["ambient_occlusion"] = np.ones(len(places))
+    for turned, passed in ((1.0, True), (-1.0, False)):
+        arrays["normals"] = normals * np.where(np.arange(len(places)) < COUNT, turned, 1.0)[:, None]
+        cloud = cloud_of(tiles(places, normals, max(spacing, 0.2)), **arrays, axes="rfu")
+        facing = measure_physics(GaussianSequence.from_clouds([cloud]), device="cpu")[2]
+        assert (facing.rule, facing.passed) == ("BEAM-PHYS-003", passed), facing
+
+
 def test_random_normals_do_not_follow_shapes():
     vectors = np.random.default_rng(5).normal(size=(500, 3))
     cosines = vectors[:, 2] / np.linalg.norm(vectors, axis=1)

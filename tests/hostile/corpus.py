@@ -1,19 +1,23 @@
-"""Malformed files: for every reader a sound one, and named ways to spoil it. A new reader is a row of `READERS`."""
+"""The corpus of malformed files: for every reader a sound file, and named ways to spoil it.
 
-import copy
+A new reader is a row of `READERS`.
+"""
+
 import json
 import struct
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import write_lcc
+from hostile.archives import ARCHIVES
+from hostile.splats import SPLATS, read_frames
+from hostile.ways import Reader
 from PIL import Image as PillowImage
 from support.drawn_ball import relightable
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame, write_frame
 from beam_warp.schema.reader import read_asset
@@ -21,112 +25,6 @@ from beam_warp.stage.stage import Stage
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import read_lights
-
-
-@dataclass(frozen=True)
-class Case:
-    """One spoiled file.
-
-    Attributes:
-        name: How it was spoiled.
-        content: Bytes of the file.
-        is_fatal: True if no reader may accept it.
-    """
-
-    name: str
-    content: bytes
-    is_fatal: bool = True
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader, and what to spoil for it.
-
-    Attributes:
-        make: Writes sound files into a folder, and returns the one that is spoiled.
-        read: Reads all that there is, from the path of that file.
-        family: Fuzz target that reads it, too: ``splats``, ``captures`` or ``images``.
-        swaps: Name → bytes of the sound file and what replaces them; none of the results may be accepted.
-        is_json: True if fields are spoiled one by one, too.
-        free: JSON fields that may hold anything.
-        cuts: Parts of the length after which the file ends.
-    """
-
-    make: Callable[[Path], Path]
-    read: Callable[[Path], object]
-    family: str = ""
-    swaps: dict[str, tuple[bytes, bytes]] = field(default_factory=dict)
-    is_json: bool = False
-    free: frozenset[str] = frozenset()
-    cuts: tuple[float, ...] = (0.0, 0.01, 0.1, 0.3, 0.6, 0.9)
-
-
-def cases(reader: Reader, sound: bytes) -> Iterator[Case]:
-    """Yield every spoiled form of a sound file."""
-    for part in reader.cuts:
-        yield Case(f"cut at {part:.0%}", sound[: int(part * len(sound))])
-    yield Case("zeros", bytes(len(sound)))
-    yield Case("ones", b"\xff" * len(sound))
-    yield Case("a page", b"<!DOCTYPE html><html><body>404</body></html>")
-    yield Case("a script", b"#!/bin/sh\nrm -rf \x1b[31m\n")
-    yield Case("in UTF-16", sound.decode("latin-1").encode("utf-16"))
-    rng = np.random.default_rng(len(sound))
-    for index in range(6):
-        damaged = bytearray(sound)
-        place = int(rng.integers(len(sound)))
-        damaged[place] ^= 1 << int(rng.integers(8))
-        yield Case(f"bit {index} turned at {place}", bytes(damaged), is_fatal=False)
-    yield Case("twice", sound + sound, is_fatal=False)
-    yield Case("zeros after", sound + bytes(64), is_fatal=False)
-    for name, (old, new) in reader.swaps.items():
-        assert old in sound, (name, old)
-        yield Case(name, sound.replace(old, new, 1))
-    if reader.is_json:
-        yield from _json_cases(json.loads(sound), reader.free)
-
-
-SPOILED: dict[str, Any] = {
-    "an object": {"\x1b[31m": []},
-    "not a number": float("nan"),
-    "beyond floats": 10**400,
-    "half a pair": "\ud800\n\x07",
-    "nested": [[[[[[[[[[]]]]]]]]]],
-}
-
-
-def _json_cases(document: Any, free: frozenset[str]) -> Iterator[Case]:
-    """Spoil each field once, wherever it first occurs."""
-    yield Case("lists without end", b"[" * 100_000)
-    yield Case("a long number", b'{"w": ' + b"9" * 5000 + b"}")
-    for name in ("an object", "nested"):
-        yield Case(f"all is {name}", json.dumps(SPOILED[name]).encode())
-    seen = set()
-    for place in _places(document):
-        label = ".".join(name for name in place if isinstance(name, str))
-        if label in seen:
-            continue
-        seen.add(label)
-        for name, value in SPOILED.items():
-            changed = copy.deepcopy(document)
-            holder = changed
-            for step in place[:-1]:
-                holder = holder[step]
-            holder[place[-1]] = value
-            yield Case(f"{label} is {name}", json.dumps(changed).encode(), is_fatal=place[-1] not in free)
-
-
-def _places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for name, item in inner:
-        yield (*place, name)
-        yield from _places(item, (*place, name))
-
-
-def _frames(path: Path, **options: Any) -> None:
-    """Read every frame of what the converters read."""
-    sequence = converters.read(path, **options)
-    for frame in range(len(sequence)):
-        sequence[frame]
 
 
 def _cloud() -> GaussianSequence:
@@ -313,15 +211,17 @@ EARLY = (0.0, 0.1, 0.3)
 """Cuts of files whose last part may be missing."""
 
 READERS: dict[str, Reader] = {
-    "ply": Reader(ply, _frames, "splats", PLY_SWAPS),
+    **SPLATS,
+    **ARCHIVES,
+    "ply": Reader(ply, read_frames, "splats", swaps=PLY_SWAPS),
     "text ply": Reader(
-        text_ply, _frames, "splats", {**PLY_SWAPS, "a word": (b"-3.5", b"three"), "nan": (b"-3.5", b"nan")}
+        text_ply, read_frames, "splats", swaps={**PLY_SWAPS, "a word": (b"-3.5", b"three"), "nan": (b"-3.5", b"nan")}
     ),
     "compressed ply": Reader(
         compressed_ply,
-        _frames,
+        read_frames,
         "splats",
-        {
+        swaps={
             "a count beyond the file": (b"vertex 2", b"vertex 2000000"),
             "chunks beyond the file": (b"chunk 1", b"chunk 1000000000"),
             "no chunk": (b"element chunk 1", b"element chunk 0"),
@@ -331,8 +231,7 @@ READERS: dict[str, Reader] = {
     "usda": Reader(
         usda,
         lambda path: read_asset(path, trusted=True)[0],
-        "",
-        {
+        swaps={
             "a scalar for an array": (b"point3f[] positions = [", b"point3f positions = (0, 0, 0) #"),
             "no unit": (b"metersPerUnit = 1", b"metersPerUnit = 1e-300"),
             "a string for a count": (b"int beam:sequence:frameCount = 1", b'string beam:sequence:frameCount = "1"'),
@@ -345,7 +244,7 @@ READERS: dict[str, Reader] = {
         exr,
         EnvironmentMap.read,
         "images",
-        {
+        swaps={
             "a window of zeros": (struct.pack("<4i", 0, 0, 31, 15), struct.pack("<4i", 0, 0, 8191, 4095)),
             "a window of ones": (struct.pack("<4i", 0, 0, 31, 15), struct.pack("<4i", 5, 5, 4, 4)),
             "a hidden channel": (b"\0R\0", b"\0\x1b\0"),
@@ -355,7 +254,7 @@ READERS: dict[str, Reader] = {
         hdr,
         EnvironmentMap.read,
         "images",
-        {
+        swaps={
             "a large size": (b"-Y 16 +X 32", b"-Y 16384 +X 32768"),
             "a size beyond the file": (b"-Y 16 +X 32", b"-Y 512 +X 1024"),
             "a negative size": (b"-Y 16", b"-Y -16"),
@@ -370,7 +269,7 @@ READERS: dict[str, Reader] = {
         png,
         read_image,
         "images",
-        {"a large size": (struct.pack(">II", 40, 30), struct.pack(">II", 2**30, 2**30))},
+        swaps={"a large size": (struct.pack(">II", 40, 30), struct.pack(">II", 2**30, 2**30))},
         cuts=EARLY,
     ),
     "nerfstudio": Reader(
@@ -380,24 +279,24 @@ READERS: dict[str, Reader] = {
         colmap_text,
         _capture,
         "captures",
-        {"a word": (b"40 30", b"40 x"), "nan": (b"50.0", b"nan"), "a model": (b"PINHOLE", b"\x1b[31m")},
+        swaps={"a word": (b"40 30", b"40 x"), "nan": (b"50.0", b"nan"), "a model": (b"PINHOLE", b"\x1b[31m")},
         cuts=(0.0, 0.3, 0.6),
     ),
     "colmap images, text": Reader(
         colmap_text_images,
         _capture,
         "captures",
-        {"a word": (b"0.25", b"x"), "nan": (b"0.25", b"nan"), "zero": (b"1 1 0", b"1 0 0")},
+        swaps={"a word": (b"0.25", b"x"), "nan": (b"0.25", b"nan"), "zero": (b"1 1 0", b"1 0 0")},
         cuts=(0.0, 0.3),
     ),
     "colmap points, text": Reader(
-        colmap_text_points, _capture, "captures", {"nan": (b"0.5 0.5", b"nan 0.5")}, cuts=(0.3,)
+        colmap_text_points, _capture, "captures", swaps={"nan": (b"0.5 0.5", b"nan 0.5")}, cuts=(0.3,)
     ),
     "colmap cameras": Reader(
         colmap_cameras,
         _capture,
         "captures",
-        {
+        swaps={
             "a count beyond the file": (struct.pack("<QI", 1, 1), struct.pack("<QI", 2**60, 1)),
             "a size of nothing": (struct.pack("<QQ", 40, 30), struct.pack("<QQ", 0, 30)),
             "a model": (struct.pack("<Ii", 1, 1), struct.pack("<Ii", 1, 99)),
@@ -407,7 +306,7 @@ READERS: dict[str, Reader] = {
         colmap_images,
         _capture,
         "captures",
-        {
+        swaps={
             "a count beyond the file": (struct.pack("<QI", 1, 1), struct.pack("<QI", 2**63, 1)),
             "a name without end": (b"a.png\0", b"a.pngx"),
             "nan": (struct.pack("<d", 0.25), struct.pack("<d", np.nan)),
@@ -417,13 +316,17 @@ READERS: dict[str, Reader] = {
         colmap_points,
         _capture,
         "captures",
-        {"a count beyond the file": (struct.pack("<QQ", 1, 1), struct.pack("<QQ", 2**62, 1))},
+        swaps={"a count beyond the file": (struct.pack("<QQ", 1, 1), struct.pack("<QQ", 2**62, 1))},
     ),
     "projections": Reader(
         projections,
         _capture,
         "captures",
-        {"a word": (b"50 0 20", b"x 0 20"), "nan": (b"50 0 20", b"nan 0 20"), "singular": (b"0 0 1 3", b"0 0 0 3")},
+        swaps={
+            "a word": (b"50 0 20", b"x 0 20"),
+            "nan": (b"50 0 20", b"nan 0 20"),
+            "singular": (b"0 0 1 3", b"0 0 0 3"),
+        },
         cuts=(0.0, 0.1, 0.3, 0.6),
     ),
     "projection options": Reader(projection_options, _capture, "captures", is_json=True),
@@ -432,3 +335,66 @@ READERS: dict[str, Reader] = {
     "stored frame": Reader(stored, read_frame, cuts=(0.0, 0.01, 0.1, 0.3)),
 }
 """Every reader of files that strangers made."""
+
+
+def streamed_sog(folder: Path) -> Path:
+    """A scene of one region."""
+    converters.write(_cloud(), folder / "lod-meta.json")
+    return folder / "lod-meta.json"
+
+
+def lcc(folder: Path) -> Path:
+    """A scene of four regions and two levels."""
+    radiance = {"radiance": np.zeros((3, 1, 3), np.float32), "radiance_color_space": DISPLAY_SRGB}
+    write_lcc.write_lcc(_cloud()[0].with_arrays(axes="rfu", **radiance), folder / "meta.lcc")
+    return folder / "meta.lcc"
+
+
+def lcc2(folder: Path) -> Path:
+    """A scene of one leaf."""
+    ply(folder)
+    leaf = {"childNum": 0, "data": {"3dgs": {"name": 0, "start": 0, "count": 2}}}
+    root = {"splatFiles": ["a.ply"], "childNum": 1, "child": {"0": leaf}}
+    (folder / "a.lcc2").write_text(json.dumps({"version": "0.0.3", "splatType": ".ply", "root": root}))
+    return folder / "a.lcc2"
+
+
+LEVELS: dict[str, Reader] = {
+    "streamed sog": Reader(
+        streamed_sog,
+        read_frames,
+        "splats",
+        {
+            "another version": (b'"version":1', b'"version":2'),
+            "a file elsewhere": (b"0_0/meta.json", b"../../a.json "),
+            "a file that is none": (b"0_0/meta.json", b"0_0/\\u001b[31m"),
+            "a run beyond the file": (b'"offset":0', b'"offset":9'),
+        },
+        is_json=True,
+        free=frozenset({"asset", "generator", "count", "bound", "min", "max"}),
+    ),
+    "lcc": Reader(
+        lcc,
+        read_frames,
+        "splats",
+        {"levels that are not there": (b'"totalLevel": 2', b'"totalLevel": 1')},
+        is_json=True,
+        free=frozenset({"version", "totalSplats", "indexDataSize", "offset", "epsg", "splats"}),
+    ),
+    "lcc2": Reader(
+        lcc2,
+        read_frames,
+        "splats",
+        {
+            "a file elsewhere": (b'"a.ply"', b'"../a.ply"'),
+            "a file of another kind": (b'"a.ply"', b'"a.lcc2"'),
+            "a run beyond the file": (b'"start": 0', b'"start": 9'),
+            "negative": (b'"count": 2', b'"count": -2'),
+        },
+        is_json=True,
+        free=frozenset({"version", "childNum"}),
+    ),
+}
+"""Readers of scenes with levels of detail."""
+
+READERS |= LEVELS

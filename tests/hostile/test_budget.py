@@ -10,9 +10,13 @@ import OpenEXR
 import pytest
 from hostile import corpus
 
+from beam_warp.schema.files import require_opens
+
+resource = pytest.importorskip("resource", reason="Windows does not count")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is KiB on Linux alone")
 
 SECONDS = 2.0
+PROBE_SECONDS = 0.3
 MEMORY = 256 * 2**20
 
 MEASURED = """
@@ -78,6 +82,21 @@ def bomb_stage(folder):
     path = corpus.stage(folder)
     path.write_text(path.read_text().replace('"duration": 1.5', '"duration": 1e12'))
     return path, ("beam_warp.cli.main", "render", path, "--out", folder / "o.png")
+
+
+def test_what_an_asset_names_beside_layers_is_not_read(tmp_path):
+    """The child process that opens an asset first spends no more if a sound of 8 GiB, here a hole, is named there."""
+    path = corpus.usda(tmp_path)
+    seconds = []
+    for layer in ("", 'def SpatialAudio "Sound"\n{\n    uniform asset filePath = @sound.wav@\n}\n'):
+        path.write_text(path.read_text() + layer)
+        (tmp_path / "sound.wav").touch()
+        os.truncate(tmp_path / "sound.wav", 2**33)
+        begun = resource.getrusage(resource.RUSAGE_CHILDREN)
+        require_opens(path)
+        done = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(done.ru_utime + done.ru_stime - begun.ru_utime - begun.ru_stime)
+    assert seconds[1] < seconds[0] + PROBE_SECONDS
 
 
 @pytest.mark.parametrize("make", [bomb_exr, huge_ply, hollow_ply, counting_usd, listed_json, bomb_stage])

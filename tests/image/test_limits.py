@@ -88,6 +88,14 @@ def test_the_size_of_a_radiance_picture_comes_from_its_header(tmp_path):
         read_image(path)
 
 
+def test_a_large_radiance_picture_without_its_end_costs_no_more_than_its_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("beam_warp.image.hdr.UNCHECKED_PIXELS", 2**18)
+    path = hdr(tmp_path / "a.hdr", 1024, 512, new_run(1024))
+    path.write_bytes(path.read_bytes()[:-12])
+    for read in (read_image, EnvironmentMap.read):
+        assert refused(read, path, "truncated one at row 511 of") < 2**20 + 2 * path.stat().st_size
+
+
 def test_an_exposure_that_overflows_is_refused(tmp_path):
     path = hdr(tmp_path / "a.hdr", 8, 4, new_run(8))
     path.write_bytes(path.read_bytes().replace(b"FORMAT", b"EXPOSURE=1e-320\nFORMAT"))

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.fake_steps import FakeSteps, write_capture
+from support.leftovers import temporary_of_the_dead
 
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
@@ -206,9 +207,10 @@ def before_each_write(monkeypatch, act):
 
 def leave_half_written(out):
     """Leave what a kill within a frame's and within the asset's writer leaves."""
-    (out / "frames" / ".frame_000001.h5.1.tmp").write_bytes(b"half")
-    (out / ".gaussians.abc").mkdir()
-    (out / ".gaussians.abc" / "half.usdc").write_bytes(b"half")
+    temporary_of_the_dead(out / "frames" / "frame_000001.h5").write_bytes(b"half")
+    folder = temporary_of_the_dead(out / "gaussians.usda")
+    folder.mkdir()
+    (folder / "half.usdc").write_bytes(b"half")
 
 
 class TestResuming:

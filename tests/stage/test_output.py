@@ -60,17 +60,18 @@ class TestNames:
 
 
 class TestFolders:
-    def test_the_last_folder_of_a_pattern_is_made(self, tmp_path):
-        require_folder(FramePattern(tmp_path / "new", "", 4, ".png"))
-        assert (tmp_path / "new").is_dir()
+    def test_folders_are_made(self, tmp_path):
+        for target in (FramePattern(tmp_path / "a" / "b", "", 4, ".png"), Still(tmp_path / "c" / "d" / "x.png")):
+            require_folder(target)
+        assert (tmp_path / "a" / "b").is_dir()
+        assert (tmp_path / "c" / "d").is_dir()
 
     def test_refusals(self, tmp_path):
         (tmp_path / "file").touch()
         (tmp_path / "x.png").mkdir()
         for target, message in (
-            (Still(tmp_path / "no" / "x.png"), "out must be in a folder that exists, got"),
-            (Film(tmp_path / "no" / "x.mp4"), "out must be in a folder that exists, got"),
-            (FramePattern(tmp_path / "no" / "no", "", 4, ".png"), r"exists or can be made, got .* \(No such file"),
+            (Film(tmp_path / "file" / "x.mp4"), r"exists or can be made, got .* \(File exists"),
+            (FramePattern(tmp_path / "file" / "no", "", 4, ".png"), r"exists or can be made, got .* \(Not a dir"),
             (FramePattern(tmp_path / "file", "", 4, ".png"), r"exists or can be made, got .* \(File exists"),
             (Still(tmp_path / "x.png"), "out must be a file, got the folder"),
         ):

@@ -1,5 +1,8 @@
 """The wide tree: every Gaussian once, boxes that contain, a depth that traversal can follow, rays against nodes."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import warp as wp
@@ -8,12 +11,13 @@ from support.shapes import aligned, random_cloud, random_rays
 
 from beam_warp import Scene, visibility
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import InvalidArrayError
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.wide_tree import LARGEST_DEPTH, boxes_met, first_bit, reciprocal
 from beam_warp.stability.tracing import traced_cloud
 from beam_warp.trace import wide_tree as wide_trees
 from beam_warp.trace.packing import PackedGaussians
 from beam_warp.trace.reference import FLOAT32_ROUNDOFF, visibility_enclosure
+from beam_warp.trace.scene import NOTHING
 from beam_warp.trace.transmittance import TraceOptions
 from beam_warp.trace.wide_tree import build_wide_tree, refit
 
@@ -392,3 +396,10 @@ class TestMove:
             ):
                 with pytest.raises(InvalidArrayError, match=f"{name} must {match}"):
                     scene.move(*good[:place], bad, *good[place + 1 :])
+
+
+def test_a_scene_is_not_copied():
+    scene = Scene.from_gaussians(NOTHING, "cpu")
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(InvalidOptionError, match="scene must stay in the process that made it"):
+            copied(scene)

@@ -89,6 +89,7 @@ VIEWERS = {
             "playcanvas.html",
             "playcanvas",
             Placement("luf", turned=True),  # half a turn about z, by the manual: upright, with its back to the front
+            {".glb": Placement("luf")},  # as it is
         ),
         Viewer(
             "Spark",
@@ -110,8 +111,7 @@ VIEWERS = {
             "babylonjs",
             "babylon.html",
             "babylon",
-            Placement("ruf"),  # the loader flips y by itself, into a left-handed world
-            {".glb": Placement("lub")},
+            Placement("ruf"),  # the loader flips y by itself, of a GLB x, into a left-handed world
             colors_wrong=frozenset({".sog"}),
         ),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,7 +12,6 @@ from tyro.conf import arg
 from beam_warp import converters
 from beam_warp.checks import require_number
 from beam_warp.cli.common.pages import SECOND_PAGE
-from beam_warp.errors import InvalidOptionError, OutputError
 from beam_warp.world.metadata import LOW_PASS_RANGE
 
 if TYPE_CHECKING:
@@ -59,30 +58,6 @@ class ReadingFlags:
     def raster(self, sequence: GaussianSequence) -> RasterOptions:
         """Return how a sequence is drawn; see `raster_options`."""
         return raster_options(sequence.metadata, self.antialiased, self.low_pass)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results, and those above it.
-
-    Raises:
-        OutputError: It cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"out must be a folder, got {folder} ({error.strerror}). Choose another.") from error
-
-
-def require_apart(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Refuse to write over what is read: work that goes wrong must not cost the original.
-
-    Raises:
-        InvalidOptionError: An output is an input, by whatever name.
-    """
-    taken = {path.resolve() for path in inputs if path is not None}
-    for path in outputs:
-        if path.resolve() in taken:
-            raise InvalidOptionError(f"out must be another file than those that are read, got {path}. Rename it.")
 
 
 def notes_of(sequence: GaussianSequence) -> list[str]:

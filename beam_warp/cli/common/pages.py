@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import shutil
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeGuard, TypeVar, get_args, get_type_hints
 
@@ -12,6 +14,9 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 FIRST, ALL = ("-h", "--help"), "--help-all"
 """Words that ask for the first page, and for all options."""
+
+NARROWEST, WIDEST = 40, 400
+"""Widths that help is set for [character]; narrower terminals break its lines. In one column, tyro takes minutes."""
 
 MORE = "More options: the same command with --help-all."
 
@@ -57,6 +62,8 @@ def parse(record: type[Record], words: Sequence[str], prog: str) -> Record:
 
     if ALL not in words and not set(words).isdisjoint(FIRST):
         registry.struct_rule(first_page)
+    if not NARROWEST <= (columns := shutil.get_terminal_size().columns) <= WIDEST:
+        os.environ["COLUMNS"] = str(min(max(columns, NARROWEST), WIDEST))
     given = [FIRST[-1] if word == ALL else word for word in words]
     try:
         with registry:

@@ -11,8 +11,9 @@ import numpy as np
 
 from beam_warp.checks import require_range
 from beam_warp.cli.drawing.flags import Render, StillCameraFlags
+from beam_warp.converters.staging import require_writable
 from beam_warp.errors import InvalidOptionError, OutputError
-from beam_warp.stage.output import IMAGE_SUFFIXES, Film, FramePattern, Target, parse_target, require_folder
+from beam_warp.stage.output import IMAGE_SUFFIXES, Film, FramePattern, Target, parse_target
 
 _TIMED = ("frames", "seconds", "fps", "speed")
 
@@ -26,7 +27,7 @@ def require_consistent(args: Render) -> None:
         args.deferred if args.mode == "path" else args.path, f"with --mode {args.mode}", why="The other mode has it."
     )
     if args.is_stage:
-        staged = ("spacing", "on_ground", "source_axes", "drop_invalid")
+        staged = ("spacing", "on_ground", "source_axes", "meters_per_unit", "drop_invalid")
         refuse(args.assets, "with a stage", staged, why="The stage states it.")
         refuse(args.time, "with a stage", ("loop",), why="The stage states it.")
     elif not args.assets.asset:
@@ -68,14 +69,8 @@ def require_capture_folder(camera: StillCameraFlags, out: Path) -> None:
 
 
 def require_place(target: Target) -> None:
-    """Refuse an output in a folder that is not there, or where nothing can be written."""
-    folder = target.folder.parent if isinstance(target, FramePattern) else target.path.parent
-    if isinstance(target, FramePattern) and target.folder.is_dir():
-        folder = target.folder
-    if not folder.is_dir():
-        raise OutputError(f"out must be in a folder that exists, got {folder}. Create it first.")
-    if not isinstance(target, FramePattern):
-        require_folder(target)
+    """Refuse an output where nothing can be written; folders that are missing are made when work begins."""
+    require_writable(target.path(0) if isinstance(target, FramePattern) else target.path, is_made=True)
 
 
 def kind_of(target: Target) -> str:

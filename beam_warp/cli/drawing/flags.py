@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, Quiet, SourceAxes
+from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, MetersPerUnit, Quiet, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
-from beam_warp.converters.numbering import SOG_NAME
+from beam_warp.converters.numbering import SOG_NAMES
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class AssetFlags:
     ] = None
     on_ground: Annotated[bool, arg(help="Put the lowest point of every asset at height 0."), SECOND_PAGE] = False
     source_axes: Annotated[SourceAxes, SECOND_PAGE] = None
+    meters_per_unit: Annotated[MetersPerUnit, SECOND_PAGE] = None
     drop_invalid: Annotated[DropInvalid, SECOND_PAGE] = False
 
 
@@ -232,4 +233,4 @@ class Render:
     def is_stage(self) -> bool:
         """Whether one stage is rendered, and not assets."""
         path = self.assets.asset[0]
-        return len(self.assets.asset) == 1 and path.suffix.lower() == ".json" and path.name != SOG_NAME
+        return len(self.assets.asset) == 1 and path.suffix.lower() == ".json" and path.name not in SOG_NAMES

@@ -64,6 +64,7 @@ def staged(args: Render, capture: Capture | None) -> tuple[Stage, int]:
             assets.asset,
             camera=_NO_CAMERA,
             source_axes=assets.source_axes,
+            meters_per_unit=assets.meters_per_unit,
             drop_invalid=assets.drop_invalid,
             on_ground=assets.on_ground,
             spacing=assets.spacing,

@@ -44,7 +44,7 @@ def capture_views(
         numbers: The capture's number of every frame of the asset.
         split: Which records.
         frame: Only this frame of the asset; all without.
-        out: Folder for the images; made if its parent exists.
+        out: Folder for the images; made if it does not exist.
         suffix: Kind of the images.
 
     Returns:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,6 +23,7 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import write_json
 from beam_warp.jobs.store import frame_key, frame_names, make_folders, read_frame, write_frame
+from beam_warp.outputs import remove_leftovers
 from beam_warp.reconstruction.frames.model import FrameModel
 from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud, GaussianSequence
@@ -38,16 +39,18 @@ class FrameStore:
 
     Attributes:
         digests: Digests of the capture's files, which are read again only if they changed.
+        notes: What a killed call had left half written, and was removed.
     """
 
     def __init__(self, out: Path) -> None:
-        """Make ``out`` if its parent exists, and ``frames``, ``previews`` and ``digests`` in it.
+        """Make ``out``, and ``frames``, ``previews`` and ``digests`` in it.
 
         Raises:
             OutputError: A folder cannot be made.
         """
         self._folders = make_folders(out, "frames", "previews", "digests")
         self.digests = CaptureDigests(self._folders[2])
+        self.notes = remove_leftovers(out, *self._folders)
 
     def path(self, frame: int) -> Path:
         """Return the file of a frame."""
@@ -56,13 +59,6 @@ class FrameStore:
     def preview_path(self, frame: int) -> Path:
         """Return the file of a frame's preview."""
         return self._folders[1] / f"frame_{frame:06d}.png"
-
-    def remove_leftovers(self, frames: Collection[int]) -> None:
-        """Remove what a killed call left half written of these frames, which no other call may be working on."""
-        names = {f"frame_{frame:06d}" for frame in frames}
-        for path in [path for folder in self._folders for path in folder.glob(".frame_*.tmp*")]:
-            if path.name.split(".")[1] in names:
-                path.unlink(missing_ok=True)
 
     def key(self, frame: int) -> str | None:
         """Return the key of a frame; None if it is not there."""

@@ -1,0 +1,292 @@
+"""What do the flaws of real captures cost, and are they told? The product's own job on flawed copies of clean captures.
+
+    python benchmarks/flaws.py --out JSON [--device cuda:0] [--captures NAME ...] [--flaws NAME ...] [--sizes S ...]
+        [--seeds N ...] [--preset draft] [--gaussians 8000] [--frames 1] [--seconds 540]
+
+A case is a capture with a flaw (`beam_warp.stability.flaws`), of a size over the nominal one, drawn by a seed, which is
+the job's seed too. ``clean`` is without any, ``flawed`` with all that a good studio gets a little wrong, and ``a+b``
+with several. `beam run` makes an asset of the first frames whose truth is known, and `beam evaluate` scores it against
+the clean capture: its test images, poses and materials. Results are written after each case; cases that the file holds
+already are not run again, if the code is the same. With ``--seconds``, no case is begun that would not end by then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import record
+from parts import Row
+
+from beam_warp import converters
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.findings import Finding
+from beam_warp.capture.views import CapturedView
+from beam_warp.cli.reconstruct import Modelling
+from beam_warp.cli.run import Run
+from beam_warp.cli.run import run as run_job
+from beam_warp.demo.capture import write_demo_capture
+from beam_warp.demo.lights import sunset
+from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import BeamError
+from beam_warp.evaluate.asset import evaluate_asset
+from beam_warp.evaluate.materials import EvaluateOptions
+from beam_warp.materials.evidence import view_evidence
+from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.stability.capture_cases.case import Detection, detections_of, in_words
+from beam_warp.stability.flaws.write import FLAWS, STUDIO, FlawedCapture, write_flawed
+from beam_warp.study.materials import without_color
+from beam_warp.world.axes import change_axes
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.harmonics import SH_C0
+
+CLEAN, TOGETHER = "clean", "flawed"
+SIZELESS = (CLEAN, "plate")
+"""Cases that have one size only."""
+
+LEAST_PIXELS = 0.1
+"""A Gaussian's truth is known where test views show at least so much of it."""
+
+NAMED: Mapping[str, Collection[str]] = {
+    "exposure": ("camera-exposure",),
+    "light": ("environment-turned", "environment-exposure"),
+    "clipping": ("clipped-images",),
+    "wrong-camera": ("sees-nothing",),
+    "missing-image": ("missing-image",),
+}
+"""Codes of findings that name a flaw."""
+
+
+def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, str, float, int]]:
+    """Yield the cases that are asked for: capture, name of the flaw, size and seed."""
+    for capture, seed, size, name in product(arguments.captures, arguments.seeds, arguments.sizes, arguments.flaws):
+        if name not in SIZELESS or size == arguments.sizes[0]:
+            yield capture, name, 1.0 if name in SIZELESS else size, seed
+
+
+def flaws_of(name: str) -> tuple[str, ...]:
+    """Return the flaws that a case's name stands for."""
+    return () if name == CLEAN else STUDIO if name == TOGETHER else tuple(name.split("+"))
+
+
+def measure(clean: Capture, name: str, size: float, seed: int, arguments: argparse.Namespace, folder: Path) -> Row:
+    """Return what comes of a case: scores, what was found, what was recovered, and seconds of each step."""
+    frames = truth_frames(clean)[: arguments.frames]
+    started = time.perf_counter()
+    copy = write_flawed(clean, folder / "capture", flaws_of(name), size=size, seed=seed, frames=frames)
+    written = time.perf_counter()
+    out = folder / "out"
+    asked = Run(
+        input=copy.capture.folder,
+        out=out,
+        modelling=Modelling(gaussians=arguments.gaussians, preset=arguments.preset),
+        seed=seed,
+        device=arguments.device,
+        quiet=True,
+    )
+    row: Row = {"injected": copy.injected, "seconds": {"write": written - started}}
+    try:
+        run_job(asked)
+    except BeamError as error:
+        return {**row, "refused": str(error), **told(copy, name, [Finding("error", "refused", str(error))])}
+    row["seconds"]["run"] = time.perf_counter() - written
+    reconstruction, decomposition = (
+        json.loads((place / "report.json").read_text()) for place in (out / "reconstruction", out)
+    )
+    said = [*reconstruction["findings"], *decomposition["findings"]]
+    said += [finding for frame in reconstruction["frames"] for finding in frame["findings"]]
+    row |= told(copy, name, [Finding(**finding) for finding in said])
+    row["recovered"] = recovered(copy, reconstruction, decomposition)
+    row["gaussians"] = decomposition["input"]["gaussians"]
+    evaluated = time.perf_counter()
+    sequence = in_units_of(converters.read(out / "asset.usda"), copy.white)
+    options = EvaluateOptions(scaled_relighting=True, device=arguments.device)
+    row["scores"] = scores(evaluate_asset(sequence, clean, options).scores.as_dict())
+    row["errors"] = stated_errors(sequence, clean, frames[0], arguments.device)
+    row["seconds"]["evaluate"] = time.perf_counter() - evaluated
+    return row
+
+
+def told(copy: FlawedCapture, name: str, findings: Collection[Finding]) -> Row:
+    """Return what was found, in words, which flaws that names, and what it names beside them.
+
+    A flaw of one camera is named where that camera is.
+    """
+    cameras = tuple(dict.fromkeys(entry.camera_name for entry in copy.capture.records))
+    warnings = detections_of([finding for finding in findings if finding.severity != "note"], cameras)
+    faulty = {camera for camera, flaws in copy.injected["cameras"].items() if "turn_degrees" in flaws}
+
+    def names(found: Detection, flaw: str) -> bool:
+        return found.code in NAMED.get(flaw, ()) and (flaw != "wrong-camera" or found.camera in faulty)
+
+    flaws = flaws_of(name)
+    beside = [found for found in warnings if not any(names(found, flaw) for flaw in flaws)]
+    return {
+        "said": in_words(warnings),
+        "named": {flaw: any(names(found, flaw) for found in warnings) for flaw in flaws},
+        "beside": in_words(beside),
+    }
+
+
+def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> Row:
+    """Return parameters that the product reports, beside those that were injected.
+
+    ``light_stops``: how much brighter the light was made; it should be minus what was injected.
+    ``exposure_spread``: largest exposure of a camera over the middle one [stop].
+    """
+    stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
+    spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
+    return {
+        "light_stops": decomposition["exposure_stops"],
+        "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
+        "exposure_spread": max(spreads, default=None),
+        "exposure_spread_injected": max(map(abs, stops), default=0.0),
+    }
+
+
+def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:
+    """Return a sequence whose captured colour, in units of white, is in those of the clean capture."""
+
+    def brightened(cloud: GaussianCloud) -> GaussianCloud:
+        assert cloud.radiance is not None
+        radiance = cloud.radiance * np.float32(white)
+        radiance[:, 0] += np.float32(0.5 * (white - 1.0) / SH_C0)  # colour is 0.5 more than the harmonics say
+        return cloud.with_arrays(radiance=radiance)
+
+    return replace(sequence, read_frame=lambda frame: brightened(sequence[frame])) if white != 1.0 else sequence
+
+
+def scores(found: Row) -> Row:
+    """Return the scores that a table of flaws has, means over views: PSNR and SSIM of images, errors of geometry."""
+    mean = found["mean"]
+    images = ("ambient_occlusion", "base_color", "base_color_scaled", "roughness", "novel_view")
+    relit = {name: mean[name].get("deferred", {}) for name in ("relit", "relit_scaled")}
+    picked = {name: mean[name] for name in images if name in mean}
+    picked |= {
+        name: {key: float(np.mean([light[key] for light in lights.values()])) for key in ("psnr", "ssim")}
+        for name, lights in relit.items()
+        if lights
+    }
+    kept = {name: {key: score[key] for key in ("psnr", "ssim")} for name, score in picked.items()}
+    geometry = ("normals_median_degrees", "normals_mean_degrees", "depth_median_mm", "overlap")
+    return {**kept, "base_color_scale": found["base_color_scale"], **{name: mean[name] for name in geometry}}
+
+
+def stated_errors(sequence: GaussianSequence, clean: Capture, frame: int, device: str) -> Row:
+    """Return how errors of the first frame's materials compare with the standard errors that the asset states.
+
+    The truth of test views is spread back over the Gaussians that they show. Normally distributed errors that are
+    stated rightly have a median |z| of 0.67, 68 % within 1 and 95 % within 2.
+    """
+    cloud = change_axes(sequence[0], "rfu")
+    records = [entry for entry in clean.select(split="test", frames=[frame]) if entry.truth_path is not None]
+    raster, found = RasterOptions.from_metadata(sequence.metadata), {}
+    for name, layers in (("base_color", [f"base_color.{hue}" for hue in "RGB"]), ("roughness", ["roughness"] * 3)):
+        shown = []
+        for entry in records:
+            truth = entry.truth()
+            alpha = np.clip(truth.channels["A"], 0.0, 1.0).astype(np.float32)
+            color = (truth.stack(*layers) * alpha[..., None]).astype(np.float32)
+            shown.append(CapturedView(name=entry.name, camera=entry.camera, color=color, alpha=alpha))
+        cameras = [entry.camera for entry in records]
+        colors = view_evidence(without_color(cloud), cameras, shown, options=raster, device=device).colors.numpy()
+        weights = colors[..., 3:].astype(np.float64)
+        known = weights.sum(axis=0)[:, 0] >= LEAST_PIXELS
+        true = (colors[..., :3] * weights).sum(axis=0)[known] / weights.sum(axis=0)[known]
+        value, error = (np.broadcast_to(getattr(cloud, key).T, (3, len(cloud))).T for key in (name, f"{name}_error"))
+        z = np.abs(value[known] - true) / np.maximum(error[known], 1e-6)
+        found[name] = {
+            "known": float(known.mean()),
+            "median_z": float(np.median(z)),
+            "within_1": float((z <= 1.0).mean()),
+            "within_2": float((z <= 2.0).mean()),
+        }
+    return found
+
+
+def capture_of(name: str, data: Path, folder: Path, device: str) -> Capture:
+    """Return a clean capture of the data folder, or the demo's, path traced."""
+    if name != "demo":
+        return Capture.read(data / "captures" / name)
+    options: dict[str, Any] = {"frame_count": 1, "camera_count": 24, "size": 320, "samples": 64, "device": device}
+    return write_demo_capture(folder / "demo", relit={"sunset": sunset()}, **options)
+
+
+def known_rows(arguments: argparse.Namespace) -> list[Row]:
+    """Return the rows that the result holds already.
+
+    Raises:
+        SystemExit: They were measured by other code.
+    """
+    if not arguments.out.is_file():
+        return []
+    known = json.loads(arguments.out.read_text(encoding="utf-8"))
+    if changed := record.changed_since(known["measured"]):
+        raise SystemExit(f"{arguments.out} was measured by other code: {', '.join(changed)}. Move it away.")
+    return known["rows"]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
+    parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], metavar="NAME", help="or demo")
+    parser.add_argument("--flaws", nargs="+", default=[CLEAN, TOGETHER, *FLAWS], metavar="NAME")
+    parser.add_argument("--sizes", nargs="+", type=float, default=[1.0], metavar="S", help="over the nominal size")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N")
+    parser.add_argument("--preset", choices=("fast", "draft"), default="fast")
+    parser.add_argument("--gaussians", type=int, metavar="N", help="by default the preset's")
+    parser.add_argument("--frames", type=int, default=1, metavar="N", help="with truth, from the first on")
+    parser.add_argument("--seconds", type=float, help="begin no case that would end later")
+    record.add_arguments(parser)
+    arguments = parser.parse_args()
+    for name in arguments.flaws:
+        if unknown := set(flaws_of(name)) - set(FLAWS):
+            parser.error(f"flaws must be {CLEAN}, {TOGETHER} or of {', '.join(FLAWS)}, got {', '.join(unknown)}")
+    started, longest = time.perf_counter(), 0.0
+    rows = known_rows(arguments)
+    done = {tuple(row["case"].values()) for row in rows}
+    with tempfile.TemporaryDirectory() as place:
+        captures: dict[str, Capture] = {}
+        for case in cases(arguments):
+            begun = time.perf_counter()
+            if case in done or (arguments.seconds and begun + longest - started > arguments.seconds):
+                continue
+            capture, name, size, seed = case
+            if capture not in captures:
+                captures[capture] = capture_of(capture, arguments.data, Path(place), arguments.device)
+            with tempfile.TemporaryDirectory(dir=place) as folder:
+                row = measure(captures[capture], name, size, seed, arguments, Path(folder))
+            title = f"{capture} {name}" + ("" if name in SIZELESS else f" x{size:g}") + f" seed {seed}"
+            rows.append(
+                {"name": title, "case": dict(zip(("capture", "flaw", "size", "seed"), case, strict=True)), **row}
+            )
+            record.write_result(arguments, resolve_device(arguments.device), {"rows": rows})
+            longest = max(longest, time.perf_counter() - begun)
+            print(f"{title}: {in_a_line(row)} ({time.perf_counter() - begun:.0f} s)", file=sys.stderr, flush=True)
+    return 0
+
+
+def in_a_line(row: Row) -> str:
+    """Return a row for people who wait."""
+    if "refused" in row:
+        return f"refused: {row['refused']}"
+    found = row["scores"]
+    keys = ("ambient_occlusion", "base_color_scaled", "relit_scaled", "novel_view")
+    psnr = ", ".join(f"{key} {found[key]['psnr']:.1f}" for key in keys if key in found)
+    return f"{psnr}, normals {found['normals_median_degrees']:.1f}°; said {', '.join(row['said']) or 'nothing'}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
