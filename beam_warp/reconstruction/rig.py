@@ -13,7 +13,8 @@ A capture's cameras are never exact, and a fit pays for each tenth of a pixel. W
 4. Corrections are undone unless they are beyond chance (an F test of the two mean squares) and beyond `OWN_ERROR`, what
    the method finds in exact rigs. Then each camera's shrinks by what chance explains of it (James and Stein). An exact
    rig therefore stays as it is, to the bit.
-5. A camera whose photograph is met much worse than the others' is left out and named.
+5. A camera whose photograph is met much worse than the others' after the first half is left out and named, and all
+   begins again without it.
 
 What pixels see of a camera is its turn and shift together: a turn and a shift sideways look the same but for depth. So
 places are found to a part of a pixel on the surface, not to a part of a millimetre where the camera stands. Principal
@@ -22,8 +23,9 @@ points are not moved: a turn does nearly the same, and images do not tell them a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -71,6 +73,19 @@ SHIFT_SHARE = 0.5
 
 MOMENTS = (0.7, 0.9)
 """Decay of Adam's moments: a camera is looked through a dozen times, not thousands."""
+
+
+FAR = 0.5
+"""A coarse level that moved a camera by more is taken again: steps reach no farther than about twice that [pixel of the
+level]."""
+
+MOST_REPEATS = 3
+"""How often levels are taken again, at most."""
+
+FEWER_POINTS = 23
+"""Every so many Gaussians are asked how far they move in an image: hundreds do."""
+
+NO_FACTS: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -130,26 +145,63 @@ def refine_rig(
     """
     if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
         return None
+    target = resolve_device(device)
+    first = _half_found(views, options, 0, target, progress)
+    psnr = first.psnr()
+    is_bad = psnr < np.nanmedian(psnr) - MOST_BEHIND
+    if is_bad.any():  # it has misled the others
+        kept = np.flatnonzero(~is_bad)
+        rest = refine_rig([names[k] for k in kept], [views[k] for k in kept], options, device=device, progress=progress)
+        return _left_out([names[k] for k in np.flatnonzero(is_bad)], psnr[is_bad], [names[k] for k in kept], rest)
+    second = _half_found(views, options, 1, target, progress)
     given = [view.camera for view in views]
-    levels = levels_of(given)
-    total = 2 * sum(step_count(level, len(views)) for level in levels)
-    taken, ends = 0, []
-    for half in range(2):
-        cameras, fitter = given, None
-        for level in levels:
-            steps = step_count(level, len(views))
+    return judged(names, given, [first.found, second.found], first.parameters.cloud(), psnr)
 
-            def report(done: int, _: int, facts: Any, before: int = taken) -> None:
-                progress(before + done, total, facts)
 
-            fitter = RigFitter(views, cameras, level, options, half, resolve_device(device))
-            fitter.run(report)
-            cameras = fitter.found
-            taken += steps
-        assert fitter is not None
-        ends.append((cameras, fitter.parameters.cloud(), fitter.psnr()))
-    progress(total, total)
-    return judged(names, given, [end[0] for end in ends], ends[0][1], ends[0][2])
+def _half_found(
+    views: Sequence[CapturedView], options: FitOptions, half: int, device: Any, progress: StepProgress
+) -> RigFitter:
+    """Refine the cameras by one half of the pixels, from coarse to fine; return the finest level."""
+    cameras = [view.camera for view in views]
+    waiting, repeats = levels_of(cameras), MOST_REPEATS
+    total = 2 * sum(step_count(level, len(views)) for level in waiting)
+    taken = half * total // 2
+    while True:
+        level = waiting[0]
+
+        def report(done: int, _: int, facts: Any = NO_FACTS, before: int = taken) -> None:
+            progress(min(before + done, total), total, facts)
+
+        fitter = RigFitter(views, cameras, level, options, half, device)
+        fitter.run(report)
+        points = fitter.parameters.cloud().positions[::FEWER_POINTS].astype(np.float64)
+        largest = max(pixels_between(*pair, points) for pair in zip(cameras, fitter.found, strict=True))
+        cameras = fitter.found
+        if repeats and len(waiting) > 1 and largest > FAR * level.reduction:
+            repeats -= 1
+            continue
+        taken += step_count(level, len(views))
+        waiting = waiting[1:]
+        if not waiting:
+            return fitter
+
+
+def _left_out(
+    bad: Sequence[str], psnr: NDArray[np.float64], kept: Sequence[str], rest: RigCorrection | None
+) -> RigCorrection:
+    """Return the corrections of a rig some of whose cameras are left out, given those of the others, if they are known.
+
+    Args:
+        bad: Names of the cameras that are left out.
+        psnr: Quality that their photographs were met with [dB].
+        kept: Names of the others.
+        rest: Corrections of the others; None if they are too few for any.
+    """
+    others = rest or RigCorrection(tuple(CameraCorrection(name) for name in kept), is_applied=False, confidence=0.0)
+    left_out = (
+        CameraCorrection(name, psnr=float(quality), is_used=False) for name, quality in zip(bad, psnr, strict=True)
+    )
+    return replace(others, cameras=(*others.cameras, *left_out))
 
 
 def levels_of(cameras: Sequence[Camera]) -> list[Level]:
@@ -300,7 +352,7 @@ def judged(
         cloud: Gaussians of the subject.
         psnr: Quality with which each photograph was met [dB]; NaN where it shows nothing.
     """
-    points = cloud.positions[cloud.opacities > 0.5][::23].astype(np.float64)
+    points = cloud.positions[cloud.opacities > 0.5][::FEWER_POINTS].astype(np.float64)
     center = np.median(cloud.positions, axis=0).astype(np.float64)
     ends = [in_gauge(given, cameras, center) for cameras in found]
     first, second = (
@@ -309,11 +361,9 @@ def judged(
     means = 0.5 * (first + second)
     moved = np.array([pixels_between(c, moved_camera(c, m), points) for c, m in zip(given, means, strict=True)])
     errors = 0.5 * np.array([pixels_between(*pair, points) for pair in zip(*ends, strict=True)])
-    bad = psnr < np.nanmedian(psnr) - MOST_BEHIND
-    noise = float(np.mean(np.square(errors[~bad])))
-    signal = float(np.mean(np.square(moved[~bad])))
+    noise, signal = float(np.mean(np.square(errors))), float(np.mean(np.square(moved)))
     confidence = signal / max(noise, 1e-12)
-    freedom = FREEDOM * int((~bad).sum())
+    freedom = FREEDOM * len(given)
     is_applied = bool(signal > OWN_ERROR**2 and confidence > stats.f.isf(CHANCE, freedom, freedom))
     kept = np.maximum(0.0, 1.0 - noise / np.maximum(np.square(moved), 1e-30)) if is_applied else np.zeros(len(moved))
     return RigCorrection(
@@ -326,10 +376,9 @@ def judged(
                 pixels=float(pixels),
                 error=float(np.hypot(error, np.sqrt(noise)) / np.sqrt(2.0)),
                 psnr=float(np.nan_to_num(quality)),
-                is_used=not is_bad,
             )
-            for name, move, pixels, error, quality, is_bad in zip(
-                names, means * kept[:, None], moved, errors, psnr, bad, strict=True
+            for name, move, pixels, error, quality in zip(
+                names, means * kept[:, None], moved, errors, psnr, strict=True
             )
         ),
         is_applied,

@@ -98,13 +98,23 @@ def test_less_than_the_method_s_own_error_moves_nothing(rng, points):
     assert not outcome(cameras, [agreed, agreed], points).is_applied
 
 
-def test_a_camera_that_is_met_much_worse_is_left_out(rng, points):
-    cameras = cameras_around(8)
-    psnr = np.full(8, 31.0)
-    psnr[3], psnr[5] = 22.0, np.nan
-    found = outcome(cameras, [shaken(rng, cameras, 0.3) for _ in range(2)], points, psnr)
+def test_a_camera_that_is_met_much_worse_is_left_out(device, monkeypatch):
+    """One of eight cameras looks a third of the ball aside; the others are refined without it."""
+    monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 2, 3, 0.05, 0.02),))
+    views = ball_views(cameras_around(8, 40))
+    turned = moved_camera(views[3].camera, [0.0, 0.12, 0.0, 0.0, 0.0, 0.0, 0.0])
+    views[3] = replace(views[3], camera=turned)
+    names, options = [f"c{k}" for k in range(8)], FitOptions.of_preset("draft", gaussian_count=500)
+    found = refine_rig(names, views, options, device=device)
+    assert found is not None
     assert [camera.camera for camera in found.cameras if not camera.is_used] == ["c3"]
-    assert not found.is_applied
+    assert len(found.cameras) == 8
+    assert found.findings()[-1].code == "camera-contradicts"
+    monkeypatch.setattr(rig, "FEWEST_CAMERAS", 8)
+    too_few = refine_rig(names, views, options, device=device)
+    assert too_few is not None
+    assert not too_few.is_applied
+    assert [camera.camera for camera in too_few.cameras if not camera.is_used] == ["c3"]
 
 
 def test_halves_share_no_pixel(device):
