@@ -76,8 +76,8 @@ MOMENTS = (0.7, 0.9)
 
 
 FAR = 0.5
-"""A coarse level that moved a camera by more is taken again: steps reach no farther than about twice that [pixel of the
-level]."""
+"""A coarse level that moved a camera by more is taken again with this one moved and the others where they were: steps
+reach no farther than about twice that, and what is far off misleads the others [pixel of the level]."""
 
 MOST_REPEATS = 3
 """How often levels are taken again, at most."""
@@ -150,9 +150,11 @@ def refine_rig(
     psnr = first.psnr()
     is_bad = psnr < np.nanmedian(psnr) - MOST_BEHIND
     if is_bad.any():  # it has misled the others
-        kept = np.flatnonzero(~is_bad)
-        rest = refine_rig([names[k] for k in kept], [views[k] for k in kept], options, device=device, progress=progress)
-        return _left_out([names[k] for k in np.flatnonzero(is_bad)], psnr[is_bad], [names[k] for k in kept], rest)
+        others = [k for k in range(len(views)) if not is_bad[k]]
+        kept = [names[k] for k in others]
+        rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
+        bad = {name: float(psnr[k]) for k, name in enumerate(names) if is_bad[k]}
+        return _left_out(bad, kept, rest)
     second = _half_found(views, options, 1, target, progress)
     given = [view.camera for view in views]
     return judged(names, given, [first.found, second.found], first.parameters.cloud(), psnr)
@@ -169,38 +171,41 @@ def _half_found(
     while True:
         level = waiting[0]
 
-        def report(done: int, _: int, facts: Any = NO_FACTS, before: int = taken) -> None:
-            progress(min(before + done, total), total, facts)
-
         fitter = RigFitter(views, cameras, level, options, half, device)
-        fitter.run(report)
+        fitter.run(_part_of(progress, taken, total))
         points = fitter.parameters.cloud().positions[::FEWER_POINTS].astype(np.float64)
-        largest = max(pixels_between(*pair, points) for pair in zip(cameras, fitter.found, strict=True))
-        cameras = fitter.found
-        if repeats and len(waiting) > 1 and largest > FAR * level.reduction:
+        limit = FAR * level.reduction
+        far = [pixels_between(*pair, points) > limit for pair in zip(cameras, fitter.found, strict=True)]
+        if repeats and len(waiting) > 1 and any(far):  # the others gave way to these
+            cameras = [new if is_far else old for old, new, is_far in zip(cameras, fitter.found, far, strict=True)]
             repeats -= 1
             continue
+        cameras = fitter.found
         taken += step_count(level, len(views))
         waiting = waiting[1:]
         if not waiting:
             return fitter
 
 
-def _left_out(
-    bad: Sequence[str], psnr: NDArray[np.float64], kept: Sequence[str], rest: RigCorrection | None
-) -> RigCorrection:
+def _part_of(progress: StepProgress, before: int, steps: int) -> StepProgress:
+    """Return a listener to the steps of one level, ``before`` of all ``steps`` taken."""
+
+    def report(done: int, total: int, facts: Mapping[str, float] = NO_FACTS) -> None:
+        progress(before + done, steps, facts)
+
+    return report
+
+
+def _left_out(bad: Mapping[str, float], kept: Sequence[str], rest: RigCorrection | None) -> RigCorrection:
     """Return the corrections of a rig some of whose cameras are left out, given those of the others, if they are known.
 
     Args:
-        bad: Names of the cameras that are left out.
-        psnr: Quality that their photographs were met with [dB].
+        bad: The quality that the photographs of the cameras that are left out were met with [dB], by name.
         kept: Names of the others.
         rest: Corrections of the others; None if they are too few for any.
     """
     others = rest or RigCorrection(tuple(CameraCorrection(name) for name in kept), is_applied=False, confidence=0.0)
-    left_out = (
-        CameraCorrection(name, psnr=float(quality), is_used=False) for name, quality in zip(bad, psnr, strict=True)
-    )
+    left_out = (CameraCorrection(name, psnr=quality, is_used=False) for name, quality in bad.items())
     return replace(others, cameras=(*others.cameras, *left_out))
 
 
@@ -360,7 +365,7 @@ def judged(
     )
     means = 0.5 * (first + second)
     moved = np.array([pixels_between(c, moved_camera(c, m), points) for c, m in zip(given, means, strict=True)])
-    errors = 0.5 * np.array([pixels_between(*pair, points) for pair in zip(*ends, strict=True)])
+    errors = 0.5 * np.array([pixels_between(one, other, points) for one, other in zip(ends[0], ends[1], strict=True)])
     noise, signal = float(np.mean(np.square(errors))), float(np.mean(np.square(moved)))
     confidence = signal / max(noise, 1e-12)
     freedom = FREEDOM * len(given)
@@ -387,6 +392,8 @@ def judged(
 
 
 def pixels_between(camera: Camera, other: Camera, points: NDArray[np.float64]) -> float:
-    """Return the root mean square distance of what two cameras show of the same points [pixel]."""
+    """Return the root mean square distance of what two cameras show of the same points [pixel]; 0 if that is none."""
     apart = camera.project(points)[:, :2] - other.project(points)[:, :2]
-    return float(np.sqrt(np.nanmean(np.square(apart).sum(axis=1))))
+    squares = np.square(apart).sum(axis=1)
+    seen = np.isfinite(squares)
+    return float(np.sqrt(squares[seen].mean())) if seen.any() else 0.0
