@@ -39,8 +39,8 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.demo.lights import sunset
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import BeamError
-from beam_warp.evaluate.asset import evaluate_asset
-from beam_warp.evaluate.materials import EvaluateOptions
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
+from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
@@ -99,7 +99,9 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     try:
         run_job(asked)
     except BeamError as error:
-        return {**row, "refused": str(error), **told(copy, name, [Finding("error", "refused", str(error))])}
+        said = str(error).replace(f"{folder}{os.sep}", "")
+        row["seconds"]["run"] = time.perf_counter() - written
+        return {**row, "refused": said, **told(copy, name, [Finding("error", "refused", said)])}
     row["seconds"]["run"] = time.perf_counter() - written
     reconstruction, decomposition = (
         json.loads((place / "report.json").read_text()) for place in (out / "reconstruction", out)
@@ -112,7 +114,7 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     evaluated = time.perf_counter()
     sequence = in_units_of(converters.read(out / "asset.usda"), copy.white)
     options = EvaluateOptions(scaled_relighting=True, device=arguments.device)
-    row["scores"] = scores(evaluate_asset(sequence, clean, options).scores.as_dict())
+    row["scores"] = scores(score_materials(sequence, clean, options, metrics=PerceptualMetrics()).as_dict())
     row["errors"] = stated_errors(sequence, clean, frames[0], arguments.device)
     row["seconds"]["evaluate"] = time.perf_counter() - evaluated
     return row
@@ -143,14 +145,14 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the middle one [stop].
+    ``exposure_spread``: largest exposure of a camera over the middle one [stop]; 0 where none is known.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
     spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
     return {
         "light_stops": decomposition["exposure_stops"],
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
-        "exposure_spread": max(spreads, default=None),
+        "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
     }
 

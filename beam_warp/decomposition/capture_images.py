@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.capture.findings import count_of, names_of
 from beam_warp.capture.inspect import SPLIT
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
@@ -26,20 +27,25 @@ class CaptureImages:
     Attributes:
         raster: How the Gaussians were drawn when they were fitted.
         is_stated: Whether the sequence states which frames of the capture it shows.
+        notes: Images that are missing and were left out, in words.
     """
 
     def __init__(self, capture: Capture, sequence: GaussianSequence) -> None:
-        """Find every frame's images.
+        """Find every frame's images; those without a file are left out, as reconstruction does, if others are there.
 
         Raises:
             InvalidOptionError: The capture lacks a frame of the sequence.
         """
         self.raster = RasterOptions.from_metadata(sequence.metadata)
         self.is_stated = stated_capture_frames(sequence.metadata, len(sequence)) is not None
-        self._records = {
-            index: list(capture.select(split=SPLIT, frames={frame}))
-            for index, frame in enumerate(matched_frames(sequence, capture, SPLIT))
-        }
+        self._records: dict[int, list[CaptureRecord]] = {}
+        missing: list[str] = []
+        for index, frame in enumerate(matched_frames(sequence, capture, SPLIT)):
+            records = capture.select(split=SPLIT, frames={frame})
+            there = [record for record in records if record.image_path.is_file()]
+            self._records[index] = there or list(records)  # of a frame without images the reader names the first
+            missing += [record.name for record in records if there and record not in there]
+        self.notes = [f"{count_of(len(missing), 'image')} missing, left out: {names_of(missing)}"] if missing else []
 
     def views(self, index: int) -> list[CapturedView]:
         """Read the images of a frame of the sequence."""

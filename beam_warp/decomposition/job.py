@@ -118,7 +118,7 @@ def run(
     for name in (ASSET_NAME, OVERVIEW_NAME, REPORT_NAME):
         require_writable(out / name, is_made=True)
     folder, digests = make_folders(out, "frames", "digests")
-    notes = remove_leftovers(out, folder, digests)
+    notes = [*remove_leftovers(out, folder, digests), *(images.notes if images is not None else ())]
     log = JobLog(progress, len(sequence), device)
     source = Source(
         sequence=sequence, images=images, options=chosen, digests=CaptureDigests(digests), device=str(device), log=log

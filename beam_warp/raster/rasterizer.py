@@ -209,7 +209,8 @@ class Rasterizer:
 
         Args:
             to_cameras: ``(V, 12)`` float, compact; overwritten with the derivatives to the numbers of each camera that
-                `CAMERA_PARAMETERS` names. None leaves them out, which costs nothing.
+                `CAMERA_PARAMETERS` names. None leaves them out, which costs nothing. The first call that asks for them
+                allocates what they need.
 
         Returns:
             The same arrays every time, overwritten by the next call.

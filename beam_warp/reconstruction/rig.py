@@ -263,6 +263,13 @@ class RigFitter(Fitter):
         self._visits = np.zeros(len(views), int)
         self._to_camera = wp.zeros((1, len(CAMERA_PARAMETERS)), dtype=float, device=device)
 
+    def _renew(self) -> float:
+        """Bring everything up to date; allocate what derivatives to cameras need, which a recording must not."""
+        psnr = super()._renew()
+        for group in dict.fromkeys(self._targets[view][0] for view in range(len(self._targets))):
+            group.rasterizer.backward(self._to_camera)
+        return psnr
+
     def _differentiated(self, group: ViewTargets, index: int) -> GaussianGradients:
         """Compare one half of a view with what was drawn, and differentiate to its camera as well."""
         group.add_losses(index, self._weights)

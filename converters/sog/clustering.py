@@ -19,6 +19,12 @@ _ROUNDS_OF_SHARING = 8
 _ROUNDS_OF_NUMBERS = 100
 _ROUNDS_OF_VECTORS = 8
 
+_ROUNDING = 1e-5
+"""Squared distance over squared length that float32 cannot tell from 0."""
+
+_MOST_COMPARED = 2**27
+"""Most comparisons of a group's members with its entries in a round, so that no palette takes minutes."""
+
 _SAMPLE = 2**16
 """Vectors that the coarse division of a palette is found from."""
 
@@ -140,7 +146,7 @@ def _shares(weights: NDArray[np.number], counts: NDArray[np.integer], size: int)
     A group without weight, whose members are equal, gets no more than one: entries may be left over.
     """
     shares = np.minimum(np.maximum(1, np.floor(weights / max(weights.sum(), 1e-300) * size)), counts).astype(np.intp)
-    most = np.where(weights > 0.0, counts, np.minimum(1, counts))
+    most = np.where(weights > 0.0, np.minimum(counts, _MOST_COMPARED // np.maximum(counts, 1)), np.minimum(1, counts))
     for group in np.argsort(-weights, kind="stable"):  # what remains, or is too much by the least of one
         shares[group] = np.clip(shares[group] + size - shares.sum(), min(1, counts[group]), most[group])
     return shares
@@ -172,5 +178,6 @@ def _nearest(
         score = half - part @ centers.T  # half the squared distance, up to the vector's own square
         labels[start : start + block] = best = score.argmin(axis=1)
         distances[start : start + block] = 2.0 * score[np.arange(len(part)), best]
-    distances += np.einsum("ij,ij->i", vectors, vectors)
-    return labels, np.maximum(distances, 0.0)
+    squares = np.einsum("ij,ij->i", vectors, vectors)
+    distances += squares
+    return labels, np.where(distances > _ROUNDING * squares, distances, 0.0)

@@ -124,14 +124,14 @@ def test_the_input_is_never_written_over(person, capsys):
     assert (person / "person.ply").read_bytes() == before
     code, _, err = run(person / "take", person / "take" / "f.ply", capsys=capsys)
     assert code == 2
-    assert "f000000.ply for both. Choose another name." in err
+    assert "f000000.ply. Rename it." in err
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("gone.ply out/a.ply", "error: input must be an existing file or folder, got "),
-        ("person.ply person.ply/a.ply", "error: output folder must exist, got "),
+        ("person.ply person.ply/a.ply", "error: output folder must be a folder, got "),
         ("person.ply out/a.obj", "error: file name must end in one of .ply, "),
         ("person.ply out/a.ksplat", "error: output's name must end in one of"),
         ("person.ply out", "error: file name must end in one of .ply, "),

@@ -136,6 +136,8 @@ def asked(figure, small, tmp_path, monkeypatch):
     light = EnvironmentMap.read(next(small.glob("environment*"))).scaled(0.5).radiance
     write_exr(tmp_path / "dim.exr", {name: light[..., index] for index, name in enumerate("RGB")})
     shutil.copytree(small, tmp_path / "other")
+    for name in ("rough.png", "mesh.obj"):
+        (tmp_path / name).write_bytes(b"")  # the job reads them, and is not run
     monkeypatch.setattr("beam_warp.decomposition.job.run", refuse)
 
     def ask(preset, words):

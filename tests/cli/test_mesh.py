@@ -156,7 +156,7 @@ def test_mistakes(sequence, tmp_path, refused):
     for words, says in (
         (("--frames", "7"), "frames must be an integer in [0, 1], got 7"),
         (("--voxel", "-1"), "voxel must be a number in"),
-        (("--out", tmp_path / "none" / "out"), "out must be a folder that can be made"),
+        (("--out", f"{__file__}/meshes"), "out must be a folder"),
         (("--confirmations", "99"), "depth must be seen"),
     ):
         refused("mesh", sequence, "--out", tmp_path, *FAST, "--frames", "0", *words, says=says)

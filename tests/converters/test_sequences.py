@@ -106,7 +106,7 @@ def test_output_folders_are_made_and_removed_again_when_the_work_fails(walk, tmp
     with pytest.raises(OutputError, match="output must be a file, got the folder"):
         converters.write(walk, tmp_path / "folder.ply")
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match=r"output folder must exist, got .*file for a\.ply"):
+    with pytest.raises(OutputError, match=r"output folder must be a folder, got .*file for a\.ply"):
         converters.write(walk, tmp_path / "file" / "a.ply")
 
 

@@ -369,6 +369,13 @@ class TestWithACapture:
         assert len(views) == len(expected) == 6
         assert all(np.array_equal(a.color, b.color) for a, b in zip(views, expected, strict=True))
 
+    def test_missing_images_are_left_out(self, discs, tiny_capture):
+        """Reconstruction leaves them out, so the materials of the same capture must be found without them, too."""
+        gone = replace(tiny_capture.records[0], image_path=tiny_capture.folder / "gone.exr")
+        images = CaptureImages(replace(tiny_capture, records=(gone, *tiny_capture.records[1:])), discs)
+        assert [len(images.views(index)) for index in range(2)] == [5, 6]
+        assert images.notes == [f"1 image missing, left out: {gone.name}"]
+
     def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, capture, tmp_path):
         """8-bit images carry no scale: the same light four times as bright gives the same base colour.
 

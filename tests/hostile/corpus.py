@@ -364,7 +364,7 @@ LEVELS: dict[str, Reader] = {
         streamed_sog,
         read_frames,
         "splats",
-        {
+        swaps={
             "another version": (b'"version":1', b'"version":2'),
             "a file elsewhere": (b"0_0/meta.json", b"../../a.json "),
             "a file that is none": (b"0_0/meta.json", b"0_0/\\u001b[31m"),
@@ -377,7 +377,7 @@ LEVELS: dict[str, Reader] = {
         lcc,
         read_frames,
         "splats",
-        {"levels that are not there": (b'"totalLevel": 2', b'"totalLevel": 1')},
+        swaps={"levels that are not there": (b'"totalLevel": 2', b'"totalLevel": 1')},
         is_json=True,
         free=frozenset({"version", "totalSplats", "indexDataSize", "offset", "epsg", "splats"}),
     ),
@@ -385,7 +385,7 @@ LEVELS: dict[str, Reader] = {
         lcc2,
         read_frames,
         "splats",
-        {
+        swaps={
             "a file elsewhere": (b'"a.ply"', b'"../a.ply"'),
             "a file of another kind": (b'"a.ply"', b'"a.lcc2"'),
             "a run beyond the file": (b'"start": 0', b'"start": 9'),

@@ -389,8 +389,9 @@ class TestMistakes:
             reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2))
 
     def test_a_folder_that_cannot_be_made(self, capture, tmp_path):
-        with pytest.raises(OutputError, match="out must be a folder that can be made"):
-            reconstruct(capture, tmp_path / "missing" / "out", FakeSteps())
+        (tmp_path / "file").write_bytes(b"")
+        with pytest.raises(OutputError, match="output folder must be a folder"):
+            reconstruct(capture, tmp_path / "file" / "out", FakeSteps())
 
 
 class TestCameras:

@@ -20,6 +20,7 @@ from beam_warp.stability.capture_cases.cameras import (
     wrong_exposure,
 )
 from beam_warp.stability.capture_cases.case import Detection, detections_of
+from beam_warp.stability.capture_cases.delivered import as_delivered, poses_off
 from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.capture_cases.subjects import no_texture, object_appears, touching
 
@@ -92,6 +93,27 @@ class TestChanges:
     def test_names_are_picked_evenly(self):
         assert evenly("abcdefghijkl", 4) == ("a", "d", "g", "j")
         assert evenly("abc", 3) == ("a", "b", "c")
+
+
+class TestDelivered:
+    def test_training_views_are_flawed_and_test_views_are_the_clean_ones(self, studio, tiny_capture):
+        stress = as_delivered.build(studio)
+        clean = {record.name: record for record in tiny_capture.records}
+        assert {record.name for record in stress.capture.records} == set(clean)
+        assert stress.may_blame
+        for record in stress.capture.records:
+            assert (record.image_path == clean[record.name].image_path) == (record.split == "test")
+        # Test views are in the units of the photographs, in which white is 1.
+        (one, *_), (other, *_) = (capture.select(split="test") for capture in (stress.capture, tiny_capture))
+        gain = one.image().rgb().sum() / other.image().rgb().sum()
+        lit = [(r.view().color.sum(), clean[r.name].view().color.sum()) for r in stress.capture.select(split="train")]
+        mean = np.mean([mine / known for mine, known in lit])
+        assert 0.7 < mean / gain < 1.3  # but for masks of a pixel in 64
+        assert one.truth().channels.keys() == other.truth().channels.keys()
+
+    def test_a_case_can_be_made_twice(self, studio):
+        first, second = (poses_off.build(studio).capture.records[0] for _ in range(2))
+        np.testing.assert_array_equal(first.camera.camera_to_world, second.camera.camera_to_world)
 
 
 class TestTraced:

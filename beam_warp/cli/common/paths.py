@@ -24,7 +24,7 @@ _WRITTEN = re.compile(
 )
 """Names of the files that commands write into a folder."""
 
-MOST_JSON_BYTES = 2**26
+MOST_JSON_BYTES = 2**23
 """Largest JSON that is searched for the names of files."""
 
 

@@ -1,10 +1,11 @@
 """Stress captures: captures on which reconstructions fail, and what must be detected in each.
 
 A case that takes images away or changes their values writes nothing: its records read the given capture's files and
-change them in memory. A case that shows another subject is path traced once, when it is asked for.
+change them in memory. A case that shows another subject is path traced once, when it is asked for. One that looks as a
+studio delivers it is a flawed copy, which `beam_warp.stability.flaws` writes.
 """
 
-from beam_warp.stability.capture_cases import cameras, subjects
+from beam_warp.stability.capture_cases import cameras, delivered, subjects
 
 CAPTURE_CASES = [
     subjects.as_it_is,
@@ -21,6 +22,9 @@ CAPTURE_CASES = [
     cameras.four_cameras,
     cameras.eight_cameras,
     subjects.object_appears,
+    delivered.as_delivered,
+    delivered.masks_off,
+    delivered.poses_off,
 ]
 """Every case, in the order of the table; the first is the capture as it is."""
 

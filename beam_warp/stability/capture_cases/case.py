@@ -80,9 +80,11 @@ class CaptureStress:
         required: What must be detected.
         may_refuse: Whether a clear error before anything is optimised counts as detection too.
         is_sound: Whether nothing is wrong: then nothing may be detected.
+        may_blame: Whether every camera is a little wrong, so that any of them may be named.
     """
 
     capture: Capture
     required: tuple[Detection, ...] = ()
     may_refuse: bool = False
     is_sound: bool = False
+    may_blame: bool = False

@@ -7,6 +7,9 @@ kept, and variance grows by the kernel's.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
@@ -14,6 +17,9 @@ from scipy.special import j1
 
 from beam_warp.capture.lenses import Lens
 from beam_warp.world.camera import Camera
+
+Transfer: TypeAlias = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]
+"""Spectrum of a kernel over the frequencies along x and y [1/pixel]."""
 
 MARGIN = 16
 """Empty pixels around an image while it is blurred, so that no side sees the opposite one."""
@@ -46,14 +52,14 @@ def defocused(layers: NDArray[np.float64], diameter: float) -> NDArray[np.float6
     Source: Fourier transform of a disc, 2 J1(s) / s (Goodman, Introduction to Fourier Optics).
     """
 
-    def disc(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def disc(u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.floating]:
         s = np.maximum(np.pi * diameter * np.hypot(u, v), 1e-9)
         return 2.0 * j1(s) / s
 
     return _filtered(layers, disc)
 
 
-def _filtered(layers: NDArray[np.float64], transfer) -> NDArray[np.float64]:
+def _filtered(layers: NDArray[np.float64], transfer: Transfer) -> NDArray[np.float64]:
     """Multiply the spectrum of every channel by a function of the frequencies along x and y [1/pixel]."""
     height, width = layers.shape[0] + MARGIN, layers.shape[1] + MARGIN
     spectrum = np.fft.rfft2(layers, s=(height, width), axes=(0, 1))

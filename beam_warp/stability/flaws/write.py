@@ -9,8 +9,8 @@ shows some of the wall, and nothing in the copy tells where the subject ends but
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from beam_warp.stability.flaws.mattes import PLATE_ALBEDO, offset_coverage, plat
 from beam_warp.stability.flaws.optics import defocused, distorted, motion_blurred
 from beam_warp.stability.flaws.rig import CameraFlaws, draw_camera_flaws, stream
 from beam_warp.stability.flaws.sensor import eight_bits, noisy, straight, write_eight_bits, write_jpeg, write_linear
-from beam_warp.world.camera import OPENGL_TO_OPENCV
 from beam_warp.world.environment import EnvironmentMap
 
 LIGHT_DEGREES = 2.0
@@ -46,7 +45,7 @@ FLAWS: Mapping[str, str] = {
     "exposure": "exposure up to 0.2 stop and white balance up to 5 % off, a camera",
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
-    "masks": "the same with masks one pixel too large in half of the cameras, too small in the others",
+    "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
     "poses": "poses off by 0.3 pixel of rotation and 1 mm",
     "light": "environment turned by 2° and 10 % too bright",
     "motion-blur": "the subject moves by a pixel while the shutter is open",
@@ -106,55 +105,44 @@ def write_flawed(
         require_choice("flaw", flaw, tuple(FLAWS))
     require_number("size", size, 1e-3, 8.0)
     records = clean.select(split="train", frames=frames)
-    cameras = {record.camera_name: record.camera for record in records}
-    if len(cameras) < 2 or clean.environment_path is None:
-        raise InvalidArrayError(
-            f"capture must have 2 training cameras and an environment, got {len(cameras)} and "
-            f"{clean.environment_path} in {clean.folder}. Choose one that has."
-        )
-    light = EnvironmentMap.read(clean.environment_path)
-    if records[0].view().alpha is None:
-        raise InvalidArrayError(f"capture must have coverage, got none in {clean.folder}. Choose one that has.")
-    drawn = draw_camera_flaws(cameras, flaws, size, seed)
-    shot = _Shot(
-        flaws=frozenset(flaws),
-        size=size,
-        seed=seed,
-        cameras=drawn,
-        white=_white(records, flaws, size, max(flaw.gains.max() for flaw in drawn.values())),
-        wall=PLATE_ALBEDO * light.mean_radiance(),
-    )
+    light = _light_of(clean, records)
+    shot = _Shot.drawn(records, light, frozenset(flaws), size, seed)
     missing = _missing(records, shot)
-    poses = np.stack([camera.camera_to_world for camera in cameras.values()])
-    center = meeting_point(poses)
-    center = poses[:, :3, 3].mean(axis=0) if center is None else center
+    stated, said = _stated_light(light, shot)
     rate = clean.frames_per_second or 24.0
     with replacing_folder(folder) as root:
-        entries = []
         for record in records:
-            entry = transforms_record(
-                record.camera_name, "train", record.frame, record.camera, rate, has_truth=False
-            ) | shot.files(record)
-            pose = shot.cameras[record.camera_name].stated(record.camera, center)
-            entry["transform_matrix"] = (pose @ OPENGL_TO_OPENCV).tolist()
-            entries.append(entry)
             if record.name not in missing:
                 shot.write(root, record)
-        stated, said = _stated_light(light, shot)
         write_exr(root / "environment.exr", {c: stated.radiance[..., i] for i, c in enumerate("RGB")})
-        content = {"camera_model": "OPENCV", "fps": rate, "environment": "environment.exr", "frames": entries}
+        content = {
+            "camera_model": "OPENCV",
+            "fps": rate,
+            "environment": "environment.exr",
+            "frames": [shot.entry(record, rate) for record in records],
+        }
         (root / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-    per_camera = {name: found for name, flaw in shot.cameras.items() if (found := flaw.as_dict())}
-    return FlawedCapture(
-        Capture.read(folder),
-        shot.white if shot.is_encoded else 1.0,
-        {"cameras": per_camera, "light": said, "missing": sorted(missing), "white": shot.white},
-    )
+    cameras = {name: found for name, flaw in shot.cameras.items() if (found := flaw.as_dict())}
+    injected = {"cameras": cameras, "light": said, "missing": sorted(missing), "white": shot.white}
+    return FlawedCapture(Capture.read(folder), shot.white if shot.is_encoded else 1.0, injected)
+
+
+def _light_of(clean: Capture, records: Sequence[CaptureRecord]) -> EnvironmentMap:
+    """Return the light of a capture that can be flawed."""
+    count = len({record.camera_name for record in records})
+    if count < 2 or clean.environment_path is None:
+        raise InvalidArrayError(
+            f"capture must have 2 training cameras and an environment, got {count} and {clean.environment_path} in "
+            f"{clean.folder}. Choose one that has."
+        )
+    if records[0].view().alpha is None:
+        raise InvalidArrayError(f"capture must have coverage, got none in {clean.folder}. Choose one that has.")
+    return EnvironmentMap.read(clean.environment_path)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Shot:
-    """How images are taken: the flaws, what each camera has of them, white, and the wall's radiance."""
+    """How images are taken: the flaws, those of each camera, white, the wall's radiance, and the subject's middle."""
 
     flaws: frozenset[str]
     size: float
@@ -162,6 +150,26 @@ class _Shot:
     cameras: Mapping[str, CameraFlaws]
     white: float
     wall: NDArray[np.float64]
+    center: NDArray[np.float64]
+
+    @classmethod
+    def drawn(
+        cls, records: Sequence[CaptureRecord], light: EnvironmentMap, flaws: frozenset[str], size: float, seed: int
+    ) -> _Shot:
+        """Draw what is wrong with the cameras of a capture."""
+        rig = {record.camera_name: record.camera for record in records}
+        cameras = draw_camera_flaws(rig, flaws, size, seed)
+        poses = np.stack([camera.camera_to_world for camera in rig.values()])
+        center = meeting_point(poses)
+        return cls(
+            flaws=flaws,
+            size=size,
+            seed=seed,
+            cameras=cameras,
+            white=_white(records, flaws, size, max(flaw.gains.max() for flaw in cameras.values())),
+            wall=PLATE_ALBEDO * light.mean_radiance(),
+            center=poses[:, :3, 3].mean(axis=0) if center is None else center,
+        )
 
     @property
     def is_encoded(self) -> bool:
@@ -179,6 +187,13 @@ class _Shot:
         place = f"{record.camera_name}/{record.frame:04d}"
         mask = {"mask_path": f"masks/{place}.png"} if self.is_photograph else {}
         return {"file_path": f"images/{place}.{suffix}", **mask}
+
+    def entry(self, record: CaptureRecord, rate: float) -> dict[str, Any]:
+        """Return what ``transforms.json`` says of a record."""
+        pose = self.cameras[record.camera_name].stated(record.camera, self.center)
+        stated = replace(record.camera, camera_to_world=pose)
+        entry = transforms_record(record.camera_name, "train", record.frame, stated, rate, has_truth=False)
+        return entry | self.files(record)
 
     def write(self, root: Path, record: CaptureRecord) -> None:
         """Write a record's image, and its mask if it has one."""

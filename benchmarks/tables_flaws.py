@@ -1,0 +1,107 @@
+"""Table of the flaws of captures and what they cost, from the results of `flaws.py`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from tables import Row, Rows, table
+
+from beam_warp.stability.flaws.write import FLAWS
+
+WORDS = {"clean": "nothing", "flawed": "exposure, noise, masks, poses and light at once"}
+TIMES = {0.5: "half of it", 1.0: "", 2.0: "twice that"}
+IMAGES = ("ambient_occlusion", "base_color_scaled", "relit_scaled", "novel_view")
+
+
+Key = tuple[str, str, float]
+"""Capture, name of the flaw, size."""
+
+
+@table("flaws", "flaws_cpu.json")
+def flaws(result: Row) -> Rows:
+    """Return a row for every flaw and size of every capture, means over seeds: the clean ones first, then the worst."""
+    head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
+    head += ["normals", "depth [mm]", "roughness", "named"]
+    return [head, *(_cells(label, rows) for label, rows in _groups(result))]
+
+
+@table("flaws_recovered", "flaws_cpu.json")
+def recovered(result: Row) -> Rows:
+    """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
+    head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
+    head += ["base colour within 1, 2 stated errors", "roughness", "seconds"]
+    return [head, *(_recovered(label, rows) for label, rows in _groups(result))]
+
+
+def _groups(result: Row) -> Iterator[tuple[str, list[Row]]]:
+    """Yield the runs of each flaw under its words, in the order of the tables."""
+    groups: dict[Key, list[Row]] = {}
+    for row in result["rows"]:
+        case = row["case"]
+        groups.setdefault((case["capture"], case["flaw"], case["size"]), []).append(row)
+    captures = list(dict.fromkeys(capture for capture, *_ in groups))
+    for key in sorted(groups, key=lambda key: (captures.index(key[0]), key[1] != "clean", _quality(groups[key]))):
+        capture, name, size = key
+        words = WORDS.get(name) or "; ".join(FLAWS[part] for part in name.split("+"))
+        parts = [capture if len(captures) > 1 else "", words, TIMES.get(size, f"times {size:g}")]
+        yield ", ".join(filter(None, parts)), groups[key]
+
+
+def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
+    """Return the cells of a flaw in the second table."""
+    found = [row for row in rows if "scores" in row]
+    if not found:
+        return [label, *[""] * 7]
+    stops, spread = (_mean(found, "recovered", key) for key in ("light_stops", "exposure_spread"))
+    should, injected = (_mean(found, "recovered", f"{key}_injected") for key in ("light_stops", "exposure_spread"))
+
+    def within(name: str) -> str:
+        return ", ".join(f"{100 * _mean(found, 'errors', name, f'within_{count}'):.0f} %" for count in (1, 2))
+
+    cells = [label, f"{stops:+.2f}", f"{0.0 - should:+.2f}", f"{spread:.2f}", f"{injected:.2f}"]
+    return [*cells, within("base_color"), within("roughness"), f"{_mean(found, 'seconds', 'run'):.0f}"]
+
+
+def _cells(label: str, rows: Sequence[Row]) -> list[str]:
+    """Return the cells of a flaw."""
+    found = [row["scores"] for row in rows if "scores" in row]
+    if not found:
+        return [label, "refused: " + re.sub(r"/\S*/capture/", "capture/", rows[0]["refused"]), *[""] * 8]
+
+    def image(channel: str) -> str:
+        return f"{_mean(found, channel, 'psnr'):.1f} dB / {_mean(found, channel, 'ssim'):.3f}"
+
+    occlusion, color, relit, novel = map(image, IMAGES)
+    scale = np.mean([score["base_color_scale"] for score in found])
+    normals, depth = (_mean(found, key) for key in ("normals_median_degrees", "depth_median_mm"))
+    geometry = [f"{normals:.1f}°", f"{depth:.1f}", f"{_mean(found, 'roughness', 'psnr'):.1f} dB"]
+    return [label, occlusion, color, f"{scale:.2f}", relit, novel, *geometry, _named(rows)]
+
+
+def _mean(scores: Sequence[Row], *path: str) -> float:
+    """Return the mean over runs of a score."""
+
+    def value(score: Any) -> Any:
+        for key in path:
+            score = score[key]
+        return score
+
+    return float(np.mean([value(score) for score in scores]))
+
+
+def _quality(rows: Sequence[Row]) -> float:
+    """Return the mean PSNR by which rows are ordered; what was refused comes first."""
+    found = [row["scores"] for row in rows if "scores" in row]
+    return float(np.mean([_mean(found, channel, "psnr") for channel in IMAGES])) if found else -np.inf
+
+
+def _named(rows: Sequence[Row]) -> str:
+    """Return which flaws were named, and in how many runs, and the codes of other findings."""
+    counts = {flaw: sum(row["named"][flaw] for row in rows) for flaw in rows[0]["named"]}
+    runs = f" in {{}} of {len(rows)} runs" if len(rows) > 1 else ""
+    named = [flaw + runs.format(count) for flaw, count in counts.items() if count]
+    beside = dict.fromkeys(words.partition(" ")[0] for row in rows for words in row["beside"])
+    return ", ".join([*named, *(f"also `{code}`" for code in beside)]) or ("" if not counts else "nothing")
