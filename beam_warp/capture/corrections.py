@@ -40,7 +40,7 @@ class CameraCorrection:
         shift: Shift in the same axes [m], ``(3,)``: a point p in them comes to be at turn(p) + shift.
         log_focal: Natural logarithm of the factor of both focal lengths.
         pixels: How far this moves the surface in the image, root mean square [pixel].
-        error: Standard error of that [pixel].
+        error: Standard error of that [pixel]; a bound on it in a rig that the first half of the pixels found sound.
         psnr: Quality that the camera's image was met with [dB].
         is_used: False for a camera that could not be reconciled with the others, and is left out.
     """
@@ -75,7 +75,7 @@ class RigCorrection:
     Attributes:
         cameras: One for each camera, moved or not.
         is_applied: False where what was found is no more than chance and the method's own error: then nothing moves.
-        confidence: Ratio of the mean squares of what was found and of its standard errors.
+        confidence: Ratio of the mean squares of what was found and of its standard errors; 0 where it was not needed.
     """
 
     cameras: tuple[CameraCorrection, ...]

@@ -155,9 +155,40 @@ def refine_rig(
         rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
         bad = {name: float(psnr[k]) for k, name in enumerate(names) if is_bad[k]}
         return _left_out(bad, kept, rest)
+    given, cloud = [view.camera for view in views], first.parameters.cloud()
+    if (sound := _sound(names, given, first.found, cloud, psnr)) is not None:
+        return sound
     second = _half_found(views, options, 1, target, progress)
-    given = [view.camera for view in views]
-    return judged(names, given, [first.found, second.found], first.parameters.cloud(), psnr)
+    return judged(names, given, [first.found, second.found], cloud, psnr)
+
+
+def _sound(
+    names: Sequence[str],
+    given: Sequence[Camera],
+    found: Sequence[Camera],
+    cloud: GaussianCloud,
+    psnr: NDArray[np.float64],
+) -> RigCorrection | None:
+    """Return that a rig is sound, which needs no second half, if the first found less than may be its own error."""
+    points, center = _points_of(cloud)
+    ends = in_gauge(given, found, center)
+    moved = np.array([pixels_between(one, other, points) for one, other in zip(given, ends, strict=True)])
+    if float(np.mean(np.square(moved))) > OWN_ERROR**2:
+        return None
+    return RigCorrection(
+        tuple(
+            CameraCorrection(name, pixels=float(pixels), error=OWN_ERROR, psnr=float(np.nan_to_num(quality)))
+            for name, pixels, quality in zip(names, moved, psnr, strict=True)
+        ),
+        is_applied=False,
+        confidence=0.0,
+    )
+
+
+def _points_of(cloud: GaussianCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some points of a subject's surface, ``(N, 3)``, and its middle, ``(3,)`` [m]."""
+    positions = cloud.positions.astype(np.float64)
+    return positions[::FEWER_POINTS], np.median(positions, axis=0)
 
 
 def _half_found(
@@ -364,8 +395,7 @@ def judged(
         cloud: Gaussians of the subject.
         psnr: Quality with which each photograph was met [dB]; NaN where it shows nothing.
     """
-    points = cloud.positions[cloud.opacities > 0.5][::FEWER_POINTS].astype(np.float64)
-    center = np.median(cloud.positions, axis=0).astype(np.float64)
+    points, center = _points_of(cloud)
     ends = [in_gauge(given, cameras, center) for cameras in found]
     first, second = (
         np.stack([move_between(one, other) for one, other in zip(given, end, strict=True)]) for end in ends

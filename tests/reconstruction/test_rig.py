@@ -172,6 +172,18 @@ def test_cameras_of_a_capture_are_found_again(device, monkeypatch, walker_views,
     assert after < 0.6 * before
 
 
+def test_a_sound_rig_stays_to_the_bit_after_one_half(device, monkeypatch):
+    monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 2, 3, 0.02, 0.01),))
+    monkeypatch.setattr(rig, "judged", None)  # is asked of two halves only
+    views = ball_views(cameras_around(6, 40))
+    found = refine_rig([f"c{k}" for k in range(6)], views, FitOptions.of_preset("draft"), device=device)
+    assert found is not None
+    assert not found.is_applied
+    assert 0.0 < found.pixels < rig.OWN_ERROR
+    for correction, view in zip(found.cameras, views, strict=True):
+        np.testing.assert_array_equal(correction.applied(view.camera).camera_to_world, view.camera.camera_to_world)
+
+
 def test_too_few_cameras_or_no_masks_say_nothing():
     views = ball_views(cameras_around(6))
     names = [f"c{k}" for k in range(6)]
