@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import read_corrections
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
@@ -99,7 +100,7 @@ class Decompose:
 def decompose(args: Decompose) -> int:
     """Run the job and say what came out; all that was asked is checked before the first frame is worked on."""
     started = time.perf_counter()
-    capture = None if args.capture is None else Capture.read(args.capture)
+    capture = None if args.capture is None else _seen_by(Capture.read(args.capture), args.sequence)
     if args.preset == "paper" and capture is None:
         raise InvalidOptionError(
             "capture must be given for the preset paper, got none: it works on images. Name one with --capture."
@@ -127,6 +128,12 @@ def decompose(args: Decompose) -> int:
         print_notes(result.report["input"]["notes"], result.report["warnings"])
         print(outcome(result, time.perf_counter() - started))
     return 0
+
+
+def _seen_by(capture: Capture, sequence: Path) -> Capture:
+    """Return a capture with the cameras that a sequence was fitted with, if it lies in a reconstruction's folder."""
+    rig = read_corrections(sequence.parent)
+    return capture if rig is None else rig.capture(capture)
 
 
 def light_of(measuring: Measuring, capture: Capture | None, source: Path) -> Path:

@@ -35,6 +35,10 @@ class Modelling:
     segment_length: Annotated[
         int, arg(metavar="K", help="Frames from one key frame to the next, which parts share out; 0 for one segment.")
     ] = 0
+    cameras: Annotated[
+        Literal["refine", "keep"],
+        arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
+    ] = "refine"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
     ] = None
@@ -129,7 +133,7 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     from beam_warp.reconstruction.job import ReconstructOptions
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
-    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames)
+    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras)
 
 
 def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:

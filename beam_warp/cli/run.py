@@ -85,7 +85,7 @@ def run(args: Run) -> int:
                 drop_invalid=args.drop_invalid,
             )
         else:
-            sequence = found.sequence
+            sequence, capture = found.sequence, found.capture
         if args.fps is not None:
             sequence = replace(sequence, frames_per_second=args.fps)
         result = run_pipeline(sequence, environment, args.out, options, capture=capture, overview=view, progress=report)
@@ -117,7 +117,7 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, target-psnr, preset, segment-length and frames must be left out unless the input is a "
+            "gaussians, target-psnr, preset, segment-length, cameras and frames must be left out unless the input is a "
             f"capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)

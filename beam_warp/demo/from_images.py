@@ -32,7 +32,7 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions, LearningRates
-from beam_warp.reconstruction.job import Reconstruction, reconstruct
+from beam_warp.reconstruction.job import Reconstruction, ReconstructOptions, reconstruct
 from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance
 from beam_warp.reconstruction.steps import FitAndTrack
@@ -136,6 +136,7 @@ def demo_from_images(
             capture,
             out / "reconstruction",
             steps,
+            ReconstructOptions(cameras="keep"),  # they are exact
             progress=lambda stage, done, total, note="": progress(stage, done, total),
         )
     with timer("mesh"):

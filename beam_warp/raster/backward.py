@@ -6,16 +6,17 @@ import warp as wp
 
 from beam_warp.kernels.raster.back_projection_cpu import launch_back_project_cpu
 from beam_warp.kernels.raster.back_projection_cuda import launch_back_project_cuda
+from beam_warp.kernels.raster.camera_sums import LANES, launch_sum_cameras
 from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors_adjoint, launch_scatter_channels
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS, Adjoints, pair_length
 from beam_warp.kernels.raster.composite_adjoint_cpu import launch_composite_adjoint_cpu
 from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.raster.pair_sums import launch_resolve_sums, launch_sum_pairs
-from beam_warp.kernels.raster.project import Splats, launch_project_adjoint
+from beam_warp.kernels.raster.project import CameraMove, Splats, launch_project_adjoint
 from beam_warp.raster.buffers import FrameBuffers, zero_splats
 from beam_warp.raster.layout import Rows, channel_rows
-from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterImages
+from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages
 
 
 class BackwardBuffers:
@@ -41,6 +42,7 @@ class BackwardBuffers:
             geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
             self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
         self._tracked = _with_gradients(drawn.splats, self._splats)
+        self._cameras: CameraBuffers | None = None
 
     def begin(self, gaussians: GaussianArrays) -> None:
         """Begin a new sum, with room for as many coefficients of captured colour as the Gaussians have."""
@@ -70,8 +72,12 @@ class BackwardBuffers:
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
             launch_sum_pairs(sums.size, pairs.matrix, drawn.order, sums, drawn.device)
 
-    def resolve(self, gaussians: GaussianArrays) -> GaussianGradients:
-        """Turn sums over pairs into the gradients of Gaussians."""
+    def resolve(self, gaussians: GaussianArrays, to_cameras: wp.array | None) -> GaussianGradients:
+        """Turn sums over pairs into the gradients of Gaussians, and of cameras if they are asked for."""
+        if to_cameras is not None and self._cameras is None:
+            self._cameras = CameraBuffers(self._drawn)
+        cameras = None if to_cameras is None else self._cameras
+        moves = None if cameras is None else cameras.begin()
         drawn, found, splats, device = self._drawn, self.gaussians, self._splats, self._drawn.device
         for i, (rows, sums) in enumerate(zip(drawn.rows, self._sums, strict=True)):
             launch_resolve_sums(sums, drawn.splats, rows.length, int(drawn.exact), splats, device)
@@ -80,9 +86,34 @@ class BackwardBuffers:
         if drawn.channels.colors:
             inputs = (gaussians.positions, gaussians.radiance, drawn.views)
             colors = (drawn.blocks.colors, self._blocks.colors)
-            launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device)
-        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device)
+            launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device, moves)
+        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device, moves)
+        if cameras is not None:
+            launch_sum_cameras(cameras.rows, drawn.splats, cameras.lanes, to_cameras, device)
         return found
+
+
+class CameraBuffers:
+    """Arrays that derivatives to cameras need besides those to Gaussians.
+
+    Attributes:
+        rows: Derivatives to the camera of every splat, ``(V * N, 12)`` float.
+        lanes: Parts of their sums.
+    """
+
+    def __init__(self, drawn: FrameBuffers) -> None:
+        """Allocate for a frame."""
+        count, length = drawn.splat_count, len(CAMERA_PARAMETERS)
+        self.rows = wp.zeros((count, length), dtype=float, device=drawn.device)
+        self.lanes = wp.zeros((drawn.view_count * LANES, length), dtype=wp.float64, device=drawn.device)
+        self._moves = wp.zeros(count, dtype=CameraMove, device=drawn.device)
+        if count:
+            self._moves.grad = wp.array(ptr=self.rows.ptr, shape=count, dtype=CameraMove, device=drawn.device)
+
+    def begin(self) -> wp.array:
+        """Begin a new sum; return the moves of the splats' cameras, zeros, whose ``grad`` are the rows."""
+        self.rows.zero_()
+        return self._moves
 
 
 def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> None:

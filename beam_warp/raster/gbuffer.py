@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, overload
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_choice, require_finite, require_same_length
@@ -15,7 +16,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.array_checks import require_cameras
 from beam_warp.raster.channels import UNIT_CHANNELS, channel_layers, is_vector
 from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.records import CAMERA_PARAMETERS, RasterOptions
 from beam_warp.raster.sources import GEOMETRY, DrawnCloud, require_world_axes, upload_gaussians
 from beam_warp.raster.view_images import ValueImages, ViewImages, host_images, view_images
 from beam_warp.world.camera import Camera
@@ -163,6 +164,8 @@ class CloudGradients:
         opacities: To the opacities.
         channels: Derivatives to the arrays of the channels that were drawn, by name. ``surface_normals`` have none of
             their own: theirs are in ``orientations``, ``scales`` and ``positions``.
+        cameras: Derivatives to the numbers of each camera that `CAMERA_PARAMETERS` names, ``(V, 12)``; None where they
+            were not asked for.
     """
 
     positions: NDArray[np.float32]
@@ -170,6 +173,7 @@ class CloudGradients:
     scales: NDArray[np.float32]
     opacities: NDArray[np.float32]
     channels: Mapping[str, NDArray[np.float32]]
+    cameras: NDArray[np.float32] | None = None
 
 
 def rasterize_backward(
@@ -178,6 +182,7 @@ def rasterize_backward(
     adjoints: Mapping[str, ArrayLike] | Sequence[Mapping[str, ArrayLike]],
     *,
     channels: Sequence[str] = MATERIAL_CHANNELS,
+    cameras_too: bool = False,
     options: RasterOptions | None = None,
     device: Any = None,
 ) -> CloudGradients:
@@ -194,6 +199,7 @@ def rasterize_backward(
             ``median_depth``) or of a channel. Images left out have derivatives of 0. One mapping for a camera, as
             many as cameras for a sequence.
         channels: See `rasterize`.
+        cameras_too: Whether derivatives to the cameras are wanted as well.
         options: See `rasterize`.
         device: See `rasterize`.
 
@@ -218,12 +224,17 @@ def rasterize_backward(
         for name in mapping:
             require_choice("adjoints", name, (*IMAGES, *drawn.channels))
     totals: dict[str, Any] = {}
+    of_cameras = []
     for rasterizer, part in drawn.draw_groups(views, options):
         for place, index in enumerate(part):
             _set_adjoints(drawn, rasterizer, place, given[index])
-        for name, array in drawn.gradients(rasterizer.backward()).items():
+        rows = wp.zeros((len(part), len(CAMERA_PARAMETERS)), dtype=float, device=drawn.device) if cameras_too else None
+        for name, array in drawn.gradients(rasterizer.backward(rows)).items():
             totals[name] = totals[name] + array if name in totals else array
-    return CloudGradients(**{name: totals.pop(name) for name in GEOMETRY}, channels=totals)
+        if rows is not None:
+            of_cameras.append(rows.numpy())
+    geometry = {name: totals.pop(name) for name in GEOMETRY}
+    return CloudGradients(**geometry, channels=totals, cameras=np.concatenate(of_cameras) if of_cameras else None)
 
 
 def _mean_images(cloud: DrawnCloud, rasterizer: Rasterizer, view: ViewImages, camera: Camera) -> GBuffer:

@@ -19,7 +19,7 @@ from beam_warp.raster.array_checks import require_cameras, require_gaussians, re
 from beam_warp.raster.backward import BackwardBuffers, back_project_band
 from beam_warp.raster.buffers import FrameBuffers
 from beam_warp.raster.layout import ChannelRanges, ViewLayout
-from beam_warp.raster.records import GaussianArrays, GaussianGradients, RasterImages, RasterOptions
+from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
 
 MAX_SPLATS = 2**26 - 1
@@ -202,27 +202,35 @@ class Rasterizer:
         """Return the buffers of a loss's derivatives to `images`, zeros at first; fill them, then call `backward`."""
         return self._backward_buffers().images
 
-    def backward(self) -> GaussianGradients:
+    def backward(self, to_cameras: wp.array | None = None) -> GaussianGradients:
         """Return a loss's derivatives to the Gaussians of the last frame, from those to the images in `adjoints`.
 
         Discrete decisions are held still: which splats count, their order, the cap of alpha, the pick of the median.
+
+        Args:
+            to_cameras: ``(V, 12)`` float, compact; overwritten with the derivatives to the numbers of each camera that
+                `CAMERA_PARAMETERS` names. None leaves them out, which costs nothing. The first call that asks for them
+                allocates what they need.
 
         Returns:
             The same arrays every time, overwritten by the next call.
 
         Raises:
+            InvalidArrayError: ``to_cameras`` has another shape, type or place.
             InvalidOptionError: Nothing was drawn.
 
         Source: Kerbl et al. 2023, Section 6; per-pair sums without atomics as in
         ``kernels/raster/composite_adjoint_cuda.py``.
         """
         gaussians = self._drawn_gaussians("backward")
+        if to_cameras is not None:
+            require_matrix("to_cameras", to_cameras, len(self.cameras), (len(CAMERA_PARAMETERS),), self.device)
         back = self._backward_buffers()
         with wp.ScopedDevice(self.device):
             back.begin(gaussians)
             for _ in self._listed_bands():
                 back.add_band()
-            return back.resolve(gaussians)
+            return back.resolve(gaussians, to_cameras)
 
     def back_project(self, pixels: wp.array, out: wp.array) -> None:
         """Carry the contents of pixels back to the Gaussians of the last frame: the transpose of drawing values.

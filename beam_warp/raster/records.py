@@ -16,6 +16,16 @@ COEFFICIENT_COUNTS = (1, 4, 9, 16, 25)
 
 DEPTH_MODES = ("plane", "exact")
 
+CAMERA_PARAMETERS = (
+    *("turn_right", "turn_down", "turn_forward", "shift_right", "shift_down", "shift_forward"),
+    *("focal_x", "focal_y", "center_x", "center_y", "radial_1", "radial_2"),
+)
+"""Numbers of a camera that images are differentiated to, in this order.
+
+A twist in the camera's axes (right, down, forward), on the left of world-to-camera: a point p in these axes comes to be
+at p + turn x p + shift, turn in [rad] and shift in [m]. Focal lengths and principal point [pixel]. Radial terms of a
+lens at 0, the pinhole that is drawn: the tangents u, v of a ray become u, v times 1 + k1 r^2 + k2 r^4."""
+
 DepthMode = Literal["plane", "exact"]
 
 

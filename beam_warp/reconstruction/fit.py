@@ -24,12 +24,19 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
-from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.records import GaussianGradients, RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.parameters import GaussianParameters, require_something
 from beam_warp.reconstruction.sampling_limits import SamplingLimits
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, chosen_samples, disc_spacing, shuffled_views
+from beam_warp.reconstruction.targets import (
+    LossWeights,
+    TargetSet,
+    ViewTargets,
+    chosen_samples,
+    disc_spacing,
+    shuffled_views,
+)
 from beam_warp.reconstruction.temporal import TemporalTerms
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -339,6 +346,7 @@ class Fitter:
                 progress(iteration, total, facts)
             view = int(order[iteration])
             self._graphs.run(view, lambda view=view: self._step(view))
+            self._stepped(view)
             self._taken += 1
             is_due = bool(chosen.refine_every) and self._taken % chosen.refine_every == 0
             if is_due and self._taken <= chosen.refine_until * total:
@@ -412,14 +420,21 @@ class Fitter:
         parameters.activate()
         group.select(index)
         group.rasterizer.redraw()
-        group.add_losses(index, self._weights)
-        drawn = group.rasterizer.backward()
+        drawn = self._differentiated(group, index)
         launch_add_gradient_lengths(drawn.positions, self._gradient_sums, self._gradient_counts, self.device)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
         if self._temporal is not None:
             self._temporal.add_gradients(self.options.temporal)
         self._adam.step()
+
+    def _differentiated(self, group: ViewTargets, index: int) -> GaussianGradients:
+        """Compare what was drawn with a view, and return the derivatives to the Gaussians."""
+        group.add_losses(index, self._weights)
+        return group.rasterizer.backward()
+
+    def _stepped(self, view: int) -> None:
+        """Do what follows a step outside of its recording: nothing, here."""
 
     def _refine(self) -> None:
         """Drop Gaussians that are not seen, and split those of large gradients into their rows."""

@@ -6,6 +6,7 @@ other: several processes may work on them, and what tracking loses, the next key
 tracking is lost becomes a key frame itself.
 
     plan            frames.plan     the records of each frame, and the segments
+    cameras         steps.refine_rig   what is wrong with the rig, from its first frame; corrected records
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
@@ -21,31 +22,34 @@ bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
-from beam_warp.capture.capture import Capture
+from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
 from beam_warp.capture.views import CapturedView
-from beam_warp.checks import require_count, require_path
+from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import InvalidOptionError
+from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress, no_progress
-from beam_warp.jobs.report import REPORT_NAME, device_facts, versions, write_report
+from beam_warp.jobs.report import REPORT_NAME, device_facts, versions, write_json, write_report
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.frames.model import model_frame
+from beam_warp.reconstruction.frames.model import model_frame, within
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
 from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
 from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, key_of_frame, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
+from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 
@@ -59,14 +63,18 @@ class ReconstructOptions:
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
         frames: Numbers of the frames, ascending; None for all of the split.
+        cameras: ``"refine"`` corrects cameras that are beyond doubt wrong, the same in all frames; ``"keep"`` takes all
+            as the capture states them.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
+    cameras: Literal["refine", "keep"] = "refine"
 
     def __post_init__(self) -> None:
         """Check every field once."""
         require_count("segment_length", self.segment_length, low=0)
+        require_choice("cameras", self.cameras, ("refine", "keep"))
         if self.frames is not None and list(self.frames) != sorted(set(self.frames)):
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
@@ -104,11 +112,13 @@ class Reconstruction:
         asset: Root layer of the asset.
         sequence: The Gaussians, read lazily from the store; axes "rfu", scene-linear radiance.
         report: What was measured, JSON-able; also written to ``report.json``.
+        capture: The capture with the cameras that the Gaussians were fitted with.
     """
 
     asset: Path
     sequence: GaussianSequence
     report: dict[str, Any]
+    capture: Capture
 
 
 def reconstruct(
@@ -148,7 +158,7 @@ def reconstruct(
     progress("write asset", 1, 1)
     report = {**_report(job, capture, chosen, resumed), "seconds": time.perf_counter() - started}
     write_report(folder, report)
-    return Reconstruction(asset, sequence, report)
+    return Reconstruction(asset, sequence, report, capture if job.rig is None else job.rig.capture(capture))
 
 
 def reconstruct_part(
@@ -201,6 +211,7 @@ class _Job:
     store: FrameStore
     common_inputs: str
     progress: NotedProgress
+    rig: RigCorrection | None = None
 
 
 def _prepare(
@@ -211,7 +222,44 @@ def _prepare(
     for name in (ASSET_NAME, REPORT_NAME):
         require_writable(out / name, is_made=True)
     plan = plan_frames(capture, options.frames, options.segment_length)
-    return _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
+    job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
+    rig = _refined_rig(job, out) if options.cameras == "refine" else None
+    if rig is None:
+        (out / FILE_NAME).unlink(missing_ok=True)
+        return job
+    records = {frame: rig.corrected(found) for frame, found in plan.records.items()}
+    return replace(job, rig=rig, plan=replace(plan, records=records, findings=(*plan.findings, *rig.findings())))
+
+
+def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
+    """Find what is wrong with the cameras, or read what was found from the same images before; None for nothing."""
+    frame, records = next(iter(job.plan.records.items()))
+    if not _is_fixed_rig(job.plan.records):
+        return None
+    with FrameReader(job.plan.records, job.store.digests) as reader:
+        key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "cameras")
+        known = None
+        with suppress(AssetFormatError):  # what is damaged is found anew
+            known = read_corrections(out, key)
+        if known is None:
+            names = [record.camera_name for record in records]
+            known = job.steps.refine_rig(names, reader.views(frame), within(job.progress, "cameras", frame))
+            if known is not None:
+                write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
+    return known
+
+
+def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
+    """Tell whether each camera has a name of its own, and stands still in all frames."""
+    cameras: dict[str, Camera] = {}
+    for found in records.values():
+        if len({record.camera_name for record in found}) < len(found):
+            return False
+        for record in found:
+            first = cameras.setdefault(record.camera_name, record.camera)
+            if not np.array_equal(first.camera_to_world, record.camera.camera_to_world):
+                return False
+    return True
 
 
 def _reconstruct_segments(job: _Job, segments: Sequence[Sequence[int]]) -> int:
@@ -286,8 +334,9 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
         },
         "device": device_facts(job.device),
         "versions": versions(),
-        "options": {**job.steps.options(), "segment_length": options.segment_length},
+        "options": {**job.steps.options(), "segment_length": options.segment_length, "cameras": options.cameras},
         "resumed_frames": resumed,
+        "cameras": None if job.rig is None else job.rig.as_dict(),
         **sequence_facts(frames),
         "findings": [vars(finding) for finding in findings],
         "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from beam_warp.capture.capture import SparsePoints
+from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
@@ -20,6 +21,7 @@ from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
+from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -63,6 +65,12 @@ class FitAndTrack:
             "tracking": asdict(self._tracking),
             "points": None if self.points is None else _digest(self.points),
         }
+
+    def refine_rig(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> RigCorrection | None:
+        """Find what is wrong with the cameras of a rig, from what they show at one moment."""
+        return refine_rig(names, views, self.fitting, device=self.device, progress=progress)
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""

@@ -28,6 +28,7 @@ from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
 CROP_MARGIN = 8
@@ -107,6 +108,7 @@ class ViewTargets:
     Attributes:
         rasterizer: Draws one view at a time: `select` says which.
         cameras: What it draws for, with as many pixels as there are samples.
+        samples: Side of the square of samples that a pixel is the mean of.
         height: Height of every view [pixel].
         width: Width of every view [pixel].
     """
@@ -131,7 +133,7 @@ class ViewTargets:
         )
         self.device = self.rasterizer.device
         self.height, self.width = views[0].camera.height, views[0].camera.width
-        self._samples = samples
+        self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
         self._colors = [upload(linear_to_srgb(view.color), float, self.device) for view in views]
         self._alphas = [
@@ -167,6 +169,21 @@ class ViewTargets:
         """Look from a view; may be captured in a CUDA graph."""
         self.rasterizer.set_cameras(self._cameras[index])
 
+    def move_camera(self, index: int, camera: Camera) -> None:
+        """Draw a view from another camera from now on, also where steps were recorded.
+
+        Normals of depth keep the camera that the view began with.
+
+        Args:
+            index: Which view.
+            camera: Its camera, with the view's size.
+        """
+        fine = camera.supersampled(self.samples)
+        moved = self.rasterizer.prepare_cameras([fine])
+        wp.copy(self._cameras[index].views, moved.views)
+        self._cameras[index] = PreparedCameras(moved.cameras, moved.layout, self._cameras[index].views)
+        self.cameras = (*self.cameras[:index], fine, *self.cameras[index + 1 :])
+
     def add_losses(self, index: int, weights: LossWeights) -> list[wp.array]:
         """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
 
@@ -175,20 +192,18 @@ class ViewTargets:
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
-        launch_average(self._color, self._samples, True, self._encoded, self.device)
+        launch_average(self._color, self.samples, True, self._encoded, self.device)
         target = self._colors[index]
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded)]
         if weights.ssim > 0.0:
             terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
-        launch_add_sample_gradients(self._color, self._samples, True, self._to_encoded, self._to_color, self.device)
+        launch_add_sample_gradients(self._color, self.samples, True, self._to_encoded, self._to_color, self.device)
         alpha = self._alphas[index]
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
-            launch_average(self._alpha, self._samples, False, self._covered, self.device)
+            launch_average(self._alpha, self.samples, False, self._covered, self.device)
             terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
-            launch_add_sample_gradients(
-                self._alpha, self._samples, False, self._to_covered, self._to_alpha, self.device
-            )
+            launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
         if weights.normal > 0.0:
             self._to_surface.zero_()
             geometry = self._depth_normals[index]
@@ -221,7 +236,7 @@ class ViewTargets:
         adjoints.channels[0].fill_(1.0)  # derivatives of the image's sum to what is composited are the weights
         values = weigher.backward().values
         assert values is not None
-        return values.numpy()[:, 0] / np.float32(self._samples**2)
+        return values.numpy()[:, 0] / np.float32(self.samples**2)
 
     def psnr(self, index: int) -> float:
         """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB].
@@ -230,7 +245,7 @@ class ViewTargets:
         """
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
-        launch_average(self._color, self._samples, True, self._encoded, self.device)
+        launch_average(self._color, self.samples, True, self._encoded, self.device)
         launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
         return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
@@ -248,7 +263,7 @@ class ViewTargets:
         alpha = self._alphas[index]
         if alpha is None:
             return 0.0
-        launch_average(self._alpha, self._samples, False, self._covered, self.device)
+        launch_average(self._alpha, self.samples, False, self._covered, self.device)
         missed = ((alpha.numpy() > 0.9) & ~(self._covered.numpy() > 0.5))[..., 0]
         labelled: Any = ndimage.label(missed)  # its types say that it may be a number
         parts, count = labelled

@@ -8,7 +8,7 @@ import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
 from beam_warp.kernels.common.spherical_harmonics import seen_color
-from beam_warp.kernels.raster.project import RasterView
+from beam_warp.kernels.raster.project import CameraMove, RasterView
 
 
 @wp.struct
@@ -33,6 +33,26 @@ def evaluate_colors_kernel(
     count = positions.shape[0]
     i = splat % count
     toward = positions[i] - views[splat / count].position
+    out_colors[splat] = seen_color(radiance, i, wp.normalize(toward))
+
+
+@wp.kernel
+def evaluate_colors_of_cameras_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    radiance: wp.array2d[wp.vec3],
+    views: wp.array[RasterView],
+    moves: wp.array[CameraMove],
+    out_colors: wp.array[wp.vec3],
+):
+    """The same with a camera for every splat, moved by zeros: a turn about a camera's place changes no colour."""
+    splat = first + wp.tid()
+    count = positions.shape[0]
+    i = splat % count
+    view = views[splat / count]
+    move = moves[splat]
+    shift = wp.vec3(move[3], move[4], move[5])
+    toward = positions[i] - view.position + wp.transpose(view.world_to_camera) * shift
     out_colors[splat] = seen_color(radiance, i, wp.normalize(toward))
 
 
@@ -101,17 +121,21 @@ def launch_evaluate_colors(positions, radiance, views, colors, device):
 
 
 def launch_evaluate_colors_adjoint(
-    positions, radiance, views, colors, color_gradients, position_gradients, radiance_gradients, device
+    positions, radiance, views, colors, color_gradients, position_gradients, radiance_gradients, device, moves=None
 ):
-    """Add to the gradients of positions and coefficients, from those of colours."""
+    """Add to the gradients of positions and coefficients, from those of colours.
+
+    Those of the zeros in ``moves``, a camera for every splat, are added to their ``grad``; None leaves cameras out.
+    """
+    kernel = evaluate_colors_kernel if moves is None else evaluate_colors_of_cameras_kernel
     count = len(positions)
     for view in range(len(views)):  # one view at a time: each Gaussian is then added to once a launch, in this order
         launch_adjoint(
-            evaluate_colors_kernel,
+            kernel,
             range(view * count, (view + 1) * count),
-            inputs=[positions, radiance, views],
+            inputs=[positions, radiance, views, *([] if moves is None else [moves])],
             outputs=[colors],
-            input_gradients=[position_gradients, radiance_gradients, None],
+            input_gradients=[position_gradients, radiance_gradients, None, *([] if moves is None else [moves.grad])],
             output_gradients=[color_gradients],
             device=device,
         )

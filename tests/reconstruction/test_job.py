@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from support.leftovers import temporary_of_the_dead
 
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera, read_corrections
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
@@ -180,7 +182,8 @@ class TestOutputs:
 
         monkeypatch.setattr(CaptureRecord, "view", counted)
         reconstruct(capture, tmp_path / "out", FakeSteps())
-        assert len(most) == 2 * 3 * len(FRAMES)  # once to inspect the capture, once for fit, tracking and previews
+        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for its cameras.
+        assert len(most) == 2 * 3 * len(FRAMES) + 3
         gc.collect()
         assert max(most) <= 2 * 3
         assert not alive
@@ -389,3 +392,67 @@ class TestMistakes:
         (tmp_path / "file").write_bytes(b"")
         with pytest.raises(OutputError, match="output folder must be a folder"):
             reconstruct(capture, tmp_path / "file" / "out", FakeSteps())
+
+
+class TestCameras:
+    """What is found about the rig holds for every frame, is kept beside the result, and is not sought twice."""
+
+    RIG = RigCorrection(
+        (
+            CameraCorrection("c0", shift=(0.0, 0.01, 0.0), pixels=0.6, error=0.1),
+            CameraCorrection("c1"),
+            CameraCorrection("c2", is_used=False),
+        ),
+        is_applied=True,
+        confidence=30.0,
+    )
+
+    @pytest.fixture
+    def steps(self):
+        steps = FakeSteps()
+        steps.rig = self.RIG
+        return steps
+
+    def test_frames_are_fitted_with_corrected_cameras(self, capture, steps, tmp_path):
+        found = reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        stated = {record.camera_name: record.camera for record in capture.select(frames={0})}
+        assert steps.refined == [("c0", "c1", "c2")]
+        assert len(steps.cameras) == 2
+        np.testing.assert_allclose(steps.cameras[0].position, stated["c0"].position - 0.01 * down_of(stated["c0"]))
+        np.testing.assert_array_equal(steps.cameras[1].position, stated["c1"].position)
+        used = found.capture.select(frames={0})
+        assert [record.camera_name for record in used] == ["c0", "c1"]
+        np.testing.assert_array_equal(used[0].camera.position, steps.cameras[0].position)
+        assert found.report["cameras"] == self.RIG.as_dict()
+        assert {finding["code"] for finding in found.report["findings"]} >= {"camera-poses", "camera-contradicts"}
+        assert read_corrections(tmp_path / "out") == self.RIG
+
+    def test_a_continued_job_does_not_seek_again(self, capture, steps, tmp_path):
+        reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        again = FakeSteps()
+        found = reconstruct(capture, tmp_path / "out", again, BEGINNING)
+        assert (again.refined, again.calls) == ([], [])
+        assert found.report["cameras"] == self.RIG.as_dict()
+
+    def test_cameras_are_kept_if_asked_for(self, capture, steps, tmp_path):
+        reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        kept = replace(BEGINNING, cameras="keep")
+        found = reconstruct(capture, tmp_path / "out", steps, kept)
+        assert steps.refined == [("c0", "c1", "c2")]
+        assert found.capture is capture
+        assert found.report["cameras"] is None
+        assert read_corrections(tmp_path / "out") is None
+        with pytest.raises(InvalidOptionError, match="cameras must be one of refine, keep, got 'move'"):
+            ReconstructOptions(cameras="move")
+
+    def test_a_rig_that_moves_is_taken_as_it_is(self, capture, steps, tmp_path):
+        moved = [
+            replace(record, camera=moved_camera(record.camera, [0.0] * 5 + [0.1, 0.0])) if record.frame else record
+            for record in capture.records
+        ]
+        reconstruct(Capture(**{**vars(capture), "records": tuple(moved)}), tmp_path / "out", steps, BEGINNING)
+        assert steps.refined == []
+
+
+def down_of(camera):
+    return camera.camera_to_world[:3, 1]

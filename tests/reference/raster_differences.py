@@ -34,6 +34,13 @@ def gradients(scene, upstream, decisions=None):
     return result
 
 
+def camera_gradients(scene, upstream, decisions=None):
+    """Return dL/d(move) of a scene's camera, (N, 12): a row for what it does to each splat; they add up."""
+    frozen = FrozenPairs(scene, upstream, decisions or decide(scene))
+    steps = 1j * STEP * np.eye(12)
+    return np.stack([frozen.derivatives(move=scene.move + step) for step in steps], axis=-1)
+
+
 def random_upstream(rng, scene, decisions):
     """Normal numbers that single precision holds, and 0 on pixels where it may decide otherwise.
 

@@ -28,8 +28,10 @@ class RasterScene:
     low_pass: float = 0.3
     near: float = 0.01
     depth_mode: str = "plane"  # or "exact"
+    move: Any = (0.0,) * 12  # of the camera: turn, shift, focal lengths, principal point, radial terms of a lens
 
     def __post_init__(self):
+        object.__setattr__(self, "move", np.asarray(self.move))
         for name, array in self.arrays().items():
             object.__setattr__(self, name, np.asarray(array, complex if np.iscomplexobj(array) else np.float64))
 
@@ -40,15 +42,21 @@ class RasterScene:
 
     @property
     def focal(self):
-        return np.array([self.camera.focal_x, self.camera.focal_y])
+        return np.array([self.camera.focal_x, self.camera.focal_y]) + self.move[6:8]
 
     @property
     def middle(self):
-        return np.array([self.camera.center_x, self.camera.center_y])
+        return np.array([self.camera.center_x, self.camera.center_y]) + self.move[8:10]
 
     @property
     def to_camera(self):
-        return np.linalg.inv(self.camera.camera_to_world[:3, :3])
+        """World to camera, to first order in the turn, which is all that a complex step sees."""
+        return (np.eye(3) + np.cross(np.eye(3), self.move[:3])) @ np.linalg.inv(self.camera.camera_to_world[:3, :3])
+
+    @property
+    def eye(self):
+        """Where the camera is: the point that goes to the origin of its axes."""
+        return self.camera.position - np.linalg.inv(self.to_camera) @ self.move[3:6]
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,7 @@ class Splats:
     opacity: Any
     whitening: Any  # W in camera axes: Sigma^-1 = W^T W
     ray: Any  # of the centre, z = 1
+    to_ray: Any  # (N, 2, 2): the way from the centre to a pixel, on the plane z = 1
     nearest: Any  # the inverse depths that clamp
     farthest: Any
     normal: Any  # world axes
@@ -80,7 +89,7 @@ class Splats:
 
 
 def local_positions(scene):
-    return (scene.positions - scene.camera.position) @ scene.to_camera.T
+    return (scene.positions - scene.eye) @ scene.to_camera.T
 
 
 def slope_range(scene):
@@ -100,6 +109,8 @@ def see(scene, decisions):
     for axis in range(2):
         jacobian[:, axis, axis] = scene.focal[axis] / z
         jacobian[:, axis, 2] = -scene.focal[axis] * slope[:, axis] / z
+    lens = lens_jacobians(slope, scene.move[10:])
+    jacobian = scene.focal[:, None] * (lens @ (jacobian / scene.focal[:, None]))
     axes = scene.to_camera @ rotations(scene.orientations)
     sigma = np.einsum("nij,nj,nkj->nik", axes, scene.scales**2, axes)
     sharp = jacobian @ sigma @ jacobian.swapaxes(1, 2)
@@ -112,17 +123,32 @@ def see(scene, decisions):
     m = np.einsum("nij,nik,nk->nj", whitening, whitening, ray)  # Sigma^-1 ray
     reach = REACH * np.take_along_axis(scene.scales, decisions.largest[:, None], axis=1)[:, 0]
     return Splats(
-        center=scene.focal * ray[:, :2] + scene.middle,
+        center=scene.focal * ray[:, :2] * lens_growth(slope, scene.move[10:])[:, None] + scene.middle,
         depth=z,
         conic=np.linalg.inv(covariance),
         opacity=opacity,
         whitening=whitening,
         ray=ray,
+        to_ray=np.linalg.inv(scene.focal[:, None] * lens),
         nearest=1.0 / np.where(decisions.near_side, scene.near, z - reach),
         farthest=1.0 / (z + reach),
         normal=-m / length(m) @ scene.to_camera,
         channels=channels(scene, decisions),
     )
+
+
+def lens_growth(rays, radial):
+    """How many times farther from the axis a lens shows a ray, (N,)."""
+    square = dot(rays, rays)
+    return 1.0 + radial[0] * square + radial[1] * square**2
+
+
+def lens_jacobians(rays, radial):
+    """Jacobians of the map that a lens is of the plane z = 1, (N, 2, 2)."""
+    square = dot(rays, rays)
+    outer = rays[:, :, None] * rays[:, None, :]
+    slope = 2.0 * radial[0] + 4.0 * radial[1] * square
+    return lens_growth(rays, radial)[:, None, None] * np.eye(2) + slope[:, None, None] * outer
 
 
 def channels(scene, decisions):
@@ -137,7 +163,7 @@ def channels(scene, decisions):
 
 def shifted_color(scene, visible):
     """Captured colour towards the camera before it is clamped at 0, (N, 3)."""
-    toward = np.where(visible[:, None], scene.positions - scene.camera.position, (0.0, 0.0, 1.0))
+    toward = np.where(visible[:, None], scene.positions - scene.eye, (0.0, 0.0, 1.0))
     degree = round(np.sqrt(scene.radiance.shape[1])) - 1
     return 0.5 + np.einsum("nk,nkc->nc", harmonics(toward / length(toward), degree), scene.radiance)
 
@@ -154,7 +180,8 @@ def ray_forms(scene, splats, i, pixels):
 
     The plane through the centre with normal A c has inverse depth l / z on r.
     """
-    r = np.concatenate([(pixels - scene.middle) / scene.focal, np.ones((len(pixels), 1))], axis=1)
+    way = np.einsum("...ij,...j->...i", splats.to_ray[i], pixels - splats.center[i])
+    r = splats.ray[i] + np.concatenate([way, np.zeros((len(pixels), 1))], axis=1)
     white_r = np.einsum("...ij,...j->...i", splats.whitening[i], r)
     white_c = np.einsum("...ij,...j->...i", splats.whitening, splats.ray)[i]
     facing = dot(white_c, white_c)

@@ -68,17 +68,24 @@ class FakeSteps:
 
     device = "cpu"
     raster = RasterOptions(antialiased=True)
+    rig = None
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
-        self.calls = []
+        self.calls, self.refined, self.cameras = [], [], []
 
     def options(self):
         return {"count": self.count, "seed": self.seed}
 
+    def refine_rig(self, names, views, progress):
+        """What the test says, in ``rig``."""
+        self.refined.append(tuple(names))
+        return self.rig
+
     def begin(self, views, progress):
         level = self.level(views)
         self.calls.append("begin")
+        self.cameras = [view.camera for view in views]
         count = self.count + (5 if level > LOST_LEVEL else 0)  # what is fitted anew has as many as it needs
         noise = np.random.default_rng([self.seed, int(level * 1e6)]).normal(size=(count, 3))
         points, spacing = sphere_points(count)

@@ -51,11 +51,11 @@ def model_frame(
     findings: list[Any] = []
     if previous is not None:
         before, segment = previous
-        track, report = steps.advance(before, views, _within(progress, "track", frame))
+        track, report = steps.advance(before, views, within(progress, "track", frame))
         lost = str(report.get("lost", ""))
         findings = list(report.get("findings", []))
     if track is None or lost:
-        track, report = steps.begin(views, _within(progress, "fit", frame))
+        track, report = steps.begin(views, within(progress, "fit", frame))
         findings += [finding for finding in report.get("findings", []) if finding not in findings]
         segment = frame
     kept = {name: value for name, value in report.items() if name != "seconds"}
@@ -73,7 +73,7 @@ def model_frame(
     )
 
 
-def _within(progress: NotedProgress, stage: str, frame: int) -> StepProgress:
+def within(progress: NotedProgress, stage: str, frame: int) -> StepProgress:
     """Return a reporter of progress inside a frame."""
 
     def report(done: int, total: int, facts: Mapping[str, float] = MappingProxyType({})) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianCloud
@@ -54,6 +55,12 @@ class FrameSteps(Protocol):
 
     def options(self) -> Mapping[str, Any]:
         """Return all that results depend on, but for the device; JSON-able."""
+        ...
+
+    def refine_rig(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> RigCorrection | None:
+        """Find what is wrong with the cameras that these names have and took these views; None for nothing to say."""
         ...
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[FrameTrack, dict[str, Any]]:

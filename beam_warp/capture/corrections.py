@@ -1,0 +1,222 @@
+"""Corrections of a rig's cameras: what they are, how sure, where they are kept, and the capture that they make.
+
+Reconstruction finds them (`beam_warp.reconstruction.rig`) and writes them beside its result, so that whatever goes back
+to the photographs later looks through the cameras that the Gaussians were fitted with. Only training records are
+corrected: a rig's mean holds the world in its place, and what is rendered for other cameras is to be where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.findings import Finding, count_of, names_of
+from beam_warp.capture.inspect import SPLIT
+from beam_warp.capture.records import read_json
+from beam_warp.checks import require_array, require_finite, require_number
+from beam_warp.errors import AssetFormatError, BeamError
+from beam_warp.world.camera import Camera
+
+FILE_NAME = "cameras.json"
+
+MOST_BYTES = 2**26
+"""Most bytes of a file of corrections; a camera has some 500."""
+
+
+@dataclass(frozen=True)
+class CameraCorrection:
+    """A correction of one camera of a rig, the same in all frames.
+
+    Attributes:
+        camera: Name of the camera.
+        turn: Rotation vector in the camera's axes (right, down, forward) [rad], ``(3,)``.
+        shift: Shift in the same axes [m], ``(3,)``: a point p in them comes to be at turn(p) + shift.
+        log_focal: Natural logarithm of the factor of both focal lengths.
+        pixels: How far this moves the surface in the image, root mean square [pixel].
+        error: Standard error of that [pixel]; a bound on it in a rig that the first half of the pixels found sound.
+        psnr: Quality that the camera's image was met with [dB].
+        is_used: False for a camera that could not be reconciled with the others, and is left out.
+    """
+
+    camera: str
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    log_focal: float = 0.0
+    pixels: float = 0.0
+    error: float = 0.0
+    psnr: float = 0.0
+    is_used: bool = True
+
+    def __post_init__(self) -> None:
+        """Check every number once: they come from files too."""
+        for name in ("turn", "shift"):
+            vector = require_array(name, getattr(self, name), (3,), np.float64)
+            require_finite(name, vector)
+            object.__setattr__(self, name, tuple(vector.tolist()))
+        for name, low, high in (("log_focal", -1.0, 1.0), ("pixels", 0.0, 1e6), ("error", 0.0, 1e6)):
+            require_number(name, getattr(self, name), low, high)
+
+    def applied(self, camera: Camera) -> Camera:
+        """Return the corrected camera."""
+        return moved_camera(camera, (*self.turn, *self.shift, self.log_focal))
+
+
+@dataclass(frozen=True)
+class RigCorrection:
+    """Corrections of the cameras of a rig.
+
+    Attributes:
+        cameras: One for each camera, moved or not.
+        is_applied: False where what was found is no more than chance and the method's own error: then nothing moves.
+        confidence: Ratio of the mean squares of what was found and of its standard errors; 0 where it was not needed.
+    """
+
+    cameras: tuple[CameraCorrection, ...]
+    is_applied: bool
+    confidence: float
+
+    @property
+    def pixels(self) -> float:
+        """Root mean square over the cameras of what was found [pixel]."""
+        return _root_mean_square([camera.pixels for camera in self.cameras])
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the cameras of the standard errors [pixel]."""
+        return _root_mean_square([camera.error for camera in self.cameras])
+
+    def corrected(self, records: Sequence[CaptureRecord]) -> tuple[CaptureRecord, ...]:
+        """Return records with their cameras corrected, those of cameras that are left out missing.
+
+        Records of other splits than training, and of cameras that the rig has not, stay as they are.
+        """
+        by_name = {camera.camera: camera for camera in self.cameras}
+        kept = []
+        for record in records:
+            found = by_name.get(record.camera_name) if record.split == SPLIT else None
+            if found is None:
+                kept.append(record)
+            elif found.is_used:
+                kept.append(replace(record, camera=found.applied(record.camera)) if self.is_applied else record)
+        return tuple(kept)
+
+    def capture(self, capture: Capture) -> Capture:
+        """Return the capture with its training cameras corrected."""
+        return Capture(**{**vars(capture), "records": self.corrected(capture.records)})
+
+    def findings(self) -> list[Finding]:
+        """Return what a user should know about the cameras."""
+        found = []
+        moved = [camera for camera in self.cameras if camera.is_used and camera.pixels > 0.0]
+        if self.is_applied and moved:
+            most = max(moved, key=lambda camera: camera.pixels)
+            found.append(
+                Finding(
+                    "warning",
+                    "camera-poses",
+                    f"cameras contradict each other by {self.pixels:.2f} ± {self.error:.2f} pixels, at most "
+                    f"{most.pixels:.2f}, and were moved to agree",
+                    most.camera,
+                    "Calibrate the rig again.",
+                )
+            )
+        left_out = [camera.camera for camera in self.cameras if not camera.is_used]
+        if left_out:
+            found.append(
+                Finding(
+                    "warning",
+                    "camera-contradicts",
+                    f"{count_of(len(left_out), 'camera')} cannot be reconciled with the others, and "
+                    f"{'is' if len(left_out) == 1 else 'are'} left out",
+                    names_of(left_out),
+                    "Check their calibration and their images.",
+                )
+            )
+        return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-able record, which `from_dict` reads."""
+        return {
+            "is_applied": self.is_applied,
+            "confidence": self.confidence,
+            "pixels": self.pixels,
+            "error": self.error,
+            "cameras": [asdict(camera) for camera in self.cameras],
+        }
+
+    @classmethod
+    def from_dict(cls, content: Any, where: Path) -> RigCorrection:
+        """Read what `as_dict` returned.
+
+        Raises:
+            AssetFormatError: A field is missing or out of range.
+        """
+        try:
+            cameras = tuple(CameraCorrection(**camera) for camera in content["cameras"])
+            confidence = require_number("confidence", content["confidence"], 0.0)
+            return cls(cameras, bool(content["is_applied"]), confidence)
+        except (BeamError, KeyError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise AssetFormatError(
+                f"corrections of cameras must be as beam reconstruct wrote them, got {reason} at {where}. Delete the "
+                "file to find them again."
+            ) from error
+
+
+def read_corrections(folder: Path, key: str | None = None) -> RigCorrection | None:
+    """Read the corrections beside a reconstruction.
+
+    Args:
+        folder: Folder of the reconstruction.
+        key: Key of what they must have been found from; None for any.
+
+    Returns:
+        The corrections; None if there are none, or none of that key.
+
+    Raises:
+        AssetFormatError: The file is damaged.
+    """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        return None
+    content = read_json(path, "corrections of cameras", MOST_BYTES)
+    found = RigCorrection.from_dict(content, path)
+    return found if key is None or content.get("key") == key else None
+
+
+def moved_camera(camera: Camera, move: ArrayLike) -> Camera:
+    """Return a camera after a motion in its own axes and a change of its focal lengths.
+
+    Args:
+        camera: The camera.
+        move: Turn [rad], shift [m] and the logarithm of the factor of the focal lengths, ``(7,)``, as in
+            `CameraCorrection`.
+    """
+    numbers = np.asarray(move, np.float64)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:6]
+    factor = float(np.exp(numbers[6]))
+    return replace(
+        camera,
+        focal_x=camera.focal_x * factor,
+        focal_y=camera.focal_y * factor,
+        camera_to_world=camera.camera_to_world @ np.linalg.inv(motion),
+    )
+
+
+def move_between(camera: Camera, other: Camera) -> NDArray[np.float64]:
+    """Return the move, ``(7,)``, with which `moved_camera` makes one camera the other, of the same pixel's shape."""
+    motion = np.linalg.inv(other.camera_to_world) @ camera.camera_to_world
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    return np.array([*turn, *motion[:3, 3], np.log(other.focal_x / camera.focal_x)])
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else 0.0
