@@ -321,6 +321,18 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, NO_SCORE)
+        for name, does in (
+            ("OWN_ERROR", "Correction that may be the method's own error [pixel]."),
+            ("FREEDOM", "Independent numbers that an image tells of its camera."),
+            ("FIELD", "Side of the fields that are fitted apart [pixel]."),
+            ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),
+            ("SHIFT_SHARE", "Steps of shifts over those of turns."),
+            ("MOMENTS", "Decay of the moments of a camera's steps."),
+            ("FAR", "Move after which a level is taken again [pixel]."),
+        )
+    ),
+    *(
         Constant(f"beam_warp.materials.light_turn:{name}", "walker, runner, robot", does, NO_SCORE)
         for name, does in (
             ("TURN_NEIGHBORS", "Neighbours whose base colours are compared."),
@@ -412,6 +424,7 @@ UNTUNED = {
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
+        beam_warp.reconstruction.rig: CHANCE FOCAL_EDGE
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -442,6 +455,7 @@ UNTUNED = {
         beam_warp.reconstruction.gains: LARGEST_SIDE MOST_POINTS DARKEST ROUNDS SETTLED
         beam_warp.reconstruction.hull: MIN_RESOLUTION MAX_RESOLUTION SEARCH_BLOCKS SEARCH_ROUNDS ENOUGH SEARCH_SIDE
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
+        beam_warp.reconstruction.rig: FEWEST_CAMERAS MOST_REPEATS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS SHORTEST_SIDE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING
