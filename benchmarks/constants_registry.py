@@ -20,6 +20,7 @@ JUDGED = "by judgement"
 NO_IMAGES = "the captures have images; it counts only for Gaussians without"
 IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run here"
 LAMPS = "only lamps use it; relit views have none"
+EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
 
@@ -321,7 +322,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, NO_SCORE)
+        Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
         for name, does in (
             ("OWN_ERROR", "Correction that may be the method's own error [pixel]."),
             ("FREEDOM", "Independent numbers that an image tells of its camera."),
@@ -455,7 +456,8 @@ UNTUNED = {
         beam_warp.reconstruction.gains: LARGEST_SIDE MOST_POINTS DARKEST ROUNDS SETTLED
         beam_warp.reconstruction.hull: MIN_RESOLUTION MAX_RESOLUTION SEARCH_BLOCKS SEARCH_ROUNDS ENOUGH SEARCH_SIDE
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
-        beam_warp.reconstruction.rig: FEWEST_CAMERAS MOST_REPEATS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS SHORTEST_SIDE
+        beam_warp.reconstruction.rig: FEWEST_CAMERAS MOST_REPEATS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
+        beam_warp.reconstruction.rig: SHORTEST_SIDE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING
