@@ -131,7 +131,7 @@ def test_halves_share_no_pixel(device):
 
 def errors(given, found, truth, points):
     """How far cameras are from the truth, as far as the gauge lets them: as given, and as found."""
-    exact = in_gauge(given, truth, CENTER)
+    exact = in_gauge(given, truth, points.mean(axis=0))
     after = [correction.applied(camera) for correction, camera in zip(found.cameras, given, strict=True)]
     return [
         np.mean([pixels_between(*pair, points) for pair in zip(cameras, exact, strict=True)])
@@ -156,9 +156,8 @@ def test_moved_cameras_of_a_ball_come_nearer_with_the_same_bits(device, monkeypa
 
 
 @pytest.mark.slow
-def test_cameras_of_a_capture_are_found_again(device, monkeypatch, walker_views, rng):
-    """The coarse level alone, on a painted figure: a third of a pixel and a millimetre become half of it."""
-    monkeypatch.setattr(rig, "LEVELS", rig.LEVELS[:1])
+def test_cameras_of_a_capture_are_found_again(device, walker_views, rng):
+    """A painted figure: of a third of a pixel and a millimetre, more than a third is gone."""
     truth = [view.camera for view in walker_views]
     center = np.array([0.0, 0.0, 1.0])
     turn = 0.3 / truth[0].focal_x
@@ -169,7 +168,7 @@ def test_cameras_of_a_capture_are_found_again(device, monkeypatch, walker_views,
     assert found is not None
     assert found.is_applied
     before, after = errors(given, found, truth, center + rng.uniform(-0.3, 0.3, (200, 3)))
-    assert after < 0.6 * before
+    assert after < 2.0 / 3.0 * before
 
 
 def test_a_sound_rig_stays_to_the_bit_after_one_half(device, monkeypatch):
