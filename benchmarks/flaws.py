@@ -63,7 +63,8 @@ NAMED: Mapping[str, Collection[str]] = {
     "masks": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
-    "wrong-camera": ("sees-nothing",),
+    "poses": ("camera-poses",),
+    "wrong-camera": ("sees-nothing", "camera-contradicts"),
     "missing-image": ("missing-image",),
 }
 """Codes of findings that name a flaw."""

@@ -29,6 +29,9 @@ MAX_CONTAINERS = 2**21
 MAX_RECORDS = 2**22
 """Most images that one capture may have."""
 
+BRIGHTER_THAN_NOISE = 5.0
+"""Least ratio of a backdrop's level to the difference of its neighbouring pixels: that of darkness is about 1."""
+
 ALPHA_ROUNDING = 2.0**-10
 """Largest distance of alpha from [0, 1] that is rounding: a renderer's filter adds two half floats."""
 
@@ -229,13 +232,19 @@ def _is_coverage(alpha: NDArray[np.float32]) -> bool:
 def _scene(image: Image) -> NDArray[np.float32] | None:
     """Return subject and backdrop, scene-linear, ``(H, W, 3)``; None if the image shows the subject alone.
 
-    Straight colour under an alpha of 0 is the backdrop's if it varies: where a subject was cut out, it is constant.
+    Straight colour under an alpha of 0 is the backdrop's if it varies and is brighter than its noise: where a subject
+    was cut out, it is constant, or the noise of a sensor without light.
     """
     alpha = image.alpha
     if alpha is not None and not _is_opaque(alpha):
         if image.premultiplied or not (beyond := image.rgb()[alpha == 0.0]).size:
             return None
         if not (beyond != np.median(beyond, axis=0)).any(axis=-1).mean() > 0.5:
+            return None
+        levels = np.where(alpha == 0.0, image.rgb().mean(axis=-1), np.nan)
+        steps = np.abs(np.diff(levels, axis=1))  # within rows of the backdrop alone
+        noise = np.median(steps[np.isfinite(steps)]) if np.isfinite(steps).any() else np.inf
+        if not np.nanmedian(levels) > BRIGHTER_THAN_NOISE * noise:
             return None
     return _opaque(image).linear_rgba()[..., :3]
 

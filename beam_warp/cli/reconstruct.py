@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp.capture.capture import Capture
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class Modelling:
     cameras: Annotated[
         Literal["refine", "keep"],
         arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
+        SECOND_PAGE,
     ] = "refine"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")

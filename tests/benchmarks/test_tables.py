@@ -141,6 +141,7 @@ DEFINED = (
     "if the last frame is more than 3 dB worse than the first",
     "uncompressed, 64-byte aligned, below 4 GiB",
     "PSNR is more than 6 dB below that of the key frame, which counts as at most 44 dB",
+    "met more than 6 dB worse",
 )
 """Thresholds and closed forms in such units: nothing was measured."""
 

@@ -151,6 +151,19 @@ def test_colour_under_a_clear_alpha_is_the_backdrop(tmp_path):
     np.testing.assert_array_equal(cut.color, masked.color)
 
 
+def test_noise_under_a_clear_alpha_is_no_backdrop(tmp_path):
+    """A sensor's darkness around a subject that was cut out varies from pixel to pixel, and shows no wall."""
+    photographed(tmp_path, {})
+    record = Capture.read(tmp_path).records[0]
+    color, mask = (np.array(PillowImage.open(path)) for path in (record.image_path, record.mask_path))
+    darkness = np.abs(np.random.default_rng(0).normal(0.0, 6.0, color.shape)).astype(np.uint8)
+    PillowImage.fromarray(np.dstack([np.where(mask[..., None] > 0, color, darkness), mask])).save(record.image_path)
+    record.mask_path.unlink()
+    view = Capture.read(tmp_path).records[0].view()
+    assert view.mask_offset is None
+    np.testing.assert_allclose(view.alpha, mask / 255.0, atol=1e-6)
+
+
 def test_plates_stand_in_for_masks(tmp_path):
     content, (rows, _) = photographed(tmp_path, {})
     records = Capture.read(tmp_path).records
