@@ -75,7 +75,7 @@ class BackwardBuffers:
     def resolve(self, gaussians: GaussianArrays, to_cameras: wp.array | None) -> GaussianGradients:
         """Turn sums over pairs into the gradients of Gaussians, and of cameras if they are asked for."""
         if to_cameras is not None and self._cameras is None:
-            self._cameras = CameraBuffers(self._drawn)
+            self._cameras = CameraBuffers(self._drawn, self._splats)
         cameras = None if to_cameras is None else self._cameras
         moves = None if cameras is None else cameras.begin()
         drawn, found, splats, device = self._drawn, self.gaussians, self._splats, self._drawn.device
@@ -87,7 +87,8 @@ class BackwardBuffers:
             inputs = (gaussians.positions, gaussians.radiance, drawn.views)
             colors = (drawn.blocks.colors, self._blocks.colors)
             launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device, moves)
-        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device, moves)
+        tracked = self._tracked if cameras is None else cameras.tracked
+        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, tracked, found[:4], device, moves)
         if cameras is not None:
             launch_sum_cameras(cameras.rows, drawn.splats, cameras.lanes, to_cameras, device)
         return found
@@ -99,11 +100,15 @@ class CameraBuffers:
     Attributes:
         rows: Derivatives to the camera of every splat, ``(V * N, 12)`` float.
         lanes: Parts of their sums.
+        tracked: Splats of their own that carry the gradients of the drawn ones: the adjoint projects anew and writes
+            them, with other roundings than those that were drawn.
     """
 
-    def __init__(self, drawn: FrameBuffers) -> None:
-        """Allocate for a frame."""
+    def __init__(self, drawn: FrameBuffers, gradients: Splats) -> None:
+        """Allocate for a frame, whose splats have these gradients."""
         count, length = drawn.splat_count, len(CAMERA_PARAMETERS)
+        with wp.ScopedDevice(drawn.device):
+            self.tracked = _with_gradients(zero_splats(count), gradients)
         self.rows = wp.zeros((count, length), dtype=float, device=drawn.device)
         self.lanes = wp.zeros((drawn.view_count * LANES, length), dtype=wp.float64, device=drawn.device)
         self._moves = wp.zeros(count, dtype=CameraMove, device=drawn.device)
