@@ -20,7 +20,7 @@ Key = tuple[str, str, float]
 """Capture, name of the flaw, size."""
 
 
-@table("flaws", "flaws_cpu.json")
+@table("flaws", "flaws_h200.json")
 def flaws(result: Row) -> Rows:
     """Return a row for every flaw and size of every capture, means over seeds: the clean ones first, then the worst."""
     head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
@@ -28,7 +28,7 @@ def flaws(result: Row) -> Rows:
     return [head, *(_cells(label, rows) for label, rows in _groups(result))]
 
 
-@table("flaws_recovered", "flaws_cpu.json")
+@table("flaws_recovered", "flaws_h200.json")
 def recovered(result: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
     head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
