@@ -150,6 +150,7 @@ class Layout:
                 self.near.setdefault(above, []).append(under)
                 self.near.setdefault(under, []).append(above)
         self.x: dict[Any, float] = {}
+        self.widths: dict[Any, float] = {}
         for row in self.rows:
             self._place(row, np.zeros(len(row)))
         best = (np.inf, self.rows, self.x)
@@ -168,11 +169,15 @@ class Layout:
 
     def _place(self, row: list[Any], wanted: np.ndarray) -> None:
         """Put a floor's nodes as near to where they should be as boxes beside each other can."""
-        widths = np.array([BOX if isinstance(node, str) else LANE for node in row])
+        boxes = sum(isinstance(node, str) for node in row)
+        most = (WIDTH - 0.9 - LANE * (len(row) - boxes) - GAP * (len(row) - 1)) / max(boxes, 1)
+        box = min(BOX, most)  # a crowded floor has narrower boxes
+        self.widths.update((node, box) for node in row)
+        widths = np.array([box if isinstance(node, str) else LANE for node in row])
         offsets = np.concatenate([[0.0], np.cumsum(0.5 * (widths[:-1] + widths[1:]) + GAP)])
         places = isotonic_regression(wanted - offsets).x + offsets
         half = 0.5 * (WIDTH - 0.9)
-        places = np.clip(places, offsets - half + 0.5 * BOX, offsets - offsets[-1] + half - 0.5 * BOX)
+        places = np.clip(places, offsets - half + 0.5 * box, offsets - offsets[-1] + half - 0.5 * box)
         self.x.update(zip(row, places.tolist(), strict=True))
 
 
@@ -204,14 +209,15 @@ def draw_floors(axes: Any, packages: Packages) -> None:
         )
     for name, height in packages.floor.items():
         x, y = middle + layout.x[name], heights[height]
-        _box(axes, x, y, BOX, box, _color(name))
+        width = layout.widths[name]
+        _box(axes, x, y, width, box, _color(name))
         lines = packages.lines[name]
         size = (
             f"{packages.modules[name]} modules, {lines / 1000.0:.1f}k lines" if name in packages.folders else "1 module"
         )
         label = {"color": INK, "ha": "center", "va": "center", "zorder": 3}
         axes.text(x, y + 0.2 * box, name, fontsize=12.0, fontweight="bold", **label)
-        axes.text(x, y - 0.25 * box, size, fontsize=9.0, **label)
+        axes.text(x, y - 0.25 * box, size, fontsize=9.0 * width / BOX, **label)
 
 
 def draw_way(axes: Any) -> None:
