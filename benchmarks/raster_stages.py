@@ -41,6 +41,7 @@ STAGES = {
     "launch_scatter_channels": "channels adjoint",
     "launch_evaluate_colors_adjoint": "channels adjoint",
     "launch_project_adjoint": "projection adjoint",
+    "launch_sum_cameras": "projection adjoint",
 }
 """Stage of each launcher of the rasteriser."""
 

@@ -12,6 +12,7 @@ def prepare(family: str, folder: Path) -> tuple[Callable[[bytes], None], list[by
 
     The first byte chooses the format, among those of the family in `hostile.corpus.READERS`; the rest is the file.
     """
+    sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))  # the corpus uses a writer of theirs
     from hostile.corpus import READERS
 
     from beam_warp.errors import BeamError

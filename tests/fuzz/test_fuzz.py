@@ -1,6 +1,7 @@
 """A minute of fuzzing for each family of formats, and a check that the targets read what they should."""
 
 import importlib.util
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,9 @@ def test_a_minute_of_fuzzing_finds_nothing(family, tmp_path):
         pytest.skip("atheris is not installed (extra fuzz)")
     script = Path(__file__).with_name(f"{family}.py")
     command = [sys.executable, "-P", str(script), f"-max_total_time={SECONDS}", f"-artifact_prefix={tmp_path}/"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10 * SECONDS, check=False)
+    for _ in range(2):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10 * SECONDS, check=False)
+        if done.returncode != -signal.SIGALRM:  # libFuzzer's own timer ended it, once in a dozen runs: run it again
+            break
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Done" in done.stderr
