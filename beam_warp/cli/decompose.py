@@ -105,6 +105,9 @@ def decompose(args: Decompose) -> int:
         raise InvalidOptionError(
             "capture must be given for the preset paper, got none: it works on images. Name one with --capture."
         )
+    options = run_options(
+        args.measuring, capture, preset=args.preset, seed=args.seed, device=args.device, persistent=False
+    )
     environment = EnvironmentMap.read(light_of(args.measuring, capture, args.sequence)).rotated(args.measuring.rotate)
     sequence = converters.read(args.sequence)
 
@@ -115,9 +118,7 @@ def decompose(args: Decompose) -> int:
             sequence,
             environment,
             args.out,
-            run_options(
-                args.measuring, capture, preset=args.preset, seed=args.seed, device=args.device, persistent=False
-            ),
+            options,
             capture=capture,
             overview=overview_options(args.measuring),
             progress=report,
