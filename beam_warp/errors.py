@@ -38,3 +38,7 @@ class MissingFileError(BeamError, FileNotFoundError):
 
 class OutputError(BeamError, OSError):
     """An output could not be written; no partial output is left behind."""
+
+
+class UnfinishedError(BeamError, RuntimeError):
+    """Steps of a long job failed for good; all that do not need them are done and kept."""

@@ -1,0 +1,157 @@
+"""Which step is next: steps whose inputs are done, those that finish frames before those that start them.
+
+A step that fails is tried once more, and is then given up: what needs it is left undone, and the rest goes on. A step
+whose worker ended is no failure at first, for machines and processes are killed for reasons of their own. A step whose
+output was found damaged is done again, and what needs it waits.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable
+from enum import Enum
+
+from beam_warp.errors import InvalidOptionError
+from beam_warp.plan.steps import Step
+
+FAILURES = 2
+"""A step that failed so often is given up."""
+
+LOSSES = 10
+"""A step that lost its worker so often is given up: it is likely the reason."""
+
+REPEATS = 3
+"""A step is done again so often because its output is damaged; then it is given up, for the disk is not to be relied on."""
+
+
+class State(Enum):
+    """What became of a step so far; its value is its word for people."""
+
+    WAITING = "waiting"
+    READY = "ready"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    LEFT = "left out"
+
+
+class Schedule:
+    """The state of every step of a plan.
+
+    Attributes:
+        steps: By name.
+        states: By name.
+        counts: How many steps are in each state.
+    """
+
+    def __init__(self, steps: Iterable[Step]) -> None:
+        """Start with nothing done.
+
+        Raises:
+            InvalidOptionError: A step's name is not its own, or an input is none of the steps.
+        """
+        given = tuple(steps)
+        self.steps = {step.name: step for step in given}
+        absent = [name for step in given for name in step.inputs if name not in self.steps]
+        if absent or len(self.steps) < len(given):
+            raise InvalidOptionError(
+                "steps must have names of their own and inputs among them, got "
+                f"{absent[0] if absent else 'a name twice'}. Mend the plan."
+            )
+        self.states = dict.fromkeys(self.steps, State.WAITING)
+        self.counts = {state: len(given) if state is State.WAITING else 0 for state in State}
+        self._order = {
+            step.name: (-step.rank, -1 if step.frame is None else step.frame, place) for place, step in enumerate(given)
+        }
+        self._dependents: dict[str, list[str]] = {name: [] for name in self.steps}
+        self._open = {step.name: len(set(step.inputs)) for step in given}
+        self._tries: dict[tuple[str, str], int] = {}
+        self._ready: list[tuple[tuple[int, int, int], str]] = []
+        for step in given:
+            for name in set(step.inputs):
+                self._dependents[name].append(step.name)
+        for name, count in self._open.items():
+            if count == 0:
+                self._enqueue(name)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing can be done any more."""
+        return not any(self.counts[state] for state in (State.READY, State.RUNNING))
+
+    def next(self) -> Step | None:
+        """Take the step to be done next; None where all that is left waits for others."""
+        while self._ready:
+            _, name = heapq.heappop(self._ready)
+            if self.states[name] is State.READY:
+                self._set(name, State.RUNNING)
+                return self.steps[name]
+        return None
+
+    def likely_after(self, step: Step) -> Step | None:
+        """Return the step that is likely to follow a running one: the first of what waits for it alone, and of all."""
+        freed = [name for name in self._dependents[step.name] if self._open[name] == 1]
+        queued = [name for _, name in self._ready[:1] if self.states[name] is State.READY]
+        first = min(freed + queued, key=self._order.__getitem__, default=None)
+        return None if first is None else self.steps[first]
+
+    def done(self, name: str) -> None:
+        """Note that a step is done."""
+        if self.states[name] is State.DONE:
+            return
+        self._set(name, State.DONE)
+        for dependent in self._dependents[name]:
+            self._open[dependent] -= 1
+            if self._open[dependent] == 0 and self.states[dependent] is State.WAITING:
+                self._enqueue(dependent)
+
+    def failed(self, name: str, *, is_final: bool = False) -> bool:
+        """Note that a step failed; return whether it is given up."""
+        return self._try_again(name, "failures", 1 if is_final else FAILURES)
+
+    def lost(self, name: str) -> bool:
+        """Note that a step's worker ended; return whether it is given up."""
+        return self._try_again(name, "losses", LOSSES)
+
+    def again(self, name: str) -> bool:
+        """Note that a step's output is damaged, so that it is to be done again; return whether it is given up."""
+        if self.states[name] is State.DONE:
+            for dependent in self._dependents[name]:
+                self._open[dependent] += 1
+                if self.states[dependent] is State.READY:
+                    self._set(dependent, State.WAITING)
+            return self._try_again(name, "repeats", REPEATS + 1)
+        return False
+
+    def wait(self, name: str) -> None:
+        """Put a step that ran back, to be done when its inputs are."""
+        self._set(name, State.WAITING)
+        if self._open[name] == 0:
+            self._enqueue(name)
+
+    def _try_again(self, name: str, what: str, limit: int) -> bool:
+        self._tries[name, what] = self._tries.get((name, what), 0) + 1
+        if self._tries[name, what] < limit:
+            self.wait(name)
+            return False
+        self._set(name, State.FAILED)
+        self._leave_out(name)
+        return True
+
+    def _leave_out(self, name: str) -> None:
+        """Give up what needs a step."""
+        open_names = [name]
+        while open_names:
+            for dependent in self._dependents[open_names.pop()]:
+                if self.states[dependent] in (State.WAITING, State.READY):
+                    self._set(dependent, State.LEFT)
+                    open_names.append(dependent)
+
+    def _enqueue(self, name: str) -> None:
+        self._set(name, State.READY)
+        heapq.heappush(self._ready, (self._order[name], name))
+
+    def _set(self, name: str, state: State) -> None:
+        self.counts[self.states[name]] -= 1
+        self.counts[state] += 1
+        self.states[name] = state

@@ -1,0 +1,388 @@
+"""Who does the steps of a plan: this process, or processes of this machine; `beam_warp.plan.cluster` has several machines.
+
+All are driven in the same way: `Workers.start` gives one of them a task, `Workers.wait` returns what became of those
+that were given. A process that ends costs its task a try and is replaced.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import queue
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any, Protocol
+
+from beam_warp.digests import code_digest
+from beam_warp.errors import BeamError, InvalidOptionError, OutputError
+from beam_warp.outputs import remove_leftovers
+from beam_warp.plan.steps import NotedProgress, Receipt, Task, Work, perform, worker_name
+
+OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
+"""Signals that come from outside; the others a process owes to what it does."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task.
+
+    Attributes:
+        name: Name of its step.
+        worker: Who had it.
+        receipt: Its receipt, if it is done.
+        error: What it raised, if it failed.
+        lost: How its worker ended, if it did.
+        is_own_fault: Whether the worker ended by what it did, rather than from outside.
+    """
+
+    name: str
+    worker: str
+    receipt: Receipt | None = None
+    error: Exception | None = None
+    lost: str = ""
+    is_own_fault: bool = False
+
+
+class Workers(Protocol):
+    """Workers that do steps.
+
+    Attributes:
+        count: How many there are, or are to be.
+    """
+
+    count: int
+
+    def idle(self) -> int:
+        """Return how many could be given a task."""
+        ...
+
+    def start(self, task: Task) -> str:
+        """Give a task to an idle worker; return the worker's name."""
+        ...
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """Return what became of some tasks, after at most a time [s].
+
+        Raises:
+            BeamError: No worker can do such work: the message says why.
+        """
+        ...
+
+    def end(self, name: str) -> None:
+        """End the worker that does a step; `wait` then says that it is lost."""
+        ...
+
+    def now(self) -> float:
+        """Return the time on the workers' clock [s]."""
+        ...
+
+    def close(self) -> None:
+        """End all workers."""
+        ...
+
+
+class InProcess:
+    """This process does every step, one after the other. It cannot survive a step that ends it, nor end one."""
+
+    count = 1
+
+    def __init__(self, works: Mapping[str, Work], progress: NotedProgress) -> None:
+        """Take what is done, and who is told how far it is."""
+        self._works, self._progress = works, progress
+        self._task: Task | None = None
+
+    def idle(self) -> int:
+        """Return 1, unless a task is to be done."""
+        return int(self._task is None)
+
+    def start(self, task: Task) -> str:
+        """Take a task, which `wait` does."""
+        self._task = task
+        return worker_name()
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """Do the task."""
+        task, self._task = self._task, None
+        if task is None:
+            return []
+        try:
+            return [Outcome(task.step.name, worker_name(), perform(self._works, task, self._progress))]
+        except Exception as error:
+            return [Outcome(task.step.name, worker_name(), error=error)]
+
+    def end(self, name: str) -> None:
+        """Do nothing: whoever asks is the one."""
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        return time.monotonic()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a worker must have, to give the bytes that this process would.
+
+    Attributes:
+        folder: Folder that it must see.
+        token: Name of a file in it, whose existence proves that.
+        device: Kind of device, "cuda" or "cpu"; empty for work without one.
+        code: Digest of the code.
+    """
+
+    folder: str
+    token: str
+    device: str
+    code: str
+
+    @classmethod
+    def of(cls, folder: Path, device: str) -> Terms:
+        """Return what workers must have for work in a folder; the folder's token is made."""
+        name = f"shared-{os.urandom(8).hex()}"
+        (folder / name).touch()
+        return cls(str(folder), name, device, code_digest())
+
+    def withdraw(self) -> None:
+        """Remove the token."""
+        (Path(self.folder) / self.token).unlink(missing_ok=True)
+
+    def require(self) -> None:
+        """Refuse a worker that lacks something; it calls this itself.
+
+        Raises:
+            InvalidOptionError: The message says what.
+        """
+        said = f"on {worker_name().split(':')[0]}"
+        if (here := code_digest()) != self.code:
+            raise InvalidOptionError(
+                f"workers must run this version of beam-warp, got other code {said} ({here[:8]}, not {self.code[:8]}). "
+                "Install the same there."
+            )
+        if self.device == "cuda":
+            import warp as wp
+
+            if not wp.is_cuda_available():
+                raise InvalidOptionError(f"workers must have a GPU, got none {said}. Add one, or use --device cpu.")
+        try:
+            wait_for_token(Path(self.folder) / self.token)
+        except OSError:
+            raise OutputError(
+                f"out must be a folder that all workers share, got {self.folder}, which is another or none {said}. "
+                "Choose one on a shared disk."
+            ) from None
+
+
+def wait_for_token(path: Path, patience: float = 5.0) -> None:
+    """Wait until an empty file is visible.
+
+    Raises:
+        OSError: It is not, after a time [s].
+    """
+    end = time.monotonic() + patience
+    while True:
+        try:
+            os.scandir(path.parent).close()
+            path.stat()
+            return
+        except OSError:
+            if time.monotonic() >= end:
+                raise
+            time.sleep(0.1)
+
+
+class Processes:
+    """Processes of this machine, one for each entry of ``settings``; one that ends is replaced."""
+
+    def __init__(self, works: Mapping[str, Work], terms: Terms, settings: Sequence[Mapping[str, str]]) -> None:
+        """Start the processes.
+
+        Args:
+            works: What does the steps of each stage; picklable.
+            terms: What each must have.
+            settings: Environment variables of each.
+
+        Raises:
+            InvalidOptionError: The work cannot be sent to another process.
+        """
+        self.count = len(settings)
+        self._terms = terms
+        self._context = multiprocessing.get_context("spawn")
+        try:
+            self._works = pickle.dumps((dict(works), terms))
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            raise InvalidOptionError(
+                f"work must be picklable to be sent to other processes, got {error}. Pass paths, or use one process."
+            ) from error
+        self._members = [self._member(setting) for setting in settings]
+
+    def idle(self) -> int:
+        """Return how many have nothing to do and have said that they are ready."""
+        return sum(member.is_ready and member.task is None for member in self._members)
+
+    def start(self, task: Task) -> str:
+        """Give a task to an idle process."""
+        member = next(member for member in self._members if member.is_ready and member.task is None)
+        member.task = task
+        with suppress(OSError):  # it has ended; `wait` finds out
+            member.link.send(task)
+        return member.name
+
+    def wait(self, seconds: float) -> list[Outcome]:
+        """Return what was said, or ended, within a time."""
+        found: list[Outcome] = []
+        links = {member.link: member for member in self._members}
+        for link in connection.wait(list(links), seconds):
+            found += self._hear(links[link])
+        return found
+
+    def end(self, name: str) -> None:
+        """Kill the process that does a step."""
+        for member in self._members:
+            if member.task is not None and member.task.step.name == name:
+                member.process.kill()
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        return time.monotonic()
+
+    def close(self) -> None:
+        """Kill all processes."""
+        for member in self._members:
+            member.process.kill()
+        for member in self._members:
+            member.process.join()
+            member.link.close()
+        self._terms.withdraw()
+
+    def processes(self) -> list[int]:
+        """Return the numbers of the processes that live, for tests that kill some."""
+        return [member.process.pid or 0 for member in self._members if member.process.is_alive()]
+
+    def _member(self, setting: Mapping[str, str]) -> _Member:
+        here, there = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(there, dict(setting)), daemon=True)
+        process.start()
+        there.close()
+        with suppress(OSError):
+            here.send_bytes(self._works)
+        return _Member(process, here, setting)
+
+    def _hear(self, member: _Member) -> list[Outcome]:
+        """Take what a process says; replace it if it has ended."""
+        try:
+            said = member.link.recv()
+        except (EOFError, OSError, pickle.UnpicklingError):
+            return self._replace(member)
+        if isinstance(said, BeamError):  # it cannot do such work, and neither can another one in its place
+            raise said
+        if said is not None:
+            member.task = None
+            return [said]
+        member.is_ready = True
+        return []
+
+    def _replace(self, member: _Member) -> list[Outcome]:
+        member.process.kill()
+        member.process.join()
+        member.link.close()
+        self._members[self._members.index(member)] = self._member(member.setting)
+        code = member.process.exitcode or 0
+        if not member.is_ready and -code not in OUTSIDE_SIGNALS:
+            raise InvalidOptionError(
+                f"workers must start, got one that ended at once ({_ended(code)}). Try --workers 1 to see why."
+            )
+        if member.task is None:
+            return []
+        own = -code not in OUTSIDE_SIGNALS
+        return [Outcome(member.task.step.name, member.name, lost=_ended(code), is_own_fault=own)]
+
+
+@dataclass(eq=False)
+class _Member:
+    """A process, the link to it, and what it was given."""
+
+    process: Any
+    link: Any
+    setting: Mapping[str, str]
+    task: Task | None = None
+    is_ready: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{worker_name().split(':')[0]}:{self.process.pid}"
+
+
+def _ended(code: int) -> str:
+    """Return in words how a process ended, given its exit code."""
+    if code < 0:
+        with suppress(ValueError):
+            return f"killed by {signal.Signals(-code).name}"
+    return f"exit code {code}"
+
+
+def _serve(link: Any, setting: Mapping[str, str]) -> None:
+    """Do what the driver asks until it ends; the first message is the work, which is unpickled after the settings."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver hears it, and ends this process
+    os.environ.update(setting)
+    tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    packed = link.recv_bytes()
+    threading.Thread(target=_listen, args=(link, tasks), daemon=True).start()
+    works, terms = pickle.loads(packed)
+    try:
+        prepare(works, terms)
+    except BeamError as error:
+        link.send(error)
+        return
+    link.send(None)
+    while True:
+        link.send(attempt(works, tasks.get()))
+
+
+def _listen(link: Any, tasks: queue.SimpleQueue[Any]) -> None:
+    """Take tasks; without a driver, end at once, whatever is being done: another one may do it anew."""
+    try:
+        while True:
+            tasks.put(link.recv())
+    except (EOFError, OSError):
+        os._exit(1)
+
+
+def prepare(works: Mapping[str, Work], terms: Terms) -> None:
+    """Make a worker ready: check what it must have, and remove what killed processes of this machine have left.
+
+    Raises:
+        BeamError: It lacks something.
+    """
+    terms.require()
+    for folder in {work.folder for work in works.values()}:
+        remove_leftovers(folder, *filter(Path.is_dir, folder.iterdir()))
+
+
+def attempt(works: Mapping[str, Work], task: Task) -> Outcome:
+    """Do a task, and return what became of it in a form that can be sent."""
+    try:
+        return Outcome(task.step.name, worker_name(), perform(works, task, lambda *step, **facts: None))
+    except Exception as error:
+        return Outcome(task.step.name, worker_name(), error=sendable(error))
+
+
+def sendable(error: Exception) -> Exception:
+    """Return an error that can be pickled, with its traceback as a note."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        error = RuntimeError(f"{type(error).__name__}: {error}")
+    error.__traceback__ = error.__cause__ = error.__context__ = None
+    error.add_note(text)
+    return error

@@ -1,0 +1,275 @@
+"""Plans of steps that cost nothing: order, faults, kills, and the same bytes whoever does the work."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from support.toy_work import toy_plan
+
+from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
+from beam_warp.plan.carry import Patience, carry_out, read_plan
+from beam_warp.plan.schedule import Schedule, State
+from beam_warp.plan.steps import Step, Task, is_whole, perform, read_receipt, wait_for
+from beam_warp.plan.workers import InProcess, Processes, Terms
+
+
+def nobody(*step, **facts):
+    """Hear nothing."""
+
+
+def here(plan, **options):
+    return carry_out(plan, InProcess(plan.works, nobody), **options)
+
+
+def processes(plan, count=2):
+    return Processes(plan.works, Terms.of(plan.folder, ""), [{}] * count)
+
+
+def outputs(folder):
+    return {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+
+
+def calls(plan):
+    return plan.works["frame"].calls()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Outputs of a plan that one process carried out without a stop."""
+    folder = tmp_path_factory.mktemp("whole")
+    here(toy_plan(folder))
+    return outputs(folder)
+
+
+class TestOrder:
+    def test_frames_are_finished_before_others_are_begun(self, tmp_path):
+        plan = toy_plan(tmp_path, 4, 2)
+        here(plan)
+        assert calls(plan) == [
+            *("cameras", "frame-0", "light", "materials-0", "frame-1", "materials-1"),
+            *("frame-2", "materials-2", "frame-3", "materials-3"),
+        ]
+
+    def test_what_is_likely_next_is_next(self, tmp_path):
+        schedule, guessed = Schedule(toy_plan(tmp_path, 6, 3).steps), None
+        while not schedule.is_over:
+            step = schedule.next()
+            assert guessed in (None, step)
+            guessed = schedule.likely_after(step)
+            schedule.done(step.name)
+        assert guessed is None
+
+    @pytest.mark.parametrize("steps", [[Step("a", "s"), Step("a", "s")], [Step("a", "s", None, ("b",))]])
+    def test_graphs_that_are_none(self, steps):
+        with pytest.raises(InvalidOptionError, match="steps must have names of their own"):
+            Schedule(steps)
+
+    def test_what_needs_a_step_that_failed_is_left_out(self):
+        schedule = Schedule([Step("a", "s"), Step("b", "s", None, ("a",)), Step("c", "s", None, ("b",)), Step("d", "s")])
+        assert schedule.next().name == "a"
+        assert not schedule.failed("a")
+        assert schedule.next().name == "a"
+        assert schedule.failed("a")
+        assert [schedule.states[name] for name in "abcd"] == [State.FAILED, State.LEFT, State.LEFT, State.READY]
+
+
+class TestKeys:
+    def test_nothing_is_done_twice(self, tmp_path):
+        plan = toy_plan(tmp_path)
+        first, again = here(plan), here(plan)
+        assert len(calls(plan)) == len(plan.steps)
+        assert all(receipt.is_kept for receipt in again.values())
+        assert {name: receipt.key for name, receipt in first.items()} == {name: again[name].key for name in again}
+
+    def test_other_options_start_over(self, tmp_path):
+        here(toy_plan(tmp_path, 4))
+        other = here(toy_plan(tmp_path, 4, options="other"))
+        assert not any(receipt.is_kept for receipt in other.values())
+
+    def test_a_changed_image_costs_its_frame_and_what_follows(self, tmp_path, monkeypatch):
+        plan = toy_plan(tmp_path, 10)
+        here(plan)
+        work = plan.works["frame"]
+        monkeypatch.setattr(type(work), "digest", lambda self, step: f"image {step.frame}{' new' * (step.frame == 8)}")
+        made = {name for name, receipt in here(plan).items() if not receipt.is_kept}
+        assert made == {"frame-8", "materials-8", "frame-9", "materials-9"}
+
+    @pytest.mark.parametrize("harm", ["gone", "cut", "spoiled", "receipt"])
+    def test_what_is_damaged_is_made_again_and_nothing_else(self, tmp_path, whole, harm):
+        plan = toy_plan(tmp_path)
+        here(plan)
+        path = tmp_path / "out" / "frame-7.bin"
+        content = path.read_bytes()
+        if harm == "gone":
+            path.unlink()
+        elif harm == "receipt":
+            (tmp_path / "steps" / "frame-7.json").write_text('{"key": 3}')
+        else:
+            path.write_bytes(content[:-1] if harm == "cut" else b"x" + content[1:])
+        assert [name for name, receipt in here(plan).items() if not receipt.is_kept] == ["frame-7"]
+        assert outputs(tmp_path) == whole
+
+    def test_an_input_that_rots_unseen_is_made_again_when_it_is_read(self, tmp_path, whole):
+        """Same size and time, other bytes: who reads it fails, which is no fault of its own."""
+        plan = toy_plan(tmp_path)
+        here(plan)
+        path = tmp_path / "out" / "frame-7.bin"
+        before = path.stat()
+        path.write_bytes(b"x" + path.read_bytes()[1:])
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        (tmp_path / "out" / "materials-7.bin").unlink()
+        here(plan)
+        assert outputs(tmp_path) == whole
+
+
+class TestFaults:
+    def test_a_poisoned_frame_is_tried_twice_and_the_rest_goes_on(self, tmp_path, whole):
+        plan = toy_plan(tmp_path, faults={"frame-8": "raise", "materials-2": "raise once"})
+        with pytest.raises(UnfinishedError, match=r"1 of 42 that failed twice \(frame-8: ValueError: a poisoned frame\)"):
+            here(plan)
+        assert calls(plan).count("frame-8") == calls(plan).count("materials-2") == 2
+        assert whole.keys() - outputs(tmp_path).keys() == {f"{s}-{f}.bin" for f in (8, 9) for s in ("frame", "materials")}
+        assert "poisoned" in (tmp_path / "plan" / "frame-8.txt").read_text()
+        assert read_plan(tmp_path)[2]["given_up"] == ["frame-8"]
+        here(toy_plan(tmp_path))
+        assert outputs(tmp_path) == whole
+
+    def test_nothing_goes_on_without_what_all_need(self, tmp_path):
+        plan = toy_plan(tmp_path, faults={"light": "raise"})
+        with pytest.raises(ValueError, match="poisoned"):
+            here(plan)
+        assert calls(plan) == ["cameras", "frame-0", "light", "light"]
+
+    def test_a_full_disk_ends_the_job_at_once(self, tmp_path):
+        plan = toy_plan(tmp_path, faults={"frame-3": "full"})
+        with pytest.raises(OutputError, match="No space left"):
+            here(plan)
+        assert "frame-4" not in calls(plan)
+
+    def test_files_that_appear_late_are_waited_for(self, tmp_path):
+        late = tmp_path / "late"
+        threading.Timer(0.3, late.write_bytes, (b"1234",)).start()
+        wait_for([(str(late), 4)], patience=10.0)
+        with pytest.raises(OSError, match="must be visible to all workers, got none of 5 bytes"):
+            wait_for([(str(late), 5)], patience=0.2)
+
+    def test_receipts_prove_the_bytes(self, tmp_path):
+        plan = toy_plan(tmp_path, 1)
+        step, work = plan.steps[0], plan.works["frame"]
+        receipt = perform(plan.works, Task(step), nobody)
+        assert read_receipt(work, step) == receipt
+        assert is_whole(work, receipt, is_read=True)
+        assert not is_whole(work, replace(receipt, outputs={"out/other.bin": (1, 2, "3")}))
+
+
+class TestProcesses:
+    def test_the_same_bytes_as_one_process(self, tmp_path, whole):
+        plan = toy_plan(tmp_path, seconds=0.1)
+        receipts = carry_out(plan, processes(plan))
+        assert outputs(tmp_path) == whole
+        assert len({receipt.worker for receipt in receipts.values()}) == 2
+        assert not [path for path in tmp_path.iterdir() if path.name.startswith("shared-")]
+
+    def test_faults_of_every_kind(self, tmp_path, whole):
+        """Killed from outside, ended by what it does, hanging: each costs a try; who does so always is given up."""
+        faults = {"frame-1": "kill once", "frame-6": "exit once", "materials-6": "hang once", "materials-3": "hang"}
+        plan = toy_plan(tmp_path, faults=faults | {"materials-9": "exit", "frame-11": "raise"})
+        heard = []
+        with pytest.raises(UnfinishedError, match="got 3 of 42 that failed twice"):
+            carry_out(plan, processes(plan), lambda step, receipt, error: heard.append(error), Patience(20.0, 1.0, 1.0))
+        lost = {f"frame-{frame}.bin" for frame in range(11, 15)} | {f"materials-{f}.bin" for f in (3, 9, *range(11, 15))}
+        assert whole.keys() - outputs(tmp_path).keys() == lost
+        for said, count in (("SIGKILL", 1), ("exit code 3", 3), ("took more than", 3), ("poisoned", 2)):
+            assert sum(said in error for error in heard) == count, said
+
+    def test_work_that_cannot_be_sent(self, tmp_path):
+        plan = toy_plan(tmp_path, 1, faults={"frame-0": lambda: None})
+        with pytest.raises(InvalidOptionError, match="work must be picklable"):
+            processes(plan)
+
+    @pytest.mark.parametrize(
+        ("changed", "says"),
+        [
+            ({"code": "0" * 32}, "workers must run this version of beam-warp, got other code"),
+            ({"device": "cuda"}, "workers must have a GPU, got none"),
+            ({"token": "no such file"}, "out must be a folder that all workers share"),
+        ],
+    )
+    def test_workers_that_would_give_other_bytes(self, tmp_path, changed, says):
+        if changed.get("device") and Path("/dev/nvidia0").exists():
+            pytest.skip("this machine has a GPU")
+        plan = toy_plan(tmp_path, 1)
+        workers = Processes(plan.works, replace(Terms.of(tmp_path, ""), **changed), [{}])
+        with pytest.raises((InvalidOptionError, OutputError), match=says):
+            carry_out(plan, workers)
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from support.toy_work import toy_plan
+from beam_warp.plan.carry import carry_out
+from beam_warp.plan.workers import InProcess, Processes, Terms
+
+if __name__ == "__main__":
+    folder, count = Path(sys.argv[1]), int(sys.argv[2])
+    plan = toy_plan(folder, seconds=0.04)
+    few = InProcess(plan.works, lambda *step, **facts: None)
+    carry_out(plan, Processes(plan.works, Terms.of(folder, ""), [{}] * count) if count > 1 else few)
+"""
+
+
+def begun(folder):
+    """How often a step was begun."""
+    return (folder / "calls.txt").read_text().count("\n") if (folder / "calls.txt").exists() else 0
+
+
+def kill_one(driver, rng):
+    """Kill a driver, or twice as likely one of its workers; return how many were there to be killed."""
+    with suppress(psutil.NoSuchProcess):
+        workers = [it for it in psutil.Process(driver).children() if "spawn_main" in str(it.cmdline())]
+        rng.choice([psutil.Process(driver), *workers, *workers]).kill()
+        return 1
+    return 0
+
+
+def storm(folder, kills, workers, seed):
+    """Carry plans of 20 frames out while random processes are killed, the driver too; yield the folder of each."""
+    rng, script, killed = random.Random(seed), folder / "driver.py", 0
+    script.write_text(DRIVER)
+    paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
+    while killed < kills:
+        (out := folder / f"after {killed} kills").mkdir()
+        code, seen = None, 0
+        while code != 0:
+            arguments = [sys.executable, "-P", str(script), str(out), str(workers)]
+            driver = subprocess.Popen(arguments, env={**os.environ, "PYTHONPATH": paths})
+            while (code := driver.poll()) is None:
+                if (count := begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
+                    seen = count
+                    time.sleep(rng.uniform(0.0, 0.06))
+                    killed += kill_one(driver.pid, rng)
+                time.sleep(0.005)
+            assert code in (0, -signal.SIGKILL)
+        yield out
+
+
+@pytest.mark.parametrize(
+    ("kills", "workers"),
+    [(5, 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((30, 1), (100, 3)))],
+)
+def test_a_storm_of_kills_changes_no_byte(tmp_path, whole, kills, workers):
+    """Workers and drivers are killed at random, whatever they are at: in the end all is there, and nothing else."""
+    for out in storm(tmp_path, kills, workers, seed=kills):
+        assert outputs(out) == whole
+        here(toy_plan(out))
+        assert not [path for path in out.rglob(".*")]
