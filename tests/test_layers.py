@@ -14,7 +14,7 @@ FLOORS = """
 errors checks digests archives blocks outputs kernels
 image device
 world
-light schema jobs
+light schema jobs plan
 trace converters
 raster capture
 mesh render interop
@@ -51,6 +51,7 @@ WITHOUT_WARP = {
     "archives",
     "blocks",
     "outputs",
+    "plan",
     "image",
     "world",
     "schema",

@@ -170,15 +170,14 @@ class RigCorrection:
             ) from error
 
 
-def read_corrections(folder: Path, key: str | None = None) -> RigCorrection | None:
+def read_corrections(folder: Path) -> RigCorrection | None:
     """Read the corrections beside a reconstruction.
 
     Args:
         folder: Folder of the reconstruction.
-        key: Key of what they must have been found from; None for any.
 
     Returns:
-        The corrections; None if there are none, or none of that key.
+        The corrections; None if there are none.
 
     Raises:
         AssetFormatError: The file is damaged.
@@ -187,8 +186,7 @@ def read_corrections(folder: Path, key: str | None = None) -> RigCorrection | No
     if not path.is_file():
         return None
     content = read_json(path, "corrections of cameras", MOST_BYTES)
-    found = RigCorrection.from_dict(content, path)
-    return found if key is None or content.get("key") == key else None
+    return RigCorrection.from_dict(content, path)
 
 
 def moved_camera(camera: Camera, move: ArrayLike) -> Camera:

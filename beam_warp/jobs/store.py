@@ -1,12 +1,11 @@
-"""Store of finished frames: one HDF5 file a frame, written whole or not at all, from which a stopped job continues.
+"""Store of finished frames: one HDF5 file a frame, written whole or not at all. Workers never share a file.
 
-Workers never share a file, and a killed one costs a frame. A file carries the key of what it was computed from. A
-reader compares that key, so a stale file is never taken for a fresh one.
+What a file was computed from, the receipt of its step says (`beam_warp.plan.steps`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from beam_warp.errors import AssetFormatError, OutputError
 from beam_warp.outputs import replacing
 
-KEY, CHECKSUM = "beam_key", "crc32"
+CHECKSUM = "crc32"
 
 
 def make_folders(out: Path, *names: str) -> list[Path]:
@@ -38,28 +37,18 @@ def make_folders(out: Path, *names: str) -> list[Path]:
     return folders
 
 
-def write_frame(path: Path, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a frame's arrays under a key.
+def write_frame(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a frame's arrays.
 
     Raises:
         OutputError: The file cannot be written; nothing is left behind.
     """
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs[KEY] = key
         for name, array in arrays.items():
             data = np.asarray(array, order="C")
             file.create_dataset(name, data=data, track_times=False).attrs[CHECKSUM] = _checksum(
                 data
             )  # same bytes again
-
-
-def frame_key(path: Path) -> str | None:
-    """Return the key of a stored frame; None if there is no whole file."""
-    try:
-        with h5py.File(path, "r") as file:
-            return str(file.attrs[KEY])
-    except (OSError, KeyError, RuntimeError, ValueError):
-        return None
 
 
 def frame_names(path: Path) -> tuple[str, ...]:
@@ -95,14 +84,3 @@ def _checked(dataset: Any) -> NDArray[Any]:
     if _checksum(np.ascontiguousarray(array)) != dataset.attrs[CHECKSUM]:
         raise ValueError(f"another checksum of {dataset.name[1:]}")
     return array
-
-
-def kept_frame(path: Path, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Return the arrays stored under a key; where there are none, make and store them first.
-
-    Raises:
-        OutputError: The file cannot be written; nothing is left behind.
-    """
-    if frame_key(path) != key:
-        write_frame(path, key, make())
-    return read_frame(path)

@@ -21,7 +21,18 @@ from typing import Any, Protocol
 
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError, UnfinishedError
 from beam_warp.plan.schedule import Schedule, State
-from beam_warp.plan.steps import Plan, Receipt, Step, Task, awaited_files, is_whole, receipt_path, worker_name, write_record
+from beam_warp.plan.steps import (
+    NotedProgress,
+    Plan,
+    Receipt,
+    Step,
+    Task,
+    awaited_files,
+    is_whole,
+    receipt_path,
+    worker_name,
+    write_record,
+)
 from beam_warp.plan.workers import Outcome, Workers
 
 FOLDER, PLAN_NAME, STATE_NAME = "plan", "plan.json", "state.json"
@@ -60,6 +71,28 @@ class Watch(Protocol):
 
     def __call__(self, step: Step, receipt: Receipt | None, error: str) -> None:
         """Take a step that is done, or was tried in vain."""
+
+
+class Counted:
+    """A watch that counts the steps of some stages for a listener."""
+
+    def __init__(self, plan: Plan, names: Mapping[str, str], progress: NotedProgress) -> None:
+        """Take what the listener calls each stage; stages without a name are not counted."""
+        self._names = {stage: name for stage, name in names.items() if stage in plan.works}
+        self._progress = progress
+        self._open = {stage: {step.name for step in plan.steps if step.stage == stage} for stage in self._names}
+        self._totals = {stage: len(steps) for stage, steps in self._open.items()}
+        for stage, name in self._names.items():
+            progress(name, 0, self._totals[stage])
+
+    def __call__(self, step: Step, receipt: Receipt | None, error: str) -> None:
+        """Count a step that is done; pass on what went wrong."""
+        if step.stage in self._names:
+            if receipt is not None:
+                self._open[step.stage].discard(step.name)
+            total = self._totals[step.stage]
+            note = f"{step.name}: {error}" if receipt is None else str(receipt.facts.get("line", ""))
+            self._progress(self._names[step.stage], total - len(self._open[step.stage]), total, note)
 
 
 @dataclass(eq=False)
@@ -134,7 +167,7 @@ def _hand_out(job: _Job) -> None:
         step = job.schedule.next()
         if step is None:
             return
-        following = job.schedule.likely_after(step) if job.workers.count == 1 else None
+        following = job.schedule.likely_after(step) if job.workers.count == 1 else ()
         inputs = [(job.plan.works[job.schedule.steps[name].stage], job.receipts[name]) for name in step.inputs]
         awaited = tuple(entry for work, receipt in inputs for entry in awaited_files(work, receipt))
         task = Task(step, tuple(receipt.key for _, receipt in inputs), awaited, following)

@@ -23,6 +23,9 @@ LOSSES = 10
 REPEATS = 3
 """A step is done again so often because its output is damaged; then it is given up, for the disk is not to be relied on."""
 
+LIKELY = 4
+"""Steps that a worker is told may follow: frames are few, and what waits for a rig is all of them."""
+
 
 class State(Enum):
     """What became of a step so far; its value is its word for people."""
@@ -88,12 +91,11 @@ class Schedule:
                 return self.steps[name]
         return None
 
-    def likely_after(self, step: Step) -> Step | None:
-        """Return the step that is likely to follow a running one: the first of what waits for it alone, and of all."""
+    def likely_after(self, step: Step) -> tuple[Step, ...]:
+        """Return the steps that are likely to follow a running one: what waits for it alone, and the first of others."""
         freed = [name for name in self._dependents[step.name] if self._open[name] == 1]
         queued = [name for _, name in self._ready[:1] if self.states[name] is State.READY]
-        first = min(freed + queued, key=self._order.__getitem__, default=None)
-        return None if first is None else self.steps[first]
+        return tuple(self.steps[name] for name in sorted(freed + queued, key=self._order.__getitem__)[:LIKELY])
 
     def done(self, name: str) -> None:
         """Note that a step is done."""

@@ -72,12 +72,8 @@ class Work(Protocol):
         """Return the files that a step writes."""
         ...
 
-    def do(self, step: Step, progress: NotedProgress) -> Mapping[str, Any]:
+    def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
         """Write the outputs of a step, each under a temporary name first; return JSON-able facts for its receipt."""
-        ...
-
-    def expect(self, step: Step) -> None:
-        """Begin to read what a step needs that is likely to come next."""
         ...
 
 
@@ -131,13 +127,13 @@ class Task:
         step: What to do.
         keys: Keys of its inputs, in their order.
         awaited: Path and size [byte] of every file of its inputs, which may become visible late.
-        following: Step that is likely to come next; None if that is not known.
+        following: Steps that are likely to come next, whose input may be read ahead; none where nobody knows.
     """
 
     step: Step
     keys: tuple[str, ...] = ()
     awaited: tuple[tuple[str, int], ...] = ()
-    following: Step | None = None
+    following: tuple[Step, ...] = ()
 
 
 def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> Receipt:
@@ -153,10 +149,8 @@ def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> R
     kept = read_receipt(work, step)
     if kept is not None and kept.key == key and is_whole(work, kept):
         return Receipt(**{**vars(kept), "is_kept": True})
-    if task.following is not None:
-        works[task.following.stage].expect(task.following)
     started = time.perf_counter()
-    facts = work.do(step, progress)
+    facts = work.do(task, progress)
     seconds = time.perf_counter() - started
     outputs = {path.relative_to(work.folder).as_posix(): _state(path) for path in work.outputs(step)}
     receipt = Receipt(key, outputs, seconds, worker_name(), time.time(), facts)

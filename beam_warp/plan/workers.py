@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
@@ -24,7 +24,7 @@ from typing import Any, Protocol
 from beam_warp.digests import code_digest
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError
 from beam_warp.outputs import remove_leftovers
-from beam_warp.plan.steps import NotedProgress, Receipt, Task, Work, perform, worker_name
+from beam_warp.plan.steps import NotedProgress, Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
@@ -127,6 +127,15 @@ class InProcess:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+Crew = Callable[[Plan, str, NotedProgress], Workers]
+"""Called with a plan, the kind of device that it is for, and who hears how far a step is; returns the workers."""
+
+
+def in_process(plan: Plan, device: str, progress: NotedProgress) -> Workers:
+    """Return this process as the only worker."""
+    return InProcess(plan.works, progress)
 
 
 @dataclass(frozen=True)

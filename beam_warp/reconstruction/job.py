@@ -10,21 +10,21 @@ tracking is lost becomes a key frame itself.
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
-    store           frames.store    one file a frame, under its key
+    store           frames.store    one file a frame
     write           this module     asset, previews, report
 
-The key of a frame covers everything it depends on: the version, the kind of device, the options, what the capture
-states and shows of the frame, and, but for the first of a segment, the key of the frame before. Tracking always goes on
-from what the file holds, never from what is in memory, so that a job that was stopped anywhere continues to the same
-bytes.
+Cameras, frames and previews are steps of a plan (`beam_warp.plan`), which knows what of them is done: the key of a
+frame covers everything it depends on. Tracking always goes on from what the file holds, never from what is in memory,
+so that a job that was stopped anywhere continues to the same bytes.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,22 +38,29 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
 from beam_warp.device.arrays import resolve_device
-from beam_warp.errors import AssetFormatError, InvalidOptionError
+from beam_warp.errors import InvalidOptionError
+from beam_warp.image.files import write_png
 from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.jobs.report import REPORT_NAME, device_facts, versions, write_json, write_report
+from beam_warp.plan.carry import Counted, carry_out
+from beam_warp.plan.steps import Plan, Receipt, Step, Task
+from beam_warp.plan.workers import Crew, in_process
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.model import model_frame, within
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
 from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
-from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, key_of_frame, stored_cloud, stored_sequence
+from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 
 ASSET_NAME = "gaussians.usda"
+
+PREVIEW_RANK, CAMERAS_RANK = 3, 9
+"""Previews come before other frames, while their images are at hand; nothing comes before cameras."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,29 +89,6 @@ class ReconstructOptions:
 
 
 @dataclass(frozen=True)
-class SegmentShare:
-    """The segments that one of several processes works on: every ``count``-th, from the ``number``-th on.
-
-    Attributes:
-        number: Which share, from 1 on.
-        count: Shares in all.
-
-    Raises:
-        InvalidOptionError: The number is not one of the shares.
-    """
-
-    number: int
-    count: int
-
-    def __post_init__(self) -> None:
-        """Check both once."""
-        if not 1 <= self.number <= self.count:
-            raise InvalidOptionError(
-                f"part must be I/N with 1 <= I <= N, got {self.number}/{self.count}. Count the parts from 1."
-            )
-
-
-@dataclass(frozen=True)
 class Reconstruction:
     """A finished reconstruction.
 
@@ -128,12 +112,13 @@ def reconstruct(
     options: ReconstructOptions | None = None,
     *,
     progress: NotedProgress = no_progress,
+    crew: Crew = in_process,
 ) -> Reconstruction:
     """Reconstruct a capture; write ``out/gaussians.usda``, its layers, ``out/report.json`` and ``out/previews``.
 
-    Every finished frame is kept in ``out/frames``; a second call takes up where the first one, or calls of
-    `reconstruct_part`, were stopped. Frames whose images, cameras or options changed, and all that were tracked from
-    them, are made anew. At no time are images of more than two frames in memory.
+    Every finished frame is kept in ``out/frames``; a second call takes up where the first one was stopped. Frames whose
+    images, cameras or options changed, and all that were tracked from them, are made anew. At no time are images of
+    more than two frames in the memory of a process.
 
     Args:
         capture: Images and cameras; its world is that of the Gaussians.
@@ -141,112 +126,245 @@ def reconstruct(
         steps: How the Gaussians of a frame are found.
         options: See `ReconstructOptions`.
         progress: Called with (stage, done, total, note).
+        crew: Who does the work: this process, or those of `beam_warp.plan.crew`.
 
     Raises:
         InvalidOptionError: The capture has no such frame.
         MissingFileError: Too few of the images are there.
         AssetFormatError: Nothing can be reconstructed from this capture: the message says why.
         OutputError: The folder cannot be made or written.
+        UnfinishedError: Several frames failed; the others are kept.
         BeamError: An image is damaged, or a step refuses its input.
     """
     started = time.perf_counter()
-    folder, chosen = require_path("out", out), options or ReconstructOptions()
-    job = _prepare(capture, folder, steps, chosen, progress)
-    resumed = _reconstruct_segments(job, job.plan.segments)
-    progress("write asset", 0, 1)
-    asset, sequence = _write_asset(job, folder, capture.frames_per_second or 30.0)
-    progress("write asset", 1, 1)
-    report = {**_report(job, capture, chosen, resumed), "seconds": time.perf_counter() - started}
-    write_report(folder, report)
-    return Reconstruction(asset, sequence, report, capture if job.rig is None else job.rig.capture(capture))
+    work = FrameWork.prepare(capture, require_path("out", out), steps, options)
+    plan = work.plan()
+    with closing(work):
+        receipts = carry_out(plan, crew(plan, work.device_kind, progress), Counted(plan, {"frame": "frames"}, progress))
+        return work.finish(receipts, started, progress)
 
 
-def reconstruct_part(
-    capture: Capture,
-    out: str | Path,
-    steps: FrameSteps,
-    part: SegmentShare,
-    options: ReconstructOptions | None = None,
-    *,
-    progress: NotedProgress = no_progress,
-) -> tuple[int, ...]:
-    """Reconstruct some segments into ``out/frames`` and ``out/previews``; `reconstruct` then finds them there.
+@dataclass(eq=False)
+class FrameWork:
+    """Steps that find the Gaussians of every frame: ``cameras``, ``frame`` and ``preview``.
 
-    Parts may run at the same time, in processes of their own or on several machines that share the folder.
-
-    Args:
-        capture: As `reconstruct`.
-        out: As `reconstruct`, and the same for all parts.
-        steps: As `reconstruct`; the kind of device must be the same for all parts.
-        part: Which segments.
-        options: As `reconstruct`, and the same for all parts.
-        progress: Called with (stage, done, total, note), of this part alone.
-
-    Returns:
-        The frames that are ready now.
-
-    Raises:
-        InvalidOptionError: There is one segment only; else as `reconstruct`.
-        MissingFileError, OutputError, BeamError: As `reconstruct`.
+    Attributes:
+        capture: Images and cameras.
+        folder: Folder of the reconstruction.
+        steps: How the Gaussians of a frame are found.
+        options: Which frames, and in which segments.
+        frames: Their records and segments, cameras as the capture states them.
+        notes: What a killed call had left half written, and was removed.
     """
-    chosen = options or ReconstructOptions()
-    if chosen.segment_length == 0 and part.count > 1:
-        raise InvalidOptionError(
-            f"segment_length must be at least 1 to work in parts, got 0 with part {part.number}/{part.count}: there is "
-            "one segment only. State the length of the segments."
-        )
-    job = _prepare(capture, require_path("out", out), steps, chosen, progress)
-    segments = job.plan.segments[part.number - 1 :: part.count]
-    _reconstruct_segments(job, segments)
-    return tuple(frame for segment in segments for frame in segment)
 
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """The state that all frames of one call share."""
-
-    plan: FramePlan
+    capture: Capture
+    folder: Path
     steps: FrameSteps
-    device: Any
-    store: FrameStore
-    common_inputs: str
-    progress: NotedProgress
-    rig: RigCorrection | None = None
+    options: ReconstructOptions
+    frames: FramePlan
+    notes: list[str]
+    _reader: FrameReader | None = None
+    _latest: tuple[int, Sequence[CapturedView]] | None = None
 
+    @classmethod
+    def prepare(cls, capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions | None) -> FrameWork:
+        """Check everything, and then make the folders."""
+        chosen = options or ReconstructOptions()
+        resolve_device(steps.device)
+        for name in (ASSET_NAME, REPORT_NAME):
+            require_writable(out / name, is_made=True)
+        frames = plan_frames(capture, chosen.frames, chosen.segment_length)
+        store = FrameStore(out)
+        return cls(capture, out, steps, chosen, frames, store.make_folders())
 
-def _prepare(
-    capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions, progress: NotedProgress
-) -> _Job:
-    """Check everything, and then make the folders."""
-    device = resolve_device(steps.device)
-    for name in (ASSET_NAME, REPORT_NAME):
-        require_writable(out / name, is_made=True)
-    plan = plan_frames(capture, options.frames, options.segment_length)
-    job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
-    rig = _refined_rig(job, out) if options.cameras == "refine" else None
-    if rig is None:
-        (out / FILE_NAME).unlink(missing_ok=True)
-        return job
-    records = {frame: rig.corrected(found) for frame, found in plan.records.items()}
-    return replace(job, rig=rig, plan=replace(plan, records=records, findings=(*plan.findings, *rig.findings())))
+    def plan(self) -> Plan:
+        """Return the steps; a frame follows the one before in its segment, and the first ones the cameras."""
+        first = ()
+        steps: list[Step] = []
+        if self.options.cameras == "refine" and _is_fixed_rig(self.frames.records):
+            steps.append(Step("cameras", "cameras", rank=CAMERAS_RANK))
+            first = ("cameras",)
+        else:
+            (self.folder / FILE_NAME).unlink(missing_ok=True)
+        for segment in self.frames.segments:
+            for frame, previous in zip(segment, (None, *segment), strict=False):
+                inputs = first if previous is None else (frame_step(previous),)
+                steps.append(Step(frame_step(frame), "frame", frame, inputs, int(previous is not None)))
+                steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), PREVIEW_RANK))
+        return Plan(self.folder, tuple(steps), dict.fromkeys(("cameras", "frame", "preview"), self))
 
+    @property
+    def device_kind(self) -> str:
+        """Kind of device, "cuda" or "cpu"."""
+        return "cuda" if resolve_device(self.steps.device).is_cuda else "cpu"
 
-def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
-    """Find what is wrong with the cameras, or read what was found from the same images before; None for nothing."""
-    frame, records = next(iter(job.plan.records.items()))
-    if not _is_fixed_rig(job.plan.records):
-        return None
-    with FrameReader(job.plan.records, job.store.digests) as reader:
-        key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "cameras")
-        known = None
-        with suppress(AssetFormatError):  # what is damaged is found anew
-            known = read_corrections(out, key)
-        if known is None:
+    @cached_property
+    def store(self) -> FrameStore:
+        """The files of frames and previews."""
+        return FrameStore(self.folder)
+
+    @cached_property
+    def rig(self) -> RigCorrection | None:
+        """What was found about the cameras; None for nothing, or before it was sought."""
+        return read_corrections(self.folder)
+
+    @cached_property
+    def records(self) -> Mapping[int, Sequence[CaptureRecord]]:
+        """Records of each frame, cameras corrected."""
+        if self.rig is None:
+            return self.frames.records
+        return {frame: self.rig.corrected(found) for frame, found in self.frames.records.items()}
+
+    def common(self) -> str:
+        """Return all that every step depends on."""
+        return self._common
+
+    @cached_property
+    def _common(self) -> str:
+        return common_inputs(self.steps, self.device_kind)
+
+    def digest(self, step: Step) -> str:
+        """Return the digest of a frame's records and images; a preview has those of its frame."""
+        if step.stage == "cameras":
+            frame = next(iter(self.frames.records))
+            with FrameReader(self.frames.records, self.store.digests) as reader:
+                return reader.digest(frame)
+        return self._images().digest(step.frame) if step.stage == "frame" and step.frame is not None else ""
+
+    def outputs(self, step: Step) -> tuple[Path, ...]:
+        """Return the file of a step; there is none about cameras in which nothing was found."""
+        if step.frame is None:
+            return tuple(filter(Path.is_file, [self.folder / FILE_NAME]))
+        return ((self.store.path if step.stage == "frame" else self.store.preview_path)(step.frame),)
+
+    def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
+        """Find cameras, model a frame, or draw its preview."""
+        step = task.step
+        if step.frame is None:
+            return self._refine_rig(progress)
+        if step.stage == "preview":
+            write_png(self.store.preview_path(step.frame), self._preview(step.frame))
+            return {}
+        self._latest = None
+        views = self._images().views(step.frame)
+        self._latest = step.frame, views
+        for following in task.following:
+            if following.stage == "frame" and following.frame is not None:
+                self._images().expect(following.frame)
+                break
+        return self._model(step, views, progress)
+
+    def close(self) -> None:
+        """End the threads that read."""
+        self._latest = None
+        if self._reader is not None:
+            self._reader.__exit__()
+            self._reader = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what other processes need: no threads, no images, nothing that was read."""
+        return {**{field.name: vars(self)[field.name] for field in fields(self)}, "_reader": None, "_latest": None}
+
+    def _images(self) -> FrameReader:
+        if self._reader is None:
+            self._reader = FrameReader(self.records, self.store.digests)
+        return self._reader
+
+    def _refine_rig(self, progress: NotedProgress) -> dict[str, Any]:
+        """Find what is wrong with the cameras."""
+        frame, records = next(iter(self.frames.records.items()))
+        with FrameReader(self.frames.records, self.store.digests) as reader:
             names = [record.camera_name for record in records]
-            known = job.steps.refine_rig(names, reader.views(frame), within(job.progress, "cameras", frame))
-            if known is not None:
-                write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
-    return known
+            found = self.steps.refine_rig(names, reader.views(frame), within(progress, "cameras", frame))
+        if found is None:
+            (self.folder / FILE_NAME).unlink(missing_ok=True)
+        else:
+            write_json(self.folder / FILE_NAME, found.as_dict())
+        return {}
+
+    def _model(self, step: Step, views: Sequence[CapturedView], progress: NotedProgress) -> dict[str, Any]:
+        """Fit or track a frame and store it."""
+        assert step.frame is not None
+        before = None
+        if step.rank:
+            order = tuple(self.frames.records)
+            previous = order[order.index(step.frame) - 1]
+            track = self.steps.restore(self.store.track_arrays(previous))
+            before = track, int(self.store.report(previous)["segment"])
+        model = model_frame(self.steps, step.frame, views, before, progress)
+        self.store.write(step.frame, model)
+        return {"line": frame_line(model.report)}
+
+    def _preview(self, frame: int) -> NDArray[np.uint8]:
+        """Draw the preview of a stored frame; its images are read again where they are not at hand."""
+        records, raster = self.records[frame], self.steps.raster
+        cloud, cameras = stored_cloud(self.store.path(frame)), [record.camera for record in records]
+        chosen, device = opposite_cameras(cameras), str(resolve_device(self.steps.device))
+        views = self._latest[1] if self._latest is not None and self._latest[0] == frame else None
+        return reconstruction_preview(
+            cloud,
+            [records[index].view() if views is None else views[index] for index in chosen],
+            shadings=mesh_shadings(cloud, cameras, chosen, options=raster, device=device),
+            options=raster,
+            samples=int(self.store.report(frame).get("samples", 1)),
+            device=device,
+        )
+
+    def sequence(self, *, is_constant: bool | None = None) -> GaussianSequence:
+        """Return the stored frames; see `stored_sequence`."""
+        frames = tuple(self.frames.records)
+        return stored_sequence(
+            [self.store.path(frame) for frame in frames],
+            self.capture.frames_per_second or 30.0,
+            {**(self.steps.raster or RasterOptions()).as_metadata(), **capture_frames_metadata(frames)},
+            is_constant,
+        )
+
+    def seen(self) -> Capture:
+        """Return the capture with the cameras that the Gaussians are fitted with."""
+        return self.capture if self.rig is None else self.rig.capture(self.capture)
+
+    def finish(self, receipts: Mapping[str, Receipt], started: float, progress: NotedProgress) -> Reconstruction:
+        """Write asset and report of a plan that was carried out, begun at a time [s]."""
+        progress("write asset", 0, 1)
+        sequence = self.sequence()
+        converters.write(sequence, self.folder / ASSET_NAME)
+        progress("write asset", 1, 1)
+        report = {**self._report(receipts), "seconds": time.perf_counter() - started}
+        write_report(self.folder, report)
+        return Reconstruction(self.folder / ASSET_NAME, sequence, report, self.seen())
+
+    def _report(self, receipts: Mapping[str, Receipt]) -> dict[str, Any]:
+        """Return what was done and found, JSON-able."""
+        records = self.records
+        made = {frame: receipts[frame_step(frame)] for frame in records}
+        frames = [{**self.store.report(frame), "seconds": receipt.seconds} for frame, receipt in made.items()]
+        findings = (*self.frames.findings, *(() if self.rig is None else self.rig.findings()))
+        return {
+            "input": {
+                "capture": str(self.capture.folder),
+                "frames": len(frames),
+                "cameras": len({record.camera_name for found in records.values() for record in found}),
+            },
+            "device": device_facts(resolve_device(self.steps.device)),
+            "workers": sorted({receipt.worker for receipt in receipts.values()}),
+            "versions": versions(),
+            "options": {
+                **self.steps.options(),
+                "segment_length": self.options.segment_length,
+                "cameras": self.options.cameras,
+            },
+            "resumed_frames": sum(receipt.is_kept for receipt in made.values()),
+            "cameras": None if self.rig is None else self.rig.as_dict(),
+            **sequence_facts(frames),
+            "findings": [vars(finding) for finding in findings],
+            "warnings": [*self.notes, *(finding.what for finding in findings), *warnings_of(frames)],
+        }
+
+
+def frame_step(frame: int) -> str:
+    """Return the name of the step that finds the Gaussians of a frame."""
+    return f"frame-{frame:06d}"
 
 
 def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
@@ -260,84 +378,3 @@ def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
             if not np.array_equal(first.camera_to_world, record.camera.camera_to_world):
                 return False
     return True
-
-
-def _reconstruct_segments(job: _Job, segments: Sequence[Sequence[int]]) -> int:
-    """Bring the frames of some segments into the store, those of each in their order; return how many were there."""
-    order = [step for segment in segments for step in zip(segment, (None, *segment), strict=False)]
-    job.progress("frames", 0, len(order))
-    key, resumed = "", 0
-    with FrameReader(job.plan.records, job.store.digests) as reader:
-        for done, (frame, previous) in enumerate(order):
-            key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "" if previous is None else key)
-            views, seconds = None, None
-            if job.store.key(frame) == key:
-                resumed += 1
-            else:
-                views = reader.views(frame)
-                if done + 1 < len(order):
-                    reader.expect(order[done + 1][0])
-                seconds = _model_and_store(job, frame, key, views, previous)
-            if not job.store.has_preview(frame, key):
-                job.store.write_preview(frame, key, _preview(job, frame, views), seconds)
-            job.progress("frames", done + 1, len(order), frame_line(job.store.report(frame)))
-    return resumed
-
-
-def _model_and_store(job: _Job, frame: int, key: str, views: Sequence[CapturedView], previous: int | None) -> float:
-    """Fit or track a frame and store it; return how long that took [s]."""
-    started = time.perf_counter()
-    before = None
-    if previous is not None:
-        track = job.steps.restore(job.store.track_arrays(previous))
-        before = track, int(job.store.report(previous)["segment"])
-    job.store.write(frame, key, model_frame(job.steps, frame, views, before, job.progress))
-    return time.perf_counter() - started
-
-
-def _preview(job: _Job, frame: int, views: Sequence[CapturedView] | None) -> NDArray[np.uint8]:
-    """Draw the preview of a stored frame; its images are read again where they are not at hand."""
-    records, device, raster = job.plan.records[frame], str(job.device), job.steps.raster
-    cloud, cameras = stored_cloud(job.store.path(frame)), [record.camera for record in records]
-    chosen = opposite_cameras(cameras)
-    return reconstruction_preview(
-        cloud,
-        [records[index].view() if views is None else views[index] for index in chosen],
-        shadings=mesh_shadings(cloud, cameras, chosen, options=raster, device=device),
-        options=raster,
-        samples=int(job.store.report(frame).get("samples", 1)),
-        device=device,
-    )
-
-
-def _write_asset(job: _Job, out: Path, frames_per_second: float) -> tuple[Path, GaussianSequence]:
-    """Write the asset of all frames."""
-    frames = tuple(job.plan.records)
-    sequence = stored_sequence(
-        [job.store.path(frame) for frame in frames],
-        frames_per_second,
-        {**(job.steps.raster or RasterOptions()).as_metadata(), **capture_frames_metadata(frames)},
-    )
-    converters.write(sequence, out / ASSET_NAME)
-    return out / ASSET_NAME, sequence
-
-
-def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: int) -> dict[str, Any]:
-    """Return what was done and found, JSON-able."""
-    records, findings = job.plan.records, job.plan.findings
-    frames = [{**job.store.report(frame), "seconds": job.store.seconds(frame)} for frame in records]
-    return {
-        "input": {
-            "capture": str(capture.folder),
-            "frames": len(frames),
-            "cameras": len({record.camera_name for found in records.values() for record in found}),
-        },
-        "device": device_facts(job.device),
-        "versions": versions(),
-        "options": {**job.steps.options(), "segment_length": options.segment_length, "cameras": options.cameras},
-        "resumed_frames": resumed,
-        "cameras": None if job.rig is None else job.rig.as_dict(),
-        **sequence_facts(frames),
-        "findings": [vars(finding) for finding in findings],
-        "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],
-    }

@@ -191,7 +191,7 @@ def lights(folder: Path) -> Path:
 
 def stored(folder: Path) -> Path:
     """A frame that a job keeps."""
-    write_frame(folder / "a.h5", "key", {"a": np.arange(100.0), "b": np.ones((4, 3), np.float32)})
+    write_frame(folder / "a.h5", {"a": np.arange(100.0), "b": np.ones((4, 3), np.float32)})
     return folder / "a.h5"
 
 

@@ -237,7 +237,7 @@ def test_layers_of_a_longer_asset_are_removed(tmp_path):
 
 def test_zeros_in_a_stored_frame_are_found(tmp_path):
     path = tmp_path / "frame_000000.h5"
-    write_frame(path, "key", {"colors": np.linspace(1, 2, 3000)})
+    write_frame(path, {"colors": np.linspace(1, 2, 3000)})
     content = path.read_bytes()
     start = content.index(np.linspace(1, 2, 3000).tobytes())
     path.write_bytes(content[: start + 800] + bytes(400) + content[start + 1200 :])

@@ -22,11 +22,12 @@ from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
+from beam_warp.plan import steps as plan_steps
 from beam_warp.reconstruction import job as job_module
 from beam_warp.reconstruction.frames import store as frame_store
 from beam_warp.reconstruction.frames.plan import plan_segments
 from beam_warp.reconstruction.frames.store import ID_BITS, stored_cloud
-from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare, reconstruct, reconstruct_part
+from beam_warp.reconstruction.job import ReconstructOptions, reconstruct
 
 FRAMES = (0, 1, 2, 3)
 PAIRS = ReconstructOptions(segment_length=2)
@@ -190,7 +191,7 @@ class TestOutputs:
 
 
 def before_each_write(monkeypatch, act):
-    """Have a run call ``act`` ahead of each of its writes: Gaussians, preview and note of a frame, and the report."""
+    """Have a run call ``act`` ahead of each of its writes: Gaussians, preview, their receipts, and the report."""
 
     def watched(function):
         def write(*arguments, **options):
@@ -199,10 +200,11 @@ def before_each_write(monkeypatch, act):
 
         return write
 
-    writes = {frame_store: ("write_frame", "write_png", "write_json"), job_module: ("write_report",)}
-    for module, names in writes.items():
-        for name in names:
-            monkeypatch.setattr(module, name, watched(getattr(module, name)))
+    for module, name in (
+        *((frame_store, "write_frame"), (job_module, "write_png")),
+        *((plan_steps, "write_record"), (job_module, "write_report")),
+    ):
+        monkeypatch.setattr(module, name, watched(getattr(module, name)))
 
 
 def leave_half_written(out):
@@ -227,13 +229,14 @@ class TestResuming:
             before_each_write(patch, keep_what_a_kill_leaves)
             reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         keep_what_a_kill_leaves()
-        assert len(left) == 3 * 3 + 1 + 1  # three writes of each frame, the report, and nothing that is killed
+        # the receipt of the cameras, four writes of each frame, the report, and nothing that is killed
+        assert len(left) == 1 + 4 * 3 + 1 + 1
         for done, out in enumerate(left):
             leave_half_written(out)
             steps = FakeSteps()
             found = reconstruct(capture, out, steps, options)
             assert len(steps.calls) == 3 - found.report["resumed_frames"]
-            assert found.report["resumed_frames"] == min((done + 2) // 3, 3)
+            assert found.report["resumed_frames"] == min((done + 1) // 4, 3)
             require_same_results(tmp_path / "whole", out)
 
     def test_an_interrupt_changes_no_byte_either(self, followed, capture, tmp_path, monkeypatch):
@@ -242,7 +245,7 @@ class TestResuming:
 
         def interrupt():
             writes.append("begun")
-            if len(writes) == 5:
+            if len(writes) == 8:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
@@ -277,16 +280,6 @@ class TestResuming:
         assert found.report["resumed_frames"] == 1
         reconstruct(capture, tmp_path / "whole", FakeSteps())
         require_same_results(tmp_path / "whole", tmp_path / "out")
-
-    def test_parts_and_a_final_call_are_the_whole(self, paired, capture, tmp_path):
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(2, 2), PAIRS) == (2, 3)
-        assert not (tmp_path / "out" / "gaussians.usda").exists()
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2), PAIRS) == (0, 1)
-        assert reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(3, 3), PAIRS) == ()
-        steps = FakeSteps()
-        reconstruct(capture, tmp_path / "out", steps, PAIRS)
-        assert steps.calls == []
-        require_same_results(paired[1], tmp_path / "out")
 
     @pytest.mark.parametrize(
         ("name", "kept", "calls"),
@@ -381,12 +374,6 @@ class TestMistakes:
         with pytest.raises(InvalidOptionError, match=says):
             reconstruct(capture, tmp_path / "out", FakeSteps(), ReconstructOptions(**options))
         assert not (tmp_path / "out").exists()
-
-    def test_parts(self, capture, tmp_path):
-        with pytest.raises(InvalidOptionError, match="part must be I/N"):
-            SegmentShare(0, 2)
-        with pytest.raises(InvalidOptionError, match="segment_length must be at least 1 to work in parts"):
-            reconstruct_part(capture, tmp_path / "out", FakeSteps(), SegmentShare(1, 2))
 
     def test_a_folder_that_cannot_be_made(self, capture, tmp_path):
         (tmp_path / "file").write_bytes(b"")

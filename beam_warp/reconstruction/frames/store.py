@@ -1,12 +1,11 @@
-"""The folder of a reconstruction that may be stopped at any time and continued: finished frames and their previews.
+"""The folder of a reconstruction: finished frames and their previews.
 
-Each finished frame is one file with its Gaussians and all that the next frame needs, under a key that covers
-everything it depends on: a frame is taken from the store only under the same key.
+Each finished frame is one file with its Gaussians and all that the next frame needs. The receipts of the job's plan say
+what it was made from.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,9 +19,7 @@ from beam_warp._version import __version__
 from beam_warp.capture.digests import CaptureDigests
 from beam_warp.digests import code_digest
 from beam_warp.image.color import LINEAR_REC709
-from beam_warp.image.files import write_png
-from beam_warp.jobs.report import write_json
-from beam_warp.jobs.store import frame_key, frame_names, make_folders, read_frame, write_frame
+from beam_warp.jobs.store import frame_names, make_folders, read_frame, write_frame
 from beam_warp.outputs import remove_leftovers
 from beam_warp.reconstruction.frames.model import FrameModel
 from beam_warp.reconstruction.frames.protocols import FrameSteps
@@ -33,24 +30,29 @@ ID_BITS = 32
 
 HEADER, TRACK = "header", "track_"
 
+FOLDERS = ("frames", "previews", "digests")
+
 
 class FrameStore:
     """Finished frames of a reconstruction, in folders beside its asset.
 
     Attributes:
         digests: Digests of the capture's files, which are read again only if they changed.
-        notes: What a killed call had left half written, and was removed.
     """
 
     def __init__(self, out: Path) -> None:
-        """Make ``out``, and ``frames``, ``previews`` and ``digests`` in it.
+        """Take the folder ``out``, and ``frames``, ``previews`` and ``digests`` in it."""
+        self._out = out
+        self._folders = [out / name for name in FOLDERS]
+        self.digests = CaptureDigests(self._folders[2])
+
+    def make_folders(self) -> list[str]:
+        """Make the folders, and remove what a killed call had left half written; say so in notes.
 
         Raises:
             OutputError: A folder cannot be made.
         """
-        self._folders = make_folders(out, "frames", "previews", "digests")
-        self.digests = CaptureDigests(self._folders[2])
-        self.notes = remove_leftovers(out, *self._folders)
+        return remove_leftovers(self._out, *make_folders(self._out, *FOLDERS))
 
     def path(self, frame: int) -> Path:
         """Return the file of a frame."""
@@ -60,11 +62,7 @@ class FrameStore:
         """Return the file of a frame's preview."""
         return self._folders[1] / f"frame_{frame:06d}.png"
 
-    def key(self, frame: int) -> str | None:
-        """Return the key of a frame; None if it is not there."""
-        return frame_key(self.path(frame))
-
-    def write(self, frame: int, key: str, model: FrameModel) -> None:
+    def write(self, frame: int, model: FrameModel) -> None:
         """Store a frame, whole: its Gaussians, its track without what both share, and a header.
 
         Raises:
@@ -80,7 +78,7 @@ class FrameStore:
             else:
                 stored[TRACK + name] = array
         text = json.dumps({"report": report, "shared": sorted(shared)}, sort_keys=True, allow_nan=False)
-        write_frame(self.path(frame), key, {**stored, HEADER: np.frombuffer(text.encode(), np.uint8)})
+        write_frame(self.path(frame), {**stored, HEADER: np.frombuffer(text.encode(), np.uint8)})
 
     def report(self, frame: int) -> dict[str, Any]:
         """Read the report of a frame; see `FrameModel`."""
@@ -93,28 +91,12 @@ class FrameStore:
         own = {name.removeprefix(TRACK): array for name, array in stored.items() if name.startswith(TRACK)}
         return own | {name: stored[name] for name in shared}
 
-    def has_preview(self, frame: int, key: str) -> bool:
-        """Return whether the preview of the frame with this key is there."""
-        return self._note(frame).get("key") == key and self.preview_path(frame).is_file()
-
-    def write_preview(self, frame: int, key: str, picture: NDArray[np.uint8], seconds: float | None) -> None:
-        """Store a preview, and then a note that vouches for it and holds the time the frame took, if it is known."""
-        write_png(self.preview_path(frame), picture)
-        write_json(self.path(frame).with_suffix(".json"), {"key": key, "seconds": seconds})
-
-    def seconds(self, frame: int) -> float | None:
-        """Read how long a frame took [s]; None if that is not known."""
-        return self._note(frame).get("seconds")
-
-    def _note(self, frame: int) -> dict[str, Any]:
-        try:
-            return dict(json.loads(self.path(frame).with_suffix(".json").read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return {}
-
 
 def stored_sequence(
-    paths: Sequence[Path], frames_per_second: float, stated: Mapping[str, str] = MappingProxyType({})
+    paths: Sequence[Path],
+    frames_per_second: float,
+    stated: Mapping[str, str] = MappingProxyType({}),
+    is_constant: bool | None = None,
 ) -> GaussianSequence:
     """Return frames of the store as a sequence; they are read when they are asked for.
 
@@ -125,9 +107,9 @@ def stored_sequence(
         frames_per_second: Playback rate [1/s].
         stated: Further metadata: how the Gaussians were drawn, which frames of the capture they show (see
             `beam_warp.world.metadata`).
+        is_constant: Whether the topology is constant, where that is known without reading all frames.
     """
-    ids = read_frame(paths[0], ("ids",))["ids"]
-    constant = all(np.array_equal(read_frame(path, ("ids",))["ids"], ids) for path in paths[1:])
+    constant = _has_same_rows(paths) if is_constant is None else is_constant
     return GaussianSequence(
         frame_count=len(paths),
         read_frame=lambda frame: stored_cloud(paths[frame]),
@@ -143,26 +125,18 @@ def stored_sequence(
     )
 
 
+def _has_same_rows(paths: Sequence[Path]) -> bool:
+    ids = read_frame(paths[0], ("ids",))["ids"]
+    return all(np.array_equal(read_frame(path, ("ids",))["ids"], ids) for path in paths[1:])
+
+
 def stored_cloud(path: Path) -> GaussianCloud:
     """Read the Gaussians of a frame of the store."""
     names = tuple(name for name in frame_names(path) if name in ATTRIBUTES)
     return GaussianCloud(**read_frame(path, names), axes=WORLD_AXES, radiance_color_space=LINEAR_REC709)
 
 
-def common_inputs(steps: FrameSteps, device: Any) -> str:
-    """Return all that every frame of a job depends on, as JSON: the code, the kind of Warp device, the options."""
-    content = {"code": code_digest(), "device": "cuda" if device.is_cuda else "cpu", "options": steps.options()}
+def common_inputs(steps: FrameSteps, device_kind: str) -> str:
+    """Return all that every frame of a job depends on, as JSON: the code, the kind of device, the options."""
+    content = {"code": code_digest(), "device": device_kind, "options": steps.options()}
     return json.dumps(content, sort_keys=True)
-
-
-def key_of_frame(common: str, frame: int, digest: str, previous: str) -> str:
-    """Return the key of a frame.
-
-    Args:
-        common: See `common_inputs`.
-        frame: Number of the frame.
-        digest: Digest of its records and images.
-        previous: Key of the frame before in its segment; empty for the first of a segment.
-    """
-    text = f"{common}\n{frame}\n{digest}\n{previous}"
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
