@@ -1,4 +1,4 @@
-"""Finished frames of the main job on disk: a stopped job continues with them, and its result is read from them."""
+"""Finished frames of the main job on disk, from which its result is read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.jobs.store import frame_key, read_frame, write_frame
+from beam_warp.jobs.store import is_stored_frame, read_frame, write_frame
 from beam_warp.materials.base_color import BaseColor
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
@@ -27,7 +27,6 @@ class MeasuredFrame:
 
     Attributes:
         number: Number of the frame in the sequence.
-        key: Key of everything that it was measured from.
         cloud: The Gaussians with normals, roughness and ambient occlusion; on the image path with base colour.
         evidence: Evidence on base colour; None on the image path, which leaves nothing to solve.
         from_shape: Where the normal is the Gaussian's own shortest axis, ``(N,)`` bool.
@@ -35,7 +34,6 @@ class MeasuredFrame:
     """
 
     number: int
-    key: str
     cloud: GaussianCloud
     evidence: ColorEvidence | None
     from_shape: NDArray[np.bool_]
@@ -46,7 +44,7 @@ class FrameArchive:
     """A folder of finished frames and their solutions.
 
     Attributes:
-        folder: Where the files are; other results that a job need not find twice lie beside the frames.
+        folder: Where the files are; what is found once for all frames lies beside them.
     """
 
     def __init__(self, folder: Path, radiance_color_space: str | None) -> None:
@@ -54,18 +52,12 @@ class FrameArchive:
         self.folder = folder
         self._color_space = radiance_color_space
 
-    def find(self, number: int, key: str) -> MeasuredFrame | None:
-        """Return the frame that is stored under a key; None if there is none."""
-        return self.read(number) if frame_key(self._frame(number)) == key else None
-
     def read(self, number: int) -> MeasuredFrame:
-        """Return a frame that was found or kept."""
-        path = self._frame(number)
-        arrays = read_frame(path)
+        """Return a frame that was kept."""
+        arrays = read_frame(self.frame_path(number))
         told = {name: arrays[EVIDENCE + name] for name in ColorEvidence.ARRAYS if EVIDENCE + name in arrays}
         return MeasuredFrame(
             number=number,
-            key=frame_key(path) or "",
             cloud=GaussianCloud(
                 **{name: array for name, array in arrays.items() if name in ATTRIBUTES},
                 axes=WORLD_AXES,
@@ -85,31 +77,33 @@ class FrameArchive:
         arrays = {**frame.cloud.arrays(), "from_shape": frame.from_shape, "report": frame.report}
         if frame.evidence is not None:
             arrays |= {EVIDENCE + name: getattr(frame.evidence, name) for name in ColorEvidence.ARRAYS}
-        write_frame(self._frame(frame.number), frame.key, arrays)
+        write_frame(self.frame_path(frame.number), arrays)
 
-    def keep_solution(self, number: int, key: str, solved: BaseColor) -> None:
+    def keep_solution(self, number: int, solved: BaseColor) -> None:
         """Store the base colour of a frame.
 
         Raises:
             OutputError: The file cannot be written; nothing is left behind.
         """
-        write_frame(self._solution(number), key, solved.arrays())
+        write_frame(self.solution_path(number), solved.arrays())
 
     def solution(self, number: int) -> dict[str, NDArray[Any]]:
         """Return base colour, its standard error and observability of a frame, as arrays of a cloud."""
-        return read_frame(self._solution(number))
+        return read_frame(self.solution_path(number))
 
     def remove_beyond(self, count: int) -> list[str]:
         """Remove the frames that an earlier, longer sequence left, and say so in a note, if there were any."""
         numbered = ((_STORED.fullmatch(path.name), path) for path in self.folder.iterdir())
-        stale = [path for match, path in numbered if match and int(match[1]) >= count and frame_key(path) is not None]
+        stale = [path for match, path in numbered if match and int(match[1]) >= count and is_stored_frame(path)]
         for path in stale:
             path.unlink(missing_ok=True)
         files = f"file{'s'[: len(stale) > 1]}"
         return [f"removed {len(stale)} stored {files} of an earlier sequence of more frames"] if stale else []
 
-    def _frame(self, number: int) -> Path:
+    def frame_path(self, number: int) -> Path:
+        """Return the file of a frame's measurements."""
         return self.folder / f"frame_{number:06d}.h5"
 
-    def _solution(self, number: int) -> Path:
+    def solution_path(self, number: int) -> Path:
+        """Return the file of a frame's base colour."""
         return self.folder / f"solution_{number:06d}.h5"

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beam_warp.capture.findings import Finding
 from beam_warp.decomposition.options import ESTIMATE, RunOptions
 from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.decomposition.source import Source
-from beam_warp.digests import array_digest
-from beam_warp.jobs.report import write_json
-from beam_warp.jobs.store import kept_frame
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.agreement import judge_clipping, judge_environment, match_silhouettes, require_match
 from beam_warp.materials.exposure import estimate_exposure
@@ -58,6 +55,16 @@ class CaptureLight:
     turned_by: float
     scales: tuple[float, float]
 
+    @classmethod
+    def of(cls, environment: EnvironmentMap, found: Mapping[str, NDArray[Any]], source: Source) -> CaptureLight:
+        """Prepare an environment, given what `find_light` found about it."""
+        degrees, error, turned_by, low, high, stops, is_fitted = found["numbers"].tolist()
+        turned = environment.rotated(turned_by) if turned_by else environment
+        with source.log.timer("prepare light"):
+            prepared = PreparedEnvironment(turned, source.device).scaled(2.0**stops)
+        turn = LightTurn(degrees, error)
+        return cls(turned.scaled(2.0**stops), prepared, stops, bool(is_fitted), turn, turned_by, (low, high))
+
     @property
     def findings(self) -> list[Finding]:
         """What is to be said about a light that is askew."""
@@ -79,47 +86,33 @@ class CaptureLight:
         }
 
 
-def prepare_light(environment: EnvironmentMap, source: Source, described: str, folder: Path) -> CaptureLight:
-    """Prepare an environment; find whether it is askew, and its exposure.
+def find_light(environment: EnvironmentMap, source: Source) -> dict[str, NDArray[Any]]:
+    """Find whether an environment is askew, its exposure, and whether it fits; return what `CaptureLight.of` takes.
 
     Args:
         environment: The light as it was given.
         source: What was captured, and the exposure that is stated or to be found.
-        described: The code and options that an automatic exposure depends on; it is kept under their key.
-        folder: Where it is kept, so that a resumed job has it at once.
+
+    Raises:
+        InvalidOptionError: The light is black, or the images show something else than the Gaussians.
     """
-    device, options = source.device, source.options
-    turn, turned_by, scales = LightTurn(), 0.0, (float("nan"), float("nan"))
+    options, turned = source.options, [float("nan"), float("inf"), 0.0, float("nan"), float("nan")]
     if source.has_light and environment.radiance.any():
-        found = kept_frame(
-            folder / "turn.h5",
-            _key(environment, source, described),
-            lambda: {"found": np.array(_turn(source.first, environment, turns_light=options.turn_light))},
-        )
-        degrees, error, turned_by, *scales = found["found"].tolist()
-        turn, scales = LightTurn(degrees, error), (scales[0], scales[1])
-    environment = environment.rotated(turned_by) if turned_by else environment
-    with source.log.timer("prepare light"):
-        given = PreparedEnvironment(environment, device)
-    stops = 0.0
-    is_fitted = options.exposure == "auto" and source.is_display_referred()
+        turned = _turn(source.first, environment, turns_light=options.turn_light)
+    stops, is_fitted = 0.0, options.exposure == "auto" and source.is_display_referred()
     if options.exposure != "auto":
         stops = float(options.exposure)
     elif is_fitted:
-        key = _key(environment, source, described)
-        found = kept_frame(
-            folder / "exposure.h5", key, lambda: {"stops": np.array([_exposure_stops(source.first, given, options)])}
-        )
-        stops = float(found["stops"][0])
+        with source.log.timer("prepare light"):
+            given = PreparedEnvironment(environment.rotated(turned[2]) if turned[2] else environment, source.device)
+        stops = _exposure_stops(source.first, given, options)
         is_fitted = bool(stops) or not source.has_light
-    scaled = environment.scaled(2.0**stops)
-    return CaptureLight(scaled, given.scaled(2.0**stops), stops, is_fitted, turn, turned_by, scales)
-
-
-def _key(environment: EnvironmentMap, source: Source, described: str) -> str:
-    """Return the key of what is found out about a light from the first frame."""
-    text = f"{described} {source.image_digest(0)}"
-    return array_digest(environment.radiance, *source.first.cloud.arrays().values(), text=text)
+    numbers = np.array([*turned, stops, float(is_fitted)])
+    light = CaptureLight.of(environment, {"numbers": numbers}, source)
+    with source.log.timer("check"):
+        findings = [*_judge(source.first, light.environment), *light.findings]
+    text = json.dumps([vars(finding) for finding in findings])
+    return {"numbers": numbers, "findings": np.frombuffer(text.encode(), np.uint8)}
 
 
 def _turn(frame: SeenFrame, environment: EnvironmentMap, *, turns_light: bool) -> list[float]:
@@ -155,32 +148,6 @@ def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOp
                 )
             )
         )
-
-
-def light_findings(frame: SeenFrame, environment: EnvironmentMap, path: Path, key: str) -> list[dict[str, Any]]:
-    """Look at the light and the images of a frame before anything is measured.
-
-    Args:
-        frame: The first frame.
-        environment: The light, exposure included.
-        path: JSON file where findings are kept.
-        key: What they depend on.
-
-    Returns:
-        Findings as records.
-
-    Raises:
-        InvalidOptionError: The light is black, or the images show something else than the Gaussians.
-    """
-    # Whatever is wrong with what was kept, it is found again.
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        known = json.loads(path.read_text(encoding="utf-8"))
-        if known["key"] == key:
-            return list(known["findings"])
-    with frame.log.timer("check"):
-        findings = [vars(finding) for finding in _judge(frame, environment)]
-    write_json(path, {"key": key, "findings": findings})
-    return findings
 
 
 def _judge(frame: SeenFrame, environment: EnvironmentMap) -> list[Finding]:

@@ -7,50 +7,45 @@
     solve     `beam_warp.decomposition.solve`           base colour from the evidence
     write     `beam_warp.decomposition.result`          asset, contact sheet and report
 
-Records go from each step to the next. What is finished is also kept in a folder
-(`beam_warp.decomposition.archive`), with which a stopped job continues.
+The first four are steps of a plan (`beam_warp.decomposition.work`), which says what of them is done: a stopped job
+continues. What they find is kept in a folder (`beam_warp.decomposition.archive`), from which the last two read.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.digests import CaptureDigests
 from beam_warp.checks import require_path
 from beam_warp.converters.numbering import ASSET_NAME
 from beam_warp.converters.staging import require_writable
-from beam_warp.decomposition.archive import FrameArchive
-from beam_warp.decomposition.capture_images import CaptureImages
-from beam_warp.decomposition.capture_light import light_findings, prepare_light
-from beam_warp.decomposition.measure import FrameMeasurement
+from beam_warp.decomposition.frames import GivenFrames
 from beam_warp.decomposition.options import OverviewOptions, RunOptions
 from beam_warp.decomposition.plan import JobPlan
-from beam_warp.decomposition.result import draw_overview, relightable_sequence, run_report
-from beam_warp.decomposition.roughness_finder import RoughnessFinder
-from beam_warp.decomposition.solve import solve_each, solve_jointly, take
-from beam_warp.decomposition.source import Source
+from beam_warp.decomposition.result import Measurements, draw_overview, relightable_sequence, run_report
+from beam_warp.decomposition.solve import SolvedFrames, solve_frame, solve_jointly, take, take_each
+from beam_warp.decomposition.work import MaterialWork
 from beam_warp.device.arrays import resolve_device
-from beam_warp.digests import array_digest, code_digest
-from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import StageProgress, no_progress
-from beam_warp.jobs.progress import JobLog
 from beam_warp.jobs.report import REPORT_NAME, write_report
-from beam_warp.jobs.store import make_folders
-from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.outputs import remove_leftovers
+from beam_warp.plan.carry import Counted, carry_out
+from beam_warp.plan.steps import Receipt
+from beam_warp.plan.workers import Crew, in_process
+from beam_warp.reconstruction.job import FrameWork, Reconstruction
 from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
+
+COUNTED = {"materials": "decompose"}
+"""Stages that a listener hears of when a step is done, and what they are called."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,7 @@ def run(
     capture: Capture | None = None,
     overview: OverviewOptions | None = None,
     progress: StageProgress = no_progress,
+    crew: Crew = in_process,
 ) -> RunResult:
     """Decompose a sequence; write ``out/asset.usda``, its layers, ``out/report.json`` and ``out/overview.png``.
 
@@ -97,6 +93,7 @@ def run(
             and base colour explains what they show. None takes the Gaussians' own colour for it.
         overview: See `OverviewOptions`.
         progress: Called with (stage, done, total).
+        crew: Who does the work: this process, or others, which must be able to unpickle the sequence.
 
     Raises:
         InvalidArrayError: A frame has no captured radiance.
@@ -107,69 +104,118 @@ def run(
     Source: BEAM §3.2, by the direct path (see `beam_warp.materials.direct`).
     """
     started = time.perf_counter()
-    chosen = options or RunOptions()
-    device = resolve_device(chosen.device)  # before a folder is made that would then stay empty
-    out = require_path("out", out)
-    images = None if capture is None else CaptureImages(capture, sequence)
-    if chosen.images is not None and images is None:
-        raise InvalidOptionError(
-            "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
-        )
+
+    def told(stage: str, done: int, total: int, note: str = "") -> None:
+        progress(stage, done, total)
+
+    work = MaterialWork(
+        require_path("out", out),
+        GivenFrames(read=lambda: sequence, seen=capture),
+        environment,
+        options or RunOptions(),
+        told,
+    )
+    return run_materials(work, overview, started, crew)
+
+
+def run_materials(
+    work: MaterialWork, overview: OverviewOptions | None, started: float, crew: Crew = in_process
+) -> RunResult:
+    """Do what `run` does with frames that every worker reads for itself.
+
+    Args:
+        work: Input, options and folder.
+        overview: See `OverviewOptions`.
+        started: When the job began, by `time.perf_counter` [s].
+        crew: Who does the work.
+    """
+    notes = _prepare(work)
+    plan = work.plan()
+    receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), Counted(plan, COUNTED, work.progress))
+    return _finish(work, receipts, notes, overview or OverviewOptions(), started)
+
+
+@dataclass(frozen=True)
+class TakeResult:
+    """What a capture became.
+
+    Attributes:
+        reconstruction: Its Gaussians.
+        result: The relightable asset.
+    """
+
+    reconstruction: Reconstruction
+    result: RunResult
+
+
+def run_capture(
+    frames: FrameWork, work: MaterialWork, overview: OverviewOptions | None, started: float, crew: Crew = in_process
+) -> TakeResult:
+    """Reconstruct a capture and decompose it in one plan: the materials of a frame do not wait for all other frames.
+
+    Args:
+        frames: The capture, and how it is reconstructed.
+        work: How the frames are decomposed; its frames are `ReconstructedFrames`.
+        overview: See `OverviewOptions`.
+        started: When the job began, by `time.perf_counter` [s].
+        crew: Who does the work.
+
+    Raises:
+        UnfinishedError: Several frames failed; the others are kept.
+        BeamError: As `run` and `beam_warp.reconstruction.job.reconstruct`.
+    """
+    with closing(frames):
+        notes = _prepare(work)
+        plan = work.plan().with_steps_of(frames.plan())
+        watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
+        receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
+        found = frames.finish(receipts, started, work.progress)
+        return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
+
+
+def _prepare(work: MaterialWork) -> list[str]:
+    """Check everything, and then make the folders."""
+    resolve_device(work.options.device)  # before a folder is made that would then stay empty
     for name in (ASSET_NAME, OVERVIEW_NAME, REPORT_NAME):
-        require_writable(out / name, is_made=True)
-    folder, digests = make_folders(out, "frames", "digests")
-    notes = [*remove_leftovers(out, folder, digests), *(images.notes if images is not None else ())]
-    log = JobLog(progress, len(sequence), device)
-    source = Source(
-        sequence=sequence, images=images, options=chosen, digests=CaptureDigests(digests), device=str(device), log=log
-    )
-    described = _described(chosen, images, is_cuda=device.is_cuda)
-    light = prepare_light(environment, source, described, folder)
-    plan = JobPlan(
-        source=source,
-        light=light,
-        persistent=chosen.persistent or sequence.topology == "constant",
-        key=array_digest(light.environment.radiance, text=described),
-        archive=FrameArchive(folder, source.first.cloud.radiance_color_space),
-    )
-    notes += plan.archive.remove_beyond(len(sequence))
-    first_key = source.key(plan.key, source.first)
-    findings = light_findings(source.first, light.environment, folder / "findings.json", first_key)
-    findings += [vars(finding) for finding in light.findings]
-    roughness = RoughnessFinder(plan)
-    frames = FrameMeasurement(plan, roughness)
-    if chosen.images is not None:
-        solved = take(plan, frames)
-    else:
-        solved = solve_jointly(plan, frames) if plan.persistent else solve_each(plan, frames)
-    relightable = relightable_sequence(plan, solved)
+        require_writable(work.folder / name, is_made=True)
+    return work.prepare()
+
+
+def _finish(
+    work: MaterialWork, receipts: Mapping[str, Receipt], notes: list[str], overview: OverviewOptions, started: float
+) -> RunResult:
+    """Solve for base colour where frames share it, and write asset, contact sheet and report."""
+    source = replace(work.source, sequence=work.frames.whole())
+    plan, out, log = replace(work.job, source=source), work.folder, source.log
+    made = Measurements.of(receipts, work.frames.numbers())
+    notes = [*notes, *(work.images.notes if work.images is not None else ())]
+    notes += plan.archive.remove_beyond(len(source.sequence))
+    solved, persistent = _solve(work, plan, made)
+    relightable = relightable_sequence(plan, solved, persistent=persistent)
     with staged_folder(out / "results") as staged:  # all of them appear, or none
         with log.timer("write asset"):
             layers = converters.write(relightable, staged / ASSET_NAME)
         with log.timer("overview"):
-            progress("overview", 0, 1)
-            draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview or OverviewOptions())
-            progress("overview", 1, 1)
+            work.progress("overview", 0, 1)
+            draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview)
+            work.progress("overview", 1, 1)
         seconds = time.perf_counter() - started
-        report = run_report(plan, frames, solved, findings=findings, roughness=roughness.report, seconds=seconds)
+        report = run_report(plan, made, solved, findings=work.findings(), persistent=persistent, seconds=seconds)
         report["input"]["notes"] += notes
         write_report(staged, report)
         publish_asset(staged, [REPORT_NAME, OVERVIEW_NAME, *(path.name for path in layers)], out)
-    return RunResult(out / ASSET_NAME, out / OVERVIEW_NAME, relightable, light.environment, report)
+    return RunResult(out / ASSET_NAME, out / OVERVIEW_NAME, relightable, plan.light.environment, report)
 
 
-def _described(options: RunOptions, images: CaptureImages | None, *, is_cuda: bool) -> str:
-    """Return the code and the options that stored results depend on; input and light are not among them."""
-    source = options.roughness
-    files = [source.texture, source.mesh] if isinstance(source, RoughnessTexture) else []
-    return json.dumps(
-        {
-            "code": code_digest(),
-            "device": "cuda" if is_cuda else "cpu",
-            "options": options.as_dict(),
-            "raster": None if images is None else asdict(images.raster),
-            "evidence": ColorEvidence.ARRAYS,
-            "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
-        },
-        sort_keys=True,
-    )
+def _solve(work: MaterialWork, plan: JobPlan, made: Measurements) -> tuple[SolvedFrames, bool]:
+    """Return the frames with base colour, and whether row i is the same Gaussian in all of them."""
+    persistent = work.options.persistent or plan.source.sequence.topology == "constant"
+    frames = map(plan.archive.read, range(len(plan.source.sequence)))
+    if work.options.images is not None:
+        return take(plan, frames), persistent
+    if persistent:
+        return solve_jointly(plan, frames), persistent
+    if work.solves:
+        return take_each(plan, frames, made.clipped), persistent
+    clipped = [solve_frame(plan, frame) for frame in frames]  # tracking was lost in what was planned as one segment
+    return take_each(plan, map(plan.archive.read, range(len(clipped))), clipped), persistent

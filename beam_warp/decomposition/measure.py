@@ -1,8 +1,9 @@
-"""Fourth step of the main job: measure every frame under the light of the capture, or find it finished."""
+"""Fourth step of the main job: measure a frame under the light of the capture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,7 @@ from numpy.typing import NDArray
 
 from beam_warp.decomposition.archive import MeasuredFrame
 from beam_warp.decomposition.plan import JobPlan
-from beam_warp.decomposition.roughness_finder import RoughnessFinder
 from beam_warp.decomposition.seen import SeenFrame
-from beam_warp.digests import array_digest
 from beam_warp.materials.direct import ColorEvidence, measure_materials
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.world.gaussians import Observability
@@ -20,47 +19,25 @@ from beam_warp.world.gaussians import Observability
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
 
 
+@dataclass(eq=False)
 class FrameMeasurement:
-    """Measures frames one after the other, and keeps each in an archive.
+    """Measures one frame.
 
     Attributes:
-        resumed: Frames that were found finished.
-        ray_count: Rays of light and occlusion that were traced for the others.
+        plan: Light and options.
+        roughness: ``roughness`` of the frame's Gaussians, ``(N,)``, and ``roughness_error`` where it is estimated.
+        ray_count: Rays of light and occlusion that were traced.
         notes: What a reader of the result should know.
     """
 
-    def __init__(self, plan: JobPlan, roughness: RoughnessFinder) -> None:
-        """Start with no frame; ``roughness`` finds that of each."""
-        self.resumed = 0
-        self.ray_count = 0
-        self.notes: list[str] = []
-        self._plan, self._roughness = plan, roughness
+    plan: JobPlan
+    roughness: Mapping[str, NDArray[np.float32]]
+    ray_count: int = 0
+    notes: list[str] = field(default_factory=list)
 
-    def __iter__(self) -> Iterator[MeasuredFrame]:
-        """Measure the frames in their order; each is stored before it is given out."""
-        plan = self._plan
-        total = len(plan.source.sequence)
-        previous: MeasuredFrame | None = None
-        for number in range(total):
-            frame = plan.source.frame(number)
-            key = plan.source.key(plan.key, frame)
-            if previous is not None:  # what is found then depends on what was found before
-                key = array_digest(text=f"{key} {previous.key}")
-            measured = plan.archive.find(number, key)
-            if measured is None:
-                measured = self._measure(frame, key, previous)
-                with plan.source.log.timer("store"):
-                    plan.archive.keep(measured)
-                frame.forget()
-            else:
-                self.resumed += 1
-            plan.source.log.report("decompose", number + 1, total)
-            previous = measured if plan.persistent and plan.source.options.images is not None else None
-            yield measured
-
-    def _measure(self, frame: SeenFrame, key: str, previous: MeasuredFrame | None) -> MeasuredFrame:
-        """Measure one frame."""
-        images, evidence = self._plan.source.options.images, None
+    def measure(self, frame: SeenFrame, previous: MeasuredFrame | None) -> MeasuredFrame:
+        """Measure a frame; on the image path, colours follow those of the frame before, if it has the same rows."""
+        images, evidence = self.plan.source.options.images, None
         if images is not None:
             arrays = self._by_images(frame, images, previous)
         else:
@@ -68,7 +45,6 @@ class FrameMeasurement:
         surface, report = frame.surface, frame.scene.report
         return MeasuredFrame(
             number=frame.number,
-            key=key,
             cloud=frame.cloud.with_arrays(normals=surface.normals, normal_confidence=surface.confidence, **arrays),
             evidence=evidence,
             from_shape=surface.from_shape,
@@ -77,16 +53,15 @@ class FrameMeasurement:
 
     def _by_rays(self, frame: SeenFrame) -> tuple[dict[str, NDArray[Any]], ColorEvidence]:
         """Measure a frame by rays from its Gaussians: occlusion, and evidence on base colour."""
-        scene, points, views = frame.scene, frame.points, frame.views
-        roughness = self._roughness.arrays(frame)
+        scene, points, views, roughness = frame.scene, frame.points, frame.views, self.roughness
         with frame.log.timer("materials"):
             measured = measure_materials(
                 frame.cloud,
                 scene,
                 points,
                 roughness["roughness"],
-                self._plan.light.prepared,
-                options=self._plan.source.options.gathering,
+                self.plan.light.prepared,
+                options=self.plan.source.options.gathering,
                 views=views,
                 frame=frame.number,
                 progress=frame.log.within("materials", frame.number),
@@ -102,7 +77,7 @@ class FrameMeasurement:
     ) -> dict[str, NDArray[Any]]:
         """Measure a frame by rays from the pixels of its views, baked into its Gaussians: all materials at once."""
         assert frame.capture is not None
-        scene, roughness = frame.scene, self._roughness.arrays(frame)
+        scene, roughness = frame.scene, self.roughness
         views = frame.images()
         with frame.log.timer("materials"):
             found = decompose_by_images(
@@ -110,7 +85,7 @@ class FrameMeasurement:
                 scene,
                 views,
                 roughness["roughness"],
-                self._plan.light.prepared,
+                self.plan.light.prepared,
                 options,
                 raster_options=frame.capture.raster,
                 previous=None if previous is None else previous.cloud.base_color,
@@ -118,7 +93,7 @@ class FrameMeasurement:
                 progress=frame.log.within("materials", frame.number),
             )
         self.ray_count += found.ray_count
-        self.notes += [note for note in found.notes if note not in self.notes]
+        self.notes += found.notes
         return {
             "ambient_occlusion": found.ambient_occlusion,
             **roughness,

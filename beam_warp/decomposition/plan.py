@@ -16,13 +16,9 @@ class JobPlan:
     Attributes:
         source: The frames, and how they are measured.
         light: The light of the capture.
-        persistent: Whether row i is the same Gaussian in every frame.
-        key: Key of the code, the options and the light.
         archive: Finished frames.
     """
 
     source: Source
     light: CaptureLight
-    persistent: bool
-    key: str
     archive: FrameArchive

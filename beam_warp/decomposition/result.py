@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +11,14 @@ import numpy as np
 
 from beam_warp._version import __version__
 from beam_warp.capture.findings import Finding
-from beam_warp.decomposition.measure import FrameMeasurement
 from beam_warp.decomposition.options import ESTIMATE, OverviewOptions
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.solve import SolvedFrames
 from beam_warp.decomposition.tally import warnings_about
+from beam_warp.decomposition.work import material_step
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
+from beam_warp.plan.steps import Receipt
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera
@@ -23,20 +26,70 @@ from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 
-def relightable_sequence(plan: JobPlan, solved: SolvedFrames) -> GaussianSequence:
-    """Return the frames that were solved as a sequence, read lazily, in the world's axes."""
+@dataclass(frozen=True)
+class Measurements:
+    """What the steps of a job said in their receipts.
+
+    Attributes:
+        resumed: Frames that were found finished.
+        ray_count: Rays of light and occlusion that were traced for the others.
+        notes: What a reader of the result should know.
+        clipped: Part of the opacity that was cut at 1, of each frame that was solved by itself.
+        roughness: How the last estimate of roughness came about; empty if none was made.
+        seconds: By stage, spent by all workers on steps of this call.
+        workers: Machines and processes that did the steps.
+    """
+
+    resumed: int
+    ray_count: int
+    notes: list[str]
+    clipped: list[float]
+    roughness: dict[str, Any]
+    seconds: dict[str, float]
+    workers: list[str]
+
+    @classmethod
+    def of(cls, receipts: Mapping[str, Receipt], numbers: Sequence[int]) -> Measurements:
+        """Add up the receipts of all steps, given what the frames are called."""
+        frames = [receipts[material_step(number)] for number in numbers]
+        steps = [*filter(None, map(receipts.get, ("light", "roughness"))), *frames]
+        fresh = [step for step in steps if not step.is_kept]
+        estimates = [step.facts["roughness"] for step in steps if "roughness" in step.facts]
+        seconds: dict[str, float] = {}
+        for step in fresh:
+            for stage, spent in step.facts["seconds"].items():
+                seconds[stage] = seconds.get(stage, 0.0) + spent
+        return cls(
+            resumed=sum(frame.is_kept for frame in frames),
+            ray_count=sum(frame.facts["rays"] for frame in frames if not frame.is_kept),
+            notes=list(dict.fromkeys(note for frame in frames for note in frame.facts["notes"])),
+            clipped=[frame.facts.get("clipped", 0.0) for frame in frames],
+            roughness=estimates[-1] if estimates else {},
+            seconds=seconds,
+            workers=sorted({step.worker for step in steps}),
+        )
+
+
+def relightable_sequence(plan: JobPlan, solved: SolvedFrames, *, persistent: bool) -> GaussianSequence:
+    """Return the frames that were solved as a sequence, read lazily, in the world's axes.
+
+    Args:
+        plan: The job.
+        solved: Its frames.
+        persistent: Whether row i is the same Gaussian in every frame.
+    """
     sequence, options = plan.source.sequence, plan.source.options
     shared = sequence.constant & set(ATTRIBUTES) - {"normals"}
     if not solved.is_varying:
         shared |= {"base_color", "base_color_error", "observability"}
-    if plan.persistent:
+    if persistent:
         shared |= {"roughness", "roughness_error"} if options.roughness == ESTIMATE else {"roughness"}
     return GaussianSequence(
         frame_count=len(sequence),
         read_frame=solved.cloud,
         frames_per_second=sequence.frames_per_second,
         constant=frozenset(shared),
-        topology="constant" if plan.persistent else "perFrame",
+        topology="constant" if persistent else "perFrame",
         metadata={
             **sequence.metadata,
             "generator": f"beam-warp {__version__}",
@@ -84,41 +137,43 @@ def _light_in_words(plan: JobPlan) -> str:
 
 def run_report(
     plan: JobPlan,
-    measurement: FrameMeasurement,
+    made: Measurements,
     solved: SolvedFrames,
     *,
     findings: list[dict[str, Any]],
-    roughness: dict[str, Any],
+    persistent: bool,
     seconds: float,
 ) -> dict[str, Any]:
     """Return what was done, found and spent, JSON-able.
 
     Args:
         plan: The job.
-        measurement: How its frames were measured.
+        made: What its steps said.
         solved: Its relightable frames.
         findings: Findings about the light and the images.
-        roughness: How an estimate of roughness came about.
+        persistent: Whether row i is the same Gaussian in every frame.
         seconds: Duration of the whole job.
     """
-    sequence, count, stages = plan.source.sequence, len(plan.source.first.cloud), plan.source.log.timer.seconds
+    sequence, count, own = plan.source.sequence, len(plan.source.first.cloud), plan.source.log.timer.seconds
+    stages = {stage: made.seconds.get(stage, 0.0) + own.get(stage, 0.0) for stage in made.seconds | own}
     traced = stages.get("materials", 0.0)
-    notes = [*sequence.metadata.get("notes", "").splitlines(), *measurement.notes, *_lines(findings, "note")]
+    notes = [*sequence.metadata.get("notes", "").splitlines(), *made.notes, *_lines(findings, "note")]
     return {
         "input": {"frames": len(sequence), "gaussians": count, "notes": notes},
         "device": device_facts(plan.light.prepared.device),
+        "workers": made.workers,
         "versions": versions(),
         "options": plan.source.options.as_dict(),
         "light": _light_in_words(plan),
         "exposure_stops": plan.light.stops,
         "exposure_is_fitted": plan.light.is_fitted,
         **plan.light.as_record(),
-        "resumed_frames": measurement.resumed,
-        "persistent": plan.persistent,
+        "resumed_frames": made.resumed,
+        "persistent": persistent,
         "materials": solved.statistics,
-        "roughness": roughness,
+        "roughness": made.roughness,
         "seconds": {**stages, "total": seconds},
-        "light_and_occlusion_rays_per_second": measurement.ray_count / traced if traced > 0.0 else None,
+        "light_and_occlusion_rays_per_second": made.ray_count / traced if traced > 0.0 else None,
         "findings": findings,
         "warnings": [*_lines(findings, "warning"), *warnings_about(solved.statistics)],
     }

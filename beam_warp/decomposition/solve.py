@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,14 +47,19 @@ def take(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
     return SolvedFrames(plan.archive, False, True, tally.summary())
 
 
-def solve_each(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
-    """Solve every frame by itself: its Gaussians are those of no other. Solutions are stored."""
+def solve_frame(plan: JobPlan, frame: MeasuredFrame) -> float:
+    """Solve a frame by itself, where its Gaussians are those of no other; return the part of the opacity cut at 1."""
+    with plan.source.log.timer("solve"):
+        solved = _solve(plan, frame, _evidence(frame))
+        plan.archive.keep_solution(frame.number, solved)
+    return solved.clipped_part
+
+
+def take_each(plan: JobPlan, frames: Iterable[MeasuredFrame], clipped: Sequence[float]) -> SolvedFrames:
+    """Take frames that were solved by themselves, given the part of the opacity of each that was cut at 1."""
     tally = MaterialTally()
-    for frame in frames:
-        with plan.source.log.timer("solve"):
-            solved = _solve(plan, frame, _evidence(frame))
-            plan.archive.keep_solution(frame.number, plan.key, solved)
-            tally.add(frame, frame.cloud.with_arrays(**solved.arrays()), solved.clipped_part)
+    for frame, part in zip(frames, clipped, strict=True):
+        tally.add(frame, frame.cloud.with_arrays(**plan.archive.solution(frame.number)), part)
     return SolvedFrames(plan.archive, True, True, tally.summary())
 
 
@@ -81,7 +86,7 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrame
         for number in range(count if is_varying else 1):
             frame = first if number == 0 else plan.archive.read(number)
             solved = with_changes(constant, change, _evidence(frame))
-            plan.archive.keep_solution(number, plan.key, solved)
+            plan.archive.keep_solution(number, solved)
             if number == 0:
                 tally.add(first, first.cloud.with_arrays(**solved.arrays()), constant.clipped_part)
     tally.count_changes(change)

@@ -79,13 +79,8 @@ class Source:
         """Return the digest of a frame's images; empty without a capture."""
         return "" if self.images is None else self.images.digest(number, self.digests)
 
-    def key(self, job: str, frame: SeenFrame) -> str:
-        """Return the key of everything that the measurements of a frame depend on.
-
-        Args:
-            job: Key of the code, the options and the light.
-            frame: The frame.
-        """
+    def digest(self, frame: SeenFrame) -> str:
+        """Return the digest of a frame: its Gaussians and its images."""
         cloud = frame.cloud
-        text = f"{job} {frame.number} {cloud.radiance_color_space} {self.image_digest(frame.number)}"
+        text = f"{frame.number} {cloud.radiance_color_space} {self.image_digest(frame.number)}"
         return array_digest(*cloud.arrays().values(), text=text)

@@ -51,6 +51,15 @@ def write_frame(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             )  # same bytes again
 
 
+def is_stored_frame(path: Path) -> bool:
+    """Return whether a file is a whole one of those that `write_frame` writes, going by its structure alone."""
+    try:
+        with h5py.File(path, "r") as file:
+            return all(CHECKSUM in dataset.attrs for dataset in file.values())
+    except (OSError, KeyError, RuntimeError, ValueError):
+        return False
+
+
 def frame_names(path: Path) -> tuple[str, ...]:
     """Return the names of a stored frame's arrays."""
     with h5py.File(path, "r") as file:

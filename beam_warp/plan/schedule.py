@@ -21,7 +21,7 @@ LOSSES = 10
 """A step that lost its worker so often is given up: it is likely the reason."""
 
 REPEATS = 3
-"""A step is done again so often because its output is damaged; then it is given up, for the disk is not to be relied on."""
+"""A step is done again so often because its output is damaged; then it is given up, for the disk is unreliable."""
 
 LIKELY = 4
 """Steps that a worker is told may follow: frames are few, and what waits for a rig is all of them."""
@@ -92,7 +92,7 @@ class Schedule:
         return None
 
     def likely_after(self, step: Step) -> tuple[Step, ...]:
-        """Return the steps that are likely to follow a running one: what waits for it alone, and the first of others."""
+        """Return the steps that are likely to follow a running one: what waits for it alone, and one of the others."""
         freed = [name for name in self._dependents[step.name] if self._open[name] == 1]
         queued = [name for _, name in self._ready[:1] if self.states[name] is State.READY]
         return tuple(self.steps[name] for name in sorted(freed + queued, key=self._order.__getitem__)[:LIKELY])

@@ -1,4 +1,4 @@
-"""Who does the steps of a plan: this process, or processes of this machine; `beam_warp.plan.cluster` has several machines.
+"""Who does the steps of a plan: this process, or processes of this machine; for others see `beam_warp.plan.cluster`.
 
 All are driven in the same way: `Workers.start` gives one of them a task, `Workers.wait` returns what became of those
 that were given. A process that ends costs its task a try and is replaced.

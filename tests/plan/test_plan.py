@@ -73,7 +73,9 @@ class TestOrder:
             Schedule(steps)
 
     def test_what_needs_a_step_that_failed_is_left_out(self):
-        schedule = Schedule([Step("a", "s"), Step("b", "s", None, ("a",)), Step("c", "s", None, ("b",)), Step("d", "s")])
+        schedule = Schedule(
+            [Step("a", "s"), Step("b", "s", None, ("a",)), Step("c", "s", None, ("b",)), Step("d", "s")]
+        )
         assert schedule.next().name == "a"
         assert not schedule.failed("a")
         assert schedule.next().name == "a"
@@ -133,10 +135,12 @@ class TestKeys:
 class TestFaults:
     def test_a_poisoned_frame_is_tried_twice_and_the_rest_goes_on(self, tmp_path, whole):
         plan = toy_plan(tmp_path, faults={"frame-8": "raise", "materials-2": "raise once"})
-        with pytest.raises(UnfinishedError, match=r"1 of 42 that failed twice \(frame-8: ValueError: a poisoned frame\)"):
+        with pytest.raises(UnfinishedError, match=r"1 of 42 .* twice \(frame-8: ValueError: a poisoned frame\)"):
             here(plan)
         assert calls(plan).count("frame-8") == calls(plan).count("materials-2") == 2
-        assert whole.keys() - outputs(tmp_path).keys() == {f"{s}-{f}.bin" for f in (8, 9) for s in ("frame", "materials")}
+        assert whole.keys() - outputs(tmp_path).keys() == {
+            f"{s}-{f}.bin" for f in (8, 9) for s in ("frame", "materials")
+        }
         assert "poisoned" in (tmp_path / "plan" / "frame-8.txt").read_text()
         assert read_plan(tmp_path)[2]["given_up"] == ["frame-8"]
         here(toy_plan(tmp_path))
@@ -185,7 +189,9 @@ class TestProcesses:
         heard = []
         with pytest.raises(UnfinishedError, match="got 3 of 42 that failed twice"):
             carry_out(plan, processes(plan), lambda step, receipt, error: heard.append(error), Patience(20.0, 1.0, 1.0))
-        lost = {f"frame-{frame}.bin" for frame in range(11, 15)} | {f"materials-{f}.bin" for f in (3, 9, *range(11, 15))}
+        lost = {f"frame-{frame}.bin" for frame in range(11, 15)} | {
+            f"materials-{f}.bin" for f in (3, 9, *range(11, 15))
+        }
         assert whole.keys() - outputs(tmp_path).keys() == lost
         for said, count in (("SIGKILL", 1), ("exit code 3", 3), ("took more than", 3), ("poisoned", 2)):
             assert sum(said in error for error in heard) == count, said
@@ -263,12 +269,11 @@ def storm(folder, kills, workers, seed):
 
 
 @pytest.mark.parametrize(
-    ("kills", "workers"),
-    [(5, 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((30, 1), (100, 3)))],
+    ("kills", "workers"), [(5, 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((30, 1), (100, 3)))]
 )
 def test_a_storm_of_kills_changes_no_byte(tmp_path, whole, kills, workers):
     """Workers and drivers are killed at random, whatever they are at: in the end all is there, and nothing else."""
     for out in storm(tmp_path, kills, workers, seed=kills):
         assert outputs(out) == whole
         here(toy_plan(out))
-        assert not [path for path in out.rglob(".*")]
+        assert not list(out.rglob(".*"))

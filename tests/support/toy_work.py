@@ -72,7 +72,9 @@ def toy_plan(folder, frame_count=20, segment_length=5, **options):
     steps = [Step("cameras", "cameras", rank=9)]
     for frame in range(frame_count):
         tracked = frame % segment_length > 0
-        steps.append(Step(f"frame-{frame}", "frame", frame, ("cameras", f"frame-{frame - 1}")[: 1 + tracked], int(tracked)))
+        steps.append(
+            Step(f"frame-{frame}", "frame", frame, ("cameras", f"frame-{frame - 1}")[: 1 + tracked], int(tracked))
+        )
         steps.append(Step(f"materials-{frame}", "materials", frame, ("light", f"frame-{frame}"), 2))
     steps.append(Step("light", "light", None, ("frame-0",), 9))
     work = ToyWork(folder, **options)

@@ -1,0 +1,277 @@
+"""Steps of the main job: the light, the roughness of persistent Gaussians, and the materials of each frame."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.capture.digests import CaptureDigests
+from beam_warp.decomposition.archive import FrameArchive
+from beam_warp.decomposition.capture_images import CaptureImages
+from beam_warp.decomposition.capture_light import CaptureLight, find_light
+from beam_warp.decomposition.frames import Frames
+from beam_warp.decomposition.measure import FrameMeasurement
+from beam_warp.decomposition.options import ESTIMATE, RunOptions
+from beam_warp.decomposition.plan import JobPlan
+from beam_warp.decomposition.roughness_finder import asked_frames, find_roughness
+from beam_warp.decomposition.seen import SeenFrame
+from beam_warp.decomposition.solve import solve_frame
+from beam_warp.decomposition.source import Source
+from beam_warp.device.arrays import resolve_device
+from beam_warp.digests import array_digest, code_digest
+from beam_warp.errors import InvalidOptionError
+from beam_warp.jobs.listeners import NotedProgress, no_progress
+from beam_warp.jobs.progress import JobLog
+from beam_warp.jobs.store import make_folders, read_frame, write_frame
+from beam_warp.materials.direct import ColorEvidence
+from beam_warp.materials.roughness import RoughnessEstimate
+from beam_warp.materials.roughness_source import RoughnessTexture, stated_roughness
+from beam_warp.outputs import remove_leftovers
+from beam_warp.plan.steps import Plan, Step, Task
+from beam_warp.world.environment import EnvironmentMap
+
+LIGHT_RANK, MATERIALS_RANK = 9, 2
+"""Nothing comes before the light; materials of a frame come before another frame."""
+
+STAGES = ("light", "roughness", "materials")
+
+
+@dataclass(eq=False)
+class MaterialWork:
+    """Steps that find light, roughness and materials, each written to ``folder/frames``.
+
+    Attributes:
+        folder: Folder of the results.
+        frames: The Gaussians, and their images.
+        environment: The light as it was given.
+        options: How frames are measured.
+        progress: Told how far a step is, in the process that this is made in.
+    """
+
+    folder: Path
+    frames: Frames
+    environment: EnvironmentMap
+    options: RunOptions
+    progress: NotedProgress = no_progress
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what other processes need: nothing that was read, and nobody who hears them."""
+        return {**{field.name: vars(self)[field.name] for field in fields(self)}, "progress": no_progress}
+
+    def prepare(self) -> list[str]:
+        """Check what can be checked, make the folders and remove what a killed call has left; return notes.
+
+        Raises:
+            InvalidOptionError: The capture lacks a frame, or there is none for the image path.
+            OutputError: A folder cannot be made.
+        """
+        if self.frames.are_made and self.images is None and self.options.images is not None:
+            raise InvalidOptionError(
+                "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
+            )
+        return remove_leftovers(self.folder, *make_folders(self.folder, "frames", "digests"))
+
+    def plan(self) -> Plan:
+        """Return the steps."""
+        numbers = self.frames.numbers()
+        made = [self.frames.step(number) for number in numbers]
+        steps, shared = [Step("light", "light", None, made[0], LIGHT_RANK)], ("light",)
+        if self.options.roughness == ESTIMATE and self._may_be_persistent:
+            inputs = ("light", *(name for names in made for name in names))
+            steps.append(Step("roughness", "roughness", None, inputs, LIGHT_RANK))
+            shared = (*shared, "roughness")
+        for index, number in enumerate(numbers):
+            before = (material_step(numbers[index - 1]),) if index and self._follows else ()
+            inputs = (*shared, *made[index], *before)
+            steps.append(Step(material_step(number), "materials", number, inputs, MATERIALS_RANK))
+        return Plan(self.folder, tuple(steps), dict.fromkeys(STAGES, self))
+
+    @property
+    def _may_be_persistent(self) -> bool:
+        return self.options.persistent or self.frames.may_be_constant
+
+    @property
+    def _follows(self) -> bool:
+        """Whether colours of a frame follow those of the frame before."""
+        return self.options.images is not None and self._may_be_persistent
+
+    @property
+    def solves(self) -> bool:
+        """Whether each frame is solved by itself, as soon as it is measured."""
+        return self.options.images is None and not self._may_be_persistent
+
+    @cached_property
+    def device(self) -> Any:
+        """Warp device."""
+        return resolve_device(self.options.device)
+
+    @property
+    def device_kind(self) -> str:
+        """Kind of device, "cuda" or "cpu"."""
+        return "cuda" if self.device.is_cuda else "cpu"
+
+    @cached_property
+    def images(self) -> CaptureImages | None:
+        """Images of the capture, if there is one."""
+        capture = self.frames.capture()
+        return None if capture is None else CaptureImages(capture, self.frames.sequence())
+
+    @cached_property
+    def source(self) -> Source:
+        """Where frames are read."""
+        sequence = self.frames.sequence()
+        return Source(
+            sequence=sequence,
+            images=self.images,
+            options=self.options,
+            digests=CaptureDigests(self.folder / "digests"),
+            device=str(self.device),
+            log=JobLog(self.progress, len(sequence), self.device),
+        )
+
+    @cached_property
+    def archive(self) -> FrameArchive:
+        """Where results are."""
+        return FrameArchive(self.folder / "frames", self.source.first.cloud.radiance_color_space)
+
+    def stored(self, name: str) -> Path:
+        """Return the file of what is found once."""
+        return self.folder / "frames" / f"{name}.h5"
+
+    @cached_property
+    def job(self) -> JobPlan:
+        """What measuring needs, when the light is found."""
+        light = CaptureLight.of(self.environment, read_frame(self.stored("light")), self.source)
+        return JobPlan(source=self.source, light=light, archive=self.archive)
+
+    def findings(self) -> list[dict[str, Any]]:
+        """Return what was found about the light and the images."""
+        return list(json.loads(read_frame(self.stored("light"), ("findings",))["findings"].tobytes()))
+
+    def common(self) -> str:
+        """Return the code and the options that results depend on."""
+        return self._common
+
+    @cached_property
+    def _common(self) -> str:
+        source, images = self.options.roughness, self.images
+        files = [source.texture, source.mesh] if isinstance(source, RoughnessTexture) else []
+        content = {
+            "code": code_digest(),
+            "device": self.device_kind,
+            "options": self.options.as_dict(),
+            "raster": None if images is None else asdict(images.raster),
+            "evidence": ColorEvidence.ARRAYS,
+            "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
+        }
+        return json.dumps(content, sort_keys=True)
+
+    def digest(self, step: Step) -> str:
+        """Return the digest of the light, or of frames that no other step makes; others are known by their keys."""
+        if step.stage == "light":
+            text = self._frame_digest(0) + str(self.source.is_display_referred())
+            return array_digest(self.environment.radiance, text=f"{text} {self.source.has_light}")
+        if step.stage == "roughness":
+            return " ".join(map(self._frame_digest, asked_frames(len(self.source.sequence))))
+        return f"{self.solves} {self._frame_digest(self._place(step))}"
+
+    def _frame_digest(self, index: int) -> str:
+        number = self.frames.numbers()[index]
+        return str(index) if self.frames.step(number) else self.source.digest(self._frame(index))
+
+    def _frame(self, index: int) -> SeenFrame:
+        """Return a frame; the latest one is not read again."""
+        if index == 0:
+            return self.source.first
+        latest: SeenFrame | None = vars(self).get("_latest")
+        if latest is None or latest.number != index:
+            latest = vars(self)["_latest"] = self.source.frame(index)
+        return latest
+
+    def _place(self, step: Step) -> int:
+        assert step.frame is not None
+        return self._places[step.frame]
+
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        return {number: index for index, number in enumerate(self.frames.numbers())}
+
+    def outputs(self, step: Step) -> tuple[Path, ...]:
+        """Return the files of a step."""
+        if step.frame is None:
+            return (self.stored(step.stage),)
+        index = self._place(step)
+        return (self.archive.frame_path(index), *([self.archive.solution_path(index)] if self.solves else []))
+
+    def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
+        """Find the light or the roughness, or measure a frame."""
+        seconds = self.source.log.timer.seconds
+        seconds.clear()
+        if task.step.stage == "light":
+            facts = self._find_light()
+        elif task.step.stage == "roughness":
+            facts = self._find_roughness()
+        else:
+            facts = self._measure(self._place(task.step))
+        facts = {**facts, "seconds": dict(seconds)}
+        seconds.clear()
+        return facts
+
+    def _find_light(self) -> dict[str, Any]:
+        found = find_light(self.environment, self.source)
+        write_frame(self.stored("light"), found)
+        return {}
+
+    def _find_roughness(self) -> dict[str, Any]:
+        """Find what persistent Gaussians share; nothing where tracking was lost, so that they are not persistent."""
+        if not (self.options.persistent or self.frames.whole().topology == "constant"):
+            write_frame(self.stored("roughness"), {})
+            return {}
+        asked = asked_frames(len(self.source.sequence))
+        estimate = find_roughness(self.job, map(self._frame, asked))
+        write_frame(self.stored("roughness"), _roughness_arrays(estimate))
+        return {"roughness": estimate.report}
+
+    def _measure(self, index: int) -> dict[str, Any]:
+        """Measure a frame and store it."""
+        frame, facts = self._frame(index), dict[str, Any]()
+        measurement = FrameMeasurement(self.job, self._roughness(frame, facts))
+        measured = measurement.measure(frame, self.archive.read(index - 1) if index and self._follows else None)
+        with self.source.log.timer("store"):
+            self.archive.keep(measured)
+        frame.forget()
+        if self.solves:
+            facts["clipped"] = solve_frame(self.job, measured)
+        return facts | {"rays": measurement.ray_count, "notes": measurement.notes}
+
+    def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
+        """Return the roughness of a frame: stated, what all frames share, or its own, whose report joins the facts."""
+        if self.options.roughness != ESTIMATE:
+            return {"roughness": stated_roughness(frame.original, self.options.roughness)}
+        shared = read_frame(self.stored("roughness")) if self._may_be_persistent else {}
+        if shared:
+            return shared
+        estimate = find_roughness(self.job, [frame])
+        facts["roughness"] = estimate.report
+        return _roughness_arrays(estimate)
+
+    def measured(self) -> list[str]:
+        """Return the names of the steps that measure frames, in the order of the frames."""
+        return [material_step(number) for number in self.frames.numbers()]
+
+
+def material_step(number: int) -> str:
+    """Return the name of the step that measures a frame."""
+    return f"materials-{number:06d}"
+
+
+def _roughness_arrays(estimate: RoughnessEstimate) -> dict[str, NDArray[np.float32]]:
+    return {"roughness": estimate.roughness, "roughness_error": estimate.standard_error}
