@@ -14,7 +14,8 @@ FLOORS = """
 errors checks digests archives blocks outputs kernels
 image device
 world
-light schema jobs plan
+light schema jobs
+plan
 trace converters
 raster capture
 mesh render interop
@@ -51,7 +52,6 @@ WITHOUT_WARP = {
     "archives",
     "blocks",
     "outputs",
-    "plan",
     "image",
     "world",
     "schema",

@@ -10,13 +10,13 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.capture.capture import Capture
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
+from beam_warp.cli.common.flags import Device, Json, Quiet, Seed, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from beam_warp.reconstruction.frames.protocols import FrameSteps
-    from beam_warp.reconstruction.job import ReconstructOptions, SegmentShare
+    from beam_warp.reconstruction.job import ReconstructOptions
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Modelling:
         arg(help="Schedule: ours, few steps (for a CPU), the paper's 7,000 + 5,000, or like RaDe-GS's."),
     ] = "fast"
     segment_length: Annotated[
-        int, arg(metavar="K", help="Frames from one key frame to the next, which parts share out; 0 for one segment.")
+        int, arg(metavar="K", help="Frames from one key frame to the next, which workers share out; 0 for one segment.")
     ] = 0
     cameras: Annotated[
         Literal["refine", "keep"],
@@ -51,8 +51,8 @@ class Reconstruct:
     """Reconstruct a multi-view capture as Gaussians with captured colour, tracked over time.
 
     Writes OUT/gaussians.usda (+ layers), OUT/report.json, OUT/previews/frame_*.png and, as it goes, OUT/frames. A job
-    that was stopped continues where it was when it is called again. Segments (--segment-length) may be shared out:
-    run --part 1/4 … --part 4/4 anywhere, then the same command without --part.
+    that was stopped continues where it was when it is called again. Segments (--segment-length) are shared out among
+    workers; `beam plan OUT` says how far they are.
 
     Example: beam reconstruct captures/walker --gaussians 20000 --out walker
     """
@@ -60,9 +60,7 @@ class Reconstruct:
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE", help="Folder of a capture: images and cameras.")]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
-    part: Annotated[
-        str | None, arg(metavar="I/N", help="Only every N-th segment from the I-th on, without the asset.")
-    ] = None
+    workers: Workers = "1"
     seed: Seed = 0
     device: Device = None
     quiet: Quiet = False
@@ -71,24 +69,16 @@ class Reconstruct:
 
 def reconstruct(args: Reconstruct) -> int:
     """Reconstruct and say what came out."""
-    part = None if args.part is None else part_of(args.part)
     capture = Capture.read(args.capture)
     options = options_of(args.modelling, capture)
     steps = steps_of(args.modelling, capture, args.seed, args.device)
 
+    from beam_warp.plan.crew import crew_of
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
-    from beam_warp.reconstruction.job import reconstruct_part
 
-    if part is not None:
-        with progress(args.quiet or args.json) as report:
-            frames = reconstruct_part(capture, args.out, steps, part, options, progress=report)
-        if args.json:
-            print_json({"part": args.part, "frames": list(frames)})
-        elif not args.quiet:
-            print(f"part {args.part}: {len(frames)} frame{'' if len(frames) == 1 else 's'} ready in {args.out}")
-        return 0
+    crew = crew_of(args.workers, args.device)
     with progress(args.quiet or args.json) as report:
-        result = reconstruct_capture(capture, args.out, steps, options, progress=report)
+        result = reconstruct_capture(capture, args.out, steps, options, progress=report, crew=crew)
     if args.json:
         print_json(result.report)
     elif not args.quiet:
@@ -158,17 +148,3 @@ def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:
             "the range."
         )
     return tuple(found)
-
-
-def part_of(words: str) -> SegmentShare:
-    """Return the part that ``I/N`` asks for.
-
-    Raises:
-        InvalidOptionError: It is none.
-    """
-    from beam_warp.reconstruction.job import SegmentShare
-
-    number, slash, count = words.partition("/")
-    if not (slash and number.isdecimal() and count.isdecimal()):
-        raise InvalidOptionError(f"part must be I/N with 1 <= I <= N, got {words}. Write 2/4 for the second of four.")
-    return SegmentShare(int(number), int(count))

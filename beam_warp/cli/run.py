@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,19 +12,19 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.checks import require_number
+from beam_warp.checks import require_number, require_path
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit, Quiet, Seed, SourceAxes
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit, Quiet, Seed, SourceAxes, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
 from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
 from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
-from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
-    from beam_warp.reconstruction.job import Reconstruction
+    from beam_warp.reconstruction.job import FrameWork
+    from beam_warp.world.gaussians import GaussianSequence
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Run:
 
     Writes OUT/asset.usda (+ layers), OUT/report.json and OUT/overview.png; of a capture, also OUT/reconstruction with
     what `beam reconstruct` writes. A job that was stopped continues where it was when it is called again with the same
-    input and options.
+    input and options, by as many workers as there are; `beam plan OUT` says how far it is.
 
     Example: beam run person.compressed.ply --environment studio.hdr --out person
 
@@ -52,6 +53,7 @@ class Run:
         bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames."), SECOND_PAGE
     ] = False
     fps: Annotated[float | None, arg(metavar="RATE", help="Frames per second; else the input's word, else 30.")] = None
+    workers: Workers = "1"
     seed: Seed = 0
     drop_invalid: Annotated[DropInvalid, SECOND_PAGE] = False
     device: Device = None
@@ -69,27 +71,26 @@ def run(args: Run) -> int:
     if args.fps is not None:
         require_number("frames_per_second", args.fps, 1e-3, 1e6)
 
-    from beam_warp.decomposition.job import run as run_pipeline
+    from beam_warp.decomposition.frames import GivenFrames, ReconstructedFrames
+    from beam_warp.decomposition.job import run_capture, run_materials
+    from beam_warp.decomposition.work import MaterialWork
+    from beam_warp.plan.crew import crew_of
 
+    crew = crew_of(args.workers, args.device)
     options = run_options(
         args.measuring, capture, preset="direct", seed=args.seed, device=args.device, persistent=args.persistent
     )
     view = overview_options(args.measuring)
     with progress(args.quiet or args.json) as report:
-        found = None if capture is None else _reconstruct(args, capture, report)
-        if found is None:
-            sequence = converters.read(
-                args.input,
-                source_axes=args.source_axes,
-                meters_per_unit=args.meters_per_unit,
-                drop_invalid=args.drop_invalid,
-            )
+        if capture is None:
+            given = GivenFrames(partial(_read, args), None)
+            work = MaterialWork(require_path("out", args.out), given, environment, options, report)
+            result, reconstruction = run_materials(work, view, started, crew), None
         else:
-            sequence, capture = found.sequence, found.capture
-        if args.fps is not None:
-            sequence = replace(sequence, frames_per_second=args.fps)
-        result = run_pipeline(sequence, environment, args.out, options, capture=capture, overview=view, progress=report)
-    reconstruction = None if found is None else found.report
+            frames = _frame_work(args, capture)
+            work = MaterialWork(args.out, ReconstructedFrames(frames, args.fps), environment, options, report)
+            both = run_capture(frames, work, view, started, crew)
+            result, reconstruction = both.result, both.reconstruction.report
     if args.json:
         print_json(result.report if reconstruction is None else {**result.report, "reconstruction": reconstruction})
     elif not args.quiet:
@@ -128,12 +129,19 @@ def _check_words(args: Run, capture: Capture | None) -> None:
         )
 
 
-def _reconstruct(args: Run, capture: Capture, report: NotedProgress) -> Reconstruction:
+def _read(args: Run) -> GaussianSequence:
+    """Read the Gaussians that a command names."""
+    sequence = converters.read(
+        args.input, source_axes=args.source_axes, meters_per_unit=args.meters_per_unit, drop_invalid=args.drop_invalid
+    )
+    return sequence if args.fps is None else replace(sequence, frames_per_second=args.fps)
+
+
+def _frame_work(args: Run, capture: Capture) -> FrameWork:
     from beam_warp.jobs.store import make_folders
-    from beam_warp.reconstruction.job import reconstruct
+    from beam_warp.reconstruction.job import FrameWork
 
     steps = steps_of(args.modelling, capture, args.seed, args.device)
-    folder = args.out / "reconstruction"
     options = options_of(args.modelling, capture)
     make_folders(args.out)
-    return reconstruct(capture, folder, steps, options, progress=report)
+    return FrameWork.prepare(capture, args.out / "reconstruction", steps, options)

@@ -22,6 +22,11 @@ class Frames(Protocol):
     are_made: bool
 
     @property
+    def have_images(self) -> bool:
+        """Whether there are images of a capture."""
+        ...
+
+    @property
     def may_be_constant(self) -> bool:
         """Whether the topology may turn out to be constant."""
         ...
@@ -65,6 +70,11 @@ class GivenFrames:
         return tuple(range(len(self.sequence())))
 
     @property
+    def have_images(self) -> bool:
+        """Whether images were given."""
+        return self.seen is not None
+
+    @property
     def may_be_constant(self) -> bool:
         """Whether the topology is constant."""
         return self.sequence().topology == "constant"
@@ -101,7 +111,7 @@ class ReconstructedFrames:
         frames_per_second: Playback rate [1/s]; None for the capture's.
     """
 
-    are_made = False
+    are_made, have_images = False, True
     work: FrameWork
     frames_per_second: float | None
 

@@ -36,6 +36,7 @@ from beam_warp.materials.roughness import RoughnessEstimate
 from beam_warp.materials.roughness_source import RoughnessTexture, stated_roughness
 from beam_warp.outputs import remove_leftovers
 from beam_warp.plan.steps import Plan, Step, Task
+from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap
 
 LIGHT_RANK, MATERIALS_RANK = 9, 2
@@ -73,10 +74,12 @@ class MaterialWork:
             InvalidOptionError: The capture lacks a frame, or there is none for the image path.
             OutputError: A folder cannot be made.
         """
-        if self.frames.are_made and self.images is None and self.options.images is not None:
+        if self.options.images is not None and not self.frames.have_images:
             raise InvalidOptionError(
                 "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
             )
+        if self.frames.are_made:
+            self.source  # noqa: B018  # the capture has all frames
         return remove_leftovers(self.folder, *make_folders(self.folder, "frames", "digests"))
 
     def plan(self) -> Plan:
@@ -162,13 +165,13 @@ class MaterialWork:
 
     @cached_property
     def _common(self) -> str:
-        source, images = self.options.roughness, self.images
+        source, has_images = self.options.roughness, self.frames.have_images
         files = [source.texture, source.mesh] if isinstance(source, RoughnessTexture) else []
         content = {
             "code": code_digest(),
             "device": self.device_kind,
             "options": self.options.as_dict(),
-            "raster": None if images is None else asdict(images.raster),
+            "raster": asdict(RasterOptions.from_metadata(self.frames.sequence().metadata)) if has_images else None,
             "evidence": ColorEvidence.ARRAYS,
             "files": [hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in files],
         }

@@ -34,6 +34,12 @@ def resolve_device(device: str | None = None) -> Any:
         raise DeviceError(f"device must be one of {known}, got {device!r}. Choose one of them.") from error
 
 
+def cuda_device_count() -> int:
+    """Return how many GPUs this process may use."""
+    _init_warp()
+    return int(wp.get_cuda_device_count())
+
+
 def device_label(device: Any) -> str:
     """Return what a table calls a device: ``cpu``, or the name of a GPU."""
     return str(device.name) if device.is_cuda else str(device)

@@ -8,7 +8,6 @@ whole job, which can be called again once there is room.
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 import traceback
@@ -20,9 +19,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError, UnfinishedError
+from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.plan.schedule import Schedule, State
 from beam_warp.plan.steps import (
-    NotedProgress,
     Plan,
     Receipt,
     Step,
@@ -30,6 +29,7 @@ from beam_warp.plan.steps import (
     awaited_files,
     is_whole,
     receipt_path,
+    version_of,
     worker_name,
     write_record,
 )
@@ -142,7 +142,7 @@ def carry_out(
     try:
         folder = plan.folder / FOLDER
         folder.mkdir(parents=True, exist_ok=True)
-        write_record(folder / PLAN_NAME, {"steps": [[*vars(step).values()] for step in plan.steps]} | _places(plan))
+        write_record(folder / PLAN_NAME, _as_record(plan))
         while not job.schedule.is_over:
             _hand_out(job)
             for outcome in workers.wait(_pause(job)):
@@ -156,9 +156,12 @@ def carry_out(
     return job.receipts
 
 
-def _places(plan: Plan) -> dict[str, Any]:
-    """Return the folder of each stage's work, relative to that of the plan."""
-    return {"places": {stage: work.folder.relative_to(plan.folder).as_posix() for stage, work in plan.works.items()}}
+def _as_record(plan: Plan) -> dict[str, Any]:
+    """Return a plan, JSON-able: its steps, and the folder and version of each stage's work."""
+    works = {
+        stage: [work.folder.relative_to(plan.folder).as_posix(), version_of(work)] for stage, work in plan.works.items()
+    }
+    return {"steps": [[*vars(step).values()] for step in plan.steps], "works": works}
 
 
 def _hand_out(job: _Job) -> None:
@@ -168,8 +171,8 @@ def _hand_out(job: _Job) -> None:
         if step is None:
             return
         following = job.schedule.likely_after(step) if job.workers.count == 1 else ()
-        inputs = [(job.plan.works[job.schedule.steps[name].stage], job.receipts[name]) for name in step.inputs]
-        awaited = tuple(entry for work, receipt in inputs for entry in awaited_files(work, receipt))
+        inputs = [(_folder(job, name), job.receipts[name]) for name in step.inputs]
+        awaited = tuple(entry for folder, receipt in inputs for entry in awaited_files(folder, receipt))
         task = Task(step, tuple(receipt.key for _, receipt in inputs), awaited, following)
         job.running[step.name] = _Running(job.workers.start(task), job.workers.now())
 
@@ -226,18 +229,18 @@ def _make_inputs_again(job: _Job, step: Step) -> bool:
     """Have damaged inputs of a step that failed made again; return whether there were any."""
     damaged = [name for name in step.inputs if not _is_sound(job, name)]
     for name in damaged:
-        receipt_path(_work(job, name), job.schedule.steps[name]).unlink(missing_ok=True)
+        receipt_path(_folder(job, name), name).unlink(missing_ok=True)
         job.errors.setdefault(name, []).append("its output was damaged or gone, and is made again")
         job.schedule.again(name)
     return bool(damaged)
 
 
 def _is_sound(job: _Job, name: str) -> bool:
-    return is_whole(_work(job, name), job.receipts[name], is_read=True)
+    return is_whole(_folder(job, name), job.receipts[name], is_read=True)
 
 
-def _work(job: _Job, name: str) -> Any:
-    return job.plan.works[job.schedule.steps[name].stage]
+def _folder(job: _Job, name: str) -> Path:
+    return job.plan.works[job.schedule.steps[name].stage].folder
 
 
 def _pause(job: _Job) -> float:
@@ -296,29 +299,3 @@ def _require_whole(job: _Job) -> None:
         f"{more}). Mend the cause or leave these frames out, and call again: all others are kept. "
         f"See {job.plan.folder / FOLDER}."
     ) from first
-
-
-def read_plan(folder: Path) -> tuple[tuple[Step, ...], dict[str, Path], Mapping[str, Any]]:
-    """Return the steps of the plan of a job, the folder of each stage's work, and what became of them.
-
-    Raises:
-        InvalidOptionError: There is no plan.
-    """
-    place = folder / FOLDER
-    try:
-        content = json.loads((place / PLAN_NAME).read_text(encoding="utf-8"))
-        steps = tuple(
-            Step(str(name), str(stage), None if frame is None else int(frame), tuple(inputs), int(rank))
-            for name, stage, frame, inputs, rank in content["steps"]
-        )
-        places = {str(stage): folder / where for stage, where in content["places"].items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InvalidOptionError(
-            f"out must be the folder of a job that was begun, got {folder}, whose {FOLDER}/{PLAN_NAME} "
-            f"{'is not there' if isinstance(error, OSError) else 'is damaged'}. Begin with beam run."
-        ) from error
-    try:
-        state = dict(json.loads((place / STATE_NAME).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        state = {}
-    return steps, places, state

@@ -13,13 +13,14 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from beam_warp.digests import content_digest
 from beam_warp.errors import MissingFileError
+from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.outputs import replacing
 
 RECEIPTS = "steps"
@@ -27,9 +28,6 @@ RECEIPTS = "steps"
 
 PATIENCE = 30.0
 """Time after which a file that another machine wrote must be visible here [s]; NFS caches names for 30 s at most."""
-
-NotedProgress = Callable[..., None]
-"""Called with (stage, done, total, note), as `beam_warp.jobs.listeners.NotedProgress`."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +100,7 @@ class Receipt:
 
     Attributes:
         key: Key of all that it depends on.
+        version: Digest of what all steps of its work depend on; see `version_of`.
         outputs: Size [byte], time of change [ns] and digest of each output, by its name in the folder of the work.
         seconds: How long it took.
         worker: Machine and process that did it.
@@ -111,6 +110,7 @@ class Receipt:
     """
 
     key: str
+    version: str
     outputs: Mapping[str, tuple[int, int, str]]
     seconds: float
     worker: str
@@ -146,15 +146,15 @@ def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> R
     step, work = task.step, works[task.step.stage]
     wait_for(task.awaited)
     key = _key(work.common(), step, work.digest(step), task.keys)
-    kept = read_receipt(work, step)
-    if kept is not None and kept.key == key and is_whole(work, kept):
+    kept = read_receipt(work.folder, step.name)
+    if kept is not None and kept.key == key and is_whole(work.folder, kept):
         return Receipt(**{**vars(kept), "is_kept": True})
     started = time.perf_counter()
     facts = work.do(task, progress)
     seconds = time.perf_counter() - started
     outputs = {path.relative_to(work.folder).as_posix(): _state(path) for path in work.outputs(step)}
-    receipt = Receipt(key, outputs, seconds, worker_name(), time.time(), facts)
-    path = receipt_path(work, step)
+    receipt = Receipt(key, version_of(work), outputs, seconds, worker_name(), time.time(), facts)
+    path = receipt_path(work.folder, step.name)
     path.parent.mkdir(exist_ok=True)
     write_record(path, {name: value for name, value in asdict(receipt).items() if name != "is_kept"})
     return receipt
@@ -163,6 +163,11 @@ def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> R
 def worker_name() -> str:
     """Return what receipts call this process."""
     return f"{platform.node()}:{os.getpid()}"
+
+
+def version_of(work: Work) -> str:
+    """Return the digest of the code and the options of a work."""
+    return hashlib.blake2b(work.common().encode(), digest_size=8).hexdigest()
 
 
 def _key(common: str, step: Step, digest: str, keys: Iterable[str]) -> str:
@@ -175,31 +180,31 @@ def _state(path: Path) -> tuple[int, int, str]:
     return status.st_size, status.st_mtime_ns, content_digest(path, {})[1]
 
 
-def receipt_path(work: Work, step: Step) -> Path:
-    """Return where the receipt of a step is."""
-    return work.folder / RECEIPTS / f"{step.name}.json"
+def receipt_path(folder: Path, name: str) -> Path:
+    """Return where the receipt of a step is, given the folder of its work."""
+    return folder / RECEIPTS / f"{name}.json"
 
 
-def read_receipt(work: Work, step: Step) -> Receipt | None:
+def read_receipt(folder: Path, name: str) -> Receipt | None:
     """Return the receipt of a step; None if there is none, or a damaged one."""
     try:
-        content = json.loads(receipt_path(work, step).read_text(encoding="utf-8"))
+        content = json.loads(receipt_path(folder, name).read_text(encoding="utf-8"))
         outputs = {str(name): (int(size), int(when), str(it)) for name, (size, when, it) in content["outputs"].items()}
         return Receipt(**{**content, "outputs": outputs})
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
-def is_whole(work: Work, receipt: Receipt, *, is_read: bool = False) -> bool:
+def is_whole(folder: Path, receipt: Receipt, *, is_read: bool = False) -> bool:
     """Return whether all outputs are as they were when a step was done.
 
     Args:
-        work: The work of the step.
+        folder: Folder of the step's work.
         receipt: Its receipt.
         is_read: Read all of them; else only those that have changed since, by their times.
     """
     for name, (size, when, digest) in receipt.outputs.items():
-        path = work.folder / name
+        path = folder / name
         try:
             status = path.stat()
             same = status.st_size == size and (
@@ -212,9 +217,9 @@ def is_whole(work: Work, receipt: Receipt, *, is_read: bool = False) -> bool:
     return True
 
 
-def awaited_files(work: Work, receipt: Receipt) -> list[tuple[str, int]]:
+def awaited_files(folder: Path, receipt: Receipt) -> list[tuple[str, int]]:
     """Return path and size of the outputs of a step, for `wait_for`."""
-    return [(str(work.folder / name), size) for name, (size, _, _) in receipt.outputs.items()]
+    return [(str(folder / name), size) for name, (size, _, _) in receipt.outputs.items()]
 
 
 def wait_for(awaited: Iterable[tuple[str, int]], patience: float = PATIENCE) -> None:

@@ -23,8 +23,9 @@ from typing import Any, Protocol
 
 from beam_warp.digests import code_digest
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError
+from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.outputs import remove_leftovers
-from beam_warp.plan.steps import NotedProgress, Plan, Receipt, Task, Work, perform, worker_name
+from beam_warp.plan.steps import Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
@@ -380,7 +381,7 @@ def prepare(works: Mapping[str, Work], terms: Terms) -> None:
 def attempt(works: Mapping[str, Work], task: Task) -> Outcome:
     """Do a task, and return what became of it in a form that can be sent."""
     try:
-        return Outcome(task.step.name, worker_name(), perform(works, task, lambda *step, **facts: None))
+        return Outcome(task.step.name, worker_name(), perform(works, task, no_progress))
     except Exception as error:
         return Outcome(task.step.name, worker_name(), error=sendable(error))
 

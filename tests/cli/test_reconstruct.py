@@ -1,6 +1,7 @@
 """`beam reconstruct`, and `beam run` of a capture: what they write and say, and one clear line for each mistake."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
+from beam_warp.cli.reconstruct import Modelling, frames_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 
@@ -50,22 +51,32 @@ class TestReconstruct:
         report = json.loads(capsys.readouterr().out)
         assert [entry["frame"] for entry in report["frames"]] == [1, 2]
 
-    def test_parts_then_the_whole(self, folder, asked, tmp_path, capsys):
-        words = ("reconstruct", folder, "--out", tmp_path / "out", "--segment-length", 2)
-        assert beam(*words, "--part", "2/2") == 0
-        assert "part 2/2: 2 frames ready" in capsys.readouterr().out
-        assert beam(*words, "--part", "1/2", "--json") == 0
-        assert json.loads(capsys.readouterr().out) == {"part": "1/2", "frames": [0, 1]}
-        assert beam(*words, "--json") == 0
-        assert json.loads(capsys.readouterr().out)["resumed_frames"] == 4
+    def test_processes_write_the_same_bytes(self, folder, asked, tmp_path, capsys):
+        words = ("reconstruct", folder, "--segment-length", 2, "--json")
+        found = []
+        for workers in (1, 2):
+            out = tmp_path / str(workers)
+            assert beam(*words, "--out", out, "--workers", workers) == 0
+            assert json.loads(capsys.readouterr().out)["segments"] == [0, 2]
+            places = (*out.glob("gaussians*"), *out.glob("frames/*"), *out.glob("previews/*"))
+            found.append({path.relative_to(out): path.read_bytes() for path in places})
+        assert len(found[0]) > 8
+        assert found[0] == found[1]
+        assert beam("plan", tmp_path / "2", "--html", tmp_path / "page.html") == 0
+        said = capsys.readouterr().out
+        assert re.search(r"frame +4/4 +0 +0", said)
+        assert "all 9 steps are done" in said
+        page = (tmp_path / "page.html").read_text()
+        assert page.count("<img") == page.count('src="2/previews/') == 4
 
 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("reconstruct {folder} --part 3/2 --segment-length 2", "part must be I/N with 1 <= I <= N, got 3/2"),
-        ("reconstruct {folder} --part one", "part must be I/N with 1 <= I <= N, got one"),
-        ("reconstruct {folder} --part 1/2", "--segment-length must be at least 1 to work in parts"),
+        ("reconstruct {folder} --workers some", "workers must be a number from 1 to 256, gpus, ray or ray://HOST:PORT"),
+        ("reconstruct {folder} --workers 0", "workers must be a number"),
+        ("reconstruct {folder} --workers gpus --device cpu", "device must be left out with workers gpus, got cpu"),
+        ("reconstruct {folder} --workers ray://", "workers must name a cluster as ray://HOST:PORT, got ray://"),
         ("reconstruct {folder} --frames 7:9", "frames must hold some of the capture's 4 from 0 to 3, got 7:9"),
         ("reconstruct {folder} --frames 3", "frames must be A:B or A:B:S, got 3"),
         ("reconstruct {folder} --segment-length -2", "--segment-length must be"),
@@ -151,12 +162,6 @@ def test_words_for_frames(words, frames):
 def test_words_for_no_frames(words):
     with pytest.raises(InvalidOptionError, match="frames must be A:B or A:B:S"):
         frames_of(words, (0, 1, 2))
-
-
-@pytest.mark.parametrize("words", ["", "1/", "0/1", "2/1", "-1/2", "a/b"])
-def test_words_for_no_part(words):
-    with pytest.raises(InvalidOptionError, match="part must be I/N"):
-        part_of(words)
 
 
 @pytest.mark.slow

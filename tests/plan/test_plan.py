@@ -16,8 +16,9 @@ import pytest
 from support.toy_work import toy_plan
 
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
-from beam_warp.plan.carry import Patience, carry_out, read_plan
+from beam_warp.plan.carry import Patience, carry_out
 from beam_warp.plan.schedule import Schedule, State
+from beam_warp.plan.standing import look
 from beam_warp.plan.steps import Step, Task, is_whole, perform, read_receipt, wait_for
 from beam_warp.plan.workers import InProcess, Processes, Terms
 
@@ -142,7 +143,7 @@ class TestFaults:
             f"{s}-{f}.bin" for f in (8, 9) for s in ("frame", "materials")
         }
         assert "poisoned" in (tmp_path / "plan" / "frame-8.txt").read_text()
-        assert read_plan(tmp_path)[2]["given_up"] == ["frame-8"]
+        assert look(tmp_path).given_up == ("frame-8",)
         here(toy_plan(tmp_path))
         assert outputs(tmp_path) == whole
 
@@ -167,11 +168,11 @@ class TestFaults:
 
     def test_receipts_prove_the_bytes(self, tmp_path):
         plan = toy_plan(tmp_path, 1)
-        step, work = plan.steps[0], plan.works["frame"]
+        step = plan.steps[0]
         receipt = perform(plan.works, Task(step), nobody)
-        assert read_receipt(work, step) == receipt
-        assert is_whole(work, receipt, is_read=True)
-        assert not is_whole(work, replace(receipt, outputs={"out/other.bin": (1, 2, "3")}))
+        assert read_receipt(tmp_path, step.name) == receipt
+        assert is_whole(tmp_path, receipt, is_read=True)
+        assert not is_whole(tmp_path, replace(receipt, outputs={"out/other.bin": (1, 2, "3")}))
 
 
 class TestProcesses:

@@ -33,6 +33,9 @@ MetersPerUnit = Annotated[
     float | None, arg(metavar="X", help="Length of the input's unit in metres; else its word, else 1.")
 ]
 DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")]
+Workers = Annotated[
+    str, arg(metavar="N|gpus|ray://…", help="Who works: N processes, one on each GPU, or a Ray cluster.")
+]
 Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
 Device = Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")]
 Quiet = Annotated[bool, arg(help="Print nothing but errors.")]

@@ -1,0 +1,64 @@
+"""Workers by the words of a command line: a number of processes, one for each GPU, or a cluster."""
+
+from __future__ import annotations
+
+import os
+
+from beam_warp.errors import InvalidOptionError
+from beam_warp.plan.steps import Plan
+from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
+
+MOST_PROCESSES = 256
+"""Processes of one machine, at most."""
+
+GPUS, RAY = "gpus", "ray"
+
+
+def crew_of(words: str, device: str | None) -> Crew:
+    """Return who does the work.
+
+    Args:
+        words: A number of processes; ``gpus`` for one on each GPU; ``ray`` for the Ray cluster that this machine is in;
+            ``ray://HOST:PORT`` for one that is reached as a Ray client.
+        device: The device that steps are told to use; None lets every worker have its own.
+
+    Raises:
+        InvalidOptionError: They mean nothing, or contradict the device.
+        MissingPackageError: Ray is not installed.
+    """
+    if words == RAY or words.startswith(f"{RAY}:"):
+        from beam_warp.plan.cluster import cluster_at
+
+        return cluster_at(words)
+    if words == GPUS:
+        if device is not None:
+            raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
+        return lambda plan, kind, progress: _processes(plan, kind, len(visible_gpus()), device)
+    if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
+        raise InvalidOptionError(
+            f"workers must be a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
+            "Write 4 for four processes."
+        )
+    return in_process if int(words) == 1 else lambda plan, kind, _: _processes(plan, kind, int(words), device)
+
+
+def visible_gpus() -> list[str]:
+    """Return what ``CUDA_VISIBLE_DEVICES`` calls each GPU that this process may use."""
+    from beam_warp.device.arrays import cuda_device_count
+
+    named = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    return named[: cuda_device_count()] or [str(number) for number in range(cuda_device_count())]
+
+
+def _processes(plan: Plan, kind: str, count: int, device: str | None) -> Workers:
+    """Return processes that share GPUs evenly, or on a CPU its cores."""
+    count, gpus = min(count, len(plan.steps)), visible_gpus()
+    if count == 0 or (kind == "cuda" and not gpus):
+        raise InvalidOptionError("workers must be a number on a machine without GPUs, got gpus. Write 2.")
+    settings: list[dict[str, str]] = [{} for _ in range(count)]
+    for number, setting in enumerate(settings):
+        if kind == "cuda" and device is None:
+            setting["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
+        if kind == "cpu":
+            setting["BEAM_WARP_THREADS"] = str(max((os.cpu_count() or 1) // count, 1))
+    return Processes(plan.works, Terms.of(plan.folder, kind), settings)
