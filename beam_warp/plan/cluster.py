@@ -21,6 +21,9 @@ from beam_warp.plan.workers import Crew, Outcome, Terms, attempt, prepare, worke
 LOOK_PERIOD = 5.0
 """How often machines are counted [s]."""
 
+MOST_DEATHS = 8
+"""Actors in a row that may end before they are ready: machines fail, but not all of them."""
+
 
 def cluster_at(words: str) -> Crew:
     """Return the workers of a cluster: ``ray`` for that of this machine, or ``ray://HOST:PORT``.
@@ -72,6 +75,7 @@ class Cluster:
         self._actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Actor)
         self._members: list[_Member] = []
         self._looked = -LOOK_PERIOD
+        self._deaths = 0
         self._most = len(plan.steps)
         self._grow()
 
@@ -134,6 +138,13 @@ class Cluster:
         try:
             said = self._ray.get(member.reply)
         except self._ray.exceptions.RayError as error:
+            self._deaths += not member.is_ready
+            if self._deaths > MOST_DEATHS:
+                reason = " ".join(str(error).split())[:200]
+                raise InvalidOptionError(
+                    f"workers must start, got {self._deaths} that ended before ({type(error).__name__}: {reason}). See "
+                    "Ray's logs."
+                ) from error
             self._members[self._members.index(member)] = self._member()
             if member.task is None:
                 return []
@@ -144,7 +155,7 @@ class Cluster:
         if isinstance(said, Outcome):
             member.task = None
             return [said]
-        member.name, member.is_ready = said, True
+        member.name, member.is_ready, self._deaths = said, True, 0
         return []
 
 
@@ -169,11 +180,16 @@ class _Actor:
         self._works: Mapping[str, Work] = {}
 
     def prepare(self) -> str | BeamError:
-        self._works, terms = pickle.loads(self._packed)
         try:
+            self._works, terms = pickle.loads(self._packed)
             prepare(self._works, terms)
         except BeamError as error:
             return error
+        except Exception as error:
+            return InvalidOptionError(
+                f"workers must be able to do such work, got {type(error).__name__} ({error}) on {worker_name()}. "
+                "Install the same packages there."
+            )
         return worker_name()
 
     def attempt(self, task: Task) -> Outcome:
