@@ -1,8 +1,6 @@
 """Plans on a Ray cluster of three pretended machines, of which some are killed."""
 
 import os
-import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -49,17 +47,16 @@ def test_machines_are_killed_and_join(cluster, tmp_path):
     plan = toy_plan(tmp_path / "there", seconds=0.3)
     first, second = (cluster.add_node(num_cpus=1) for _ in range(2))
 
-    def harm():
-        for node in (first, second):
-            while len(list((tmp_path / "there" / "out").iterdir())) < (5 if node is first else 20):
-                time.sleep(0.1)
-            cluster.add_node(num_cpus=1)
-            cluster.remove_node(node, allow_graceful=False)
+    heard = []
 
-    thread = threading.Thread(target=harm)
-    thread.start()
-    receipts = carry_out(plan, crew_of("ray", None)(plan, "", no_progress))
-    thread.join()
+    def harm(step, receipt, error):
+        """Let a machine join and another one die, in the midst of what it does; twice."""
+        heard.append(error)
+        if len(heard) in (5, 20):
+            cluster.add_node(num_cpus=1)
+            cluster.remove_node(first if len(heard) == 5 else second, allow_graceful=False)
+
+    receipts = carry_out(plan, crew_of("ray", None)(plan, "", no_progress), harm)
     assert outputs(tmp_path / "there") == outputs(tmp_path / "here")
     assert len({receipt.worker for receipt in receipts.values()}) > 2
 

@@ -1,0 +1,102 @@
+"""A capture as one plan, from cameras to materials: the same bytes by one process and by several."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+from support.fake_steps import FakeSteps, write_capture
+
+from beam_warp import RunOptions, validate
+from beam_warp.capture.capture import Capture
+from beam_warp.decomposition.frames import ReconstructedFrames
+from beam_warp.decomposition.job import OverviewOptions, run_capture
+from beam_warp.decomposition.work import MaterialWork
+from beam_warp.demo.from_images import FromImagesOptions, demo_steps
+from beam_warp.materials.direct import MaterialOptions
+from beam_warp.plan.crew import crew_of
+from beam_warp.plan.standing import look
+from beam_warp.plan.workers import Processes, in_process
+from beam_warp.reconstruction.job import FrameWork, ReconstructOptions
+from beam_warp.world.environment import EnvironmentMap
+
+OPTIONS = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
+
+
+def take(capture, out, steps, length, crew=in_process, options=OPTIONS):
+    out.mkdir()
+    frames = FrameWork.prepare(capture, out / "reconstruction", steps, ReconstructOptions(segment_length=length))
+    light = EnvironmentMap.read(capture.environment_path).resized(8, 16)
+    work = MaterialWork(out, ReconstructedFrames(frames, None), light, options)
+    return run_capture(frames, work, OverviewOptions(height=48), time.perf_counter(), crew)
+
+
+def results(out):
+    """Every byte that a run promises: all but times."""
+    files = (
+        path for path in out.rglob("*") if path.is_file() and path.suffix != ".json" and path.parent.name != "plan"
+    )
+    return {path.relative_to(out): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return Capture.read(write_capture(tmp_path_factory.mktemp("captures") / "ball", (2, 3, 4, 5)))
+
+
+@pytest.mark.parametrize(("length", "topology"), [(2, "perFrame"), (0, "constant")])
+def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
+    one = take(ball, tmp_path / "one", FakeSteps(), length)
+    two = take(ball, tmp_path / "two", FakeSteps(), length, crew_of("2", "cpu"))
+    assert two.result.sequence.topology == topology
+    assert validate(two.result.asset).is_valid
+    assert results(tmp_path / "one") == results(tmp_path / "two")
+    assert one.result.report["materials"] == two.result.report["materials"]
+    assert one.result.report["workers"] != two.result.report["workers"]
+    assert look(tmp_path / "two").stages["materials"].done == 4
+
+
+def test_materials_do_not_wait_for_other_segments(ball, tmp_path):
+    take(ball, tmp_path / "out", FakeSteps(), 2)
+    receipts = look(tmp_path / "out").receipts
+    assert receipts["materials-000003"].ended < receipts["frame-000004"].ended
+
+
+def test_tracking_that_is_lost_in_one_segment(tmp_path):
+    """What looked as if it could be persistent is then decomposed frame by frame."""
+    capture = Capture.read(write_capture(tmp_path / "capture", (0, 1, 2), levels={1: 0.95}))
+    lost = take(capture, tmp_path / "lost", FakeSteps(), 0, options=OPTIONS)
+    assert lost.result.sequence.topology == "perFrame"
+    assert [len(cloud) for cloud in lost.result.sequence] == [60, 65, 65]
+    assert lost.reconstruction.report["segments"] == [0, 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [1, 0])
+def test_a_real_capture_whose_workers_are_killed(tiny_capture, tmp_path, length):
+    """The true steps, small: two processes, each killed once, write what one process writes."""
+    small = FromImagesOptions(gaussian_count=400, color_iterations=6, normal_iterations=6, joint_iterations=6)
+    options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device="cpu")
+    steps = demo_steps(small, device="cpu", seed=0)
+    killed = []
+
+    def crew(plan, kind, progress):
+        workers = crew_of("2", "cpu")(plan, kind, progress)
+        assert isinstance(workers, Processes)
+
+        def kill():
+            for member in list(workers._members):
+                while member.task is None:
+                    time.sleep(0.05)
+                time.sleep(1.0)
+                os.kill(member.process.pid, signal.SIGKILL)
+                killed.append(member.process.pid)
+
+        threading.Thread(target=kill, daemon=True).start()
+        return workers
+
+    take(tiny_capture, tmp_path / "one", steps, length, options=options)
+    take(tiny_capture, tmp_path / "two", steps, length, crew, options)
+    assert killed
+    assert results(tmp_path / "one") == results(tmp_path / "two")
