@@ -40,7 +40,7 @@ SWEEPS = 40
 INK, FAINT, ARROW = "#1f2933", "#9aa5b1", "#52606d"
 
 COLORS = {
-    "#e4e7eb": ("errors", "checks", "digests", "archives", "blocks", "outputs", "kernels", "device", "jobs"),
+    "#e4e7eb": ("errors", "checks", "digests", "archives", "blocks", "outputs", "kernels", "device", "jobs", "plan"),
     "#d3e8d3": ("image", "world", "schema", "converters", "capture", "mesh", "stage"),
     "#fdebc8": ("light", "trace", "raster", "render", "interop"),
     "#d2e3f7": ("materials", "reconstruction", "decomposition"),

@@ -8,7 +8,9 @@ another machine, and machines that join the cluster get theirs.
 from __future__ import annotations
 
 import logging
+import os
 import pickle
+import socket
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,6 +22,9 @@ from beam_warp.plan.workers import Crew, Outcome, Terms, attempt, prepare, worke
 
 LOOK_PERIOD = 5.0
 """How often machines are counted [s]."""
+
+CONNECT_PATIENCE = 10.0
+"""Time within which a cluster must answer [s]."""
 
 MOST_DEATHS = 8
 """Actors in a row that may end before they are ready: machines fail, but not all of them."""
@@ -45,6 +50,17 @@ def cluster_at(words: str) -> Crew:
     return lambda plan, kind, progress: Cluster(ray, address, plan, kind)
 
 
+def _require_open(address: str) -> None:
+    """Try a cluster's port, for Ray tries for minutes.
+
+    Raises:
+        OSError: Nobody answers.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_PATIENCE).close()
+
+
 class Cluster:
     """Actors of a Ray cluster."""
 
@@ -63,6 +79,7 @@ class Cluster:
         self.count = 0
         self._ray, self._kind = ray, kind
         try:
+            _require_open(os.environ.get("RAY_ADDRESS", "") if address == "auto" else address)
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
@@ -172,8 +189,6 @@ class _Actor:
     """What runs in the cluster."""
 
     def __init__(self, packed: bytes, kind: str) -> None:
-        import os
-
         if kind == "cpu":
             os.environ["BEAM_WARP_THREADS"] = "1"  # it has been given one core
         self._packed = packed

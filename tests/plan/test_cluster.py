@@ -61,10 +61,10 @@ def test_machines_are_killed_and_join(cluster, tmp_path):
     assert len({receipt.worker for receipt in receipts.values()}) > 2
 
 
-@pytest.mark.slow
-def test_no_cluster_at_an_address(tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", ["ray", "ray://127.0.0.1:1"])
+def test_no_cluster_at_an_address(tmp_path, monkeypatch, words):
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     plan = toy_plan(tmp_path, 1)
-    with pytest.raises(InvalidOptionError, match="workers must name a Ray cluster that runs"):
-        crew_of("ray", None)(plan, "", no_progress)
+    with pytest.raises(InvalidOptionError, match=r"workers must name a Ray cluster that runs, got none at .*refused"):
+        crew_of(words, None)(plan, "", no_progress)
