@@ -53,8 +53,8 @@ def found(tmp_path, monkeypatch):
             roughness="estimate", persistent=True, materials=MaterialOptions(sample_count=samples), device="cpu"
         )
         work = MaterialWork(tmp_path, GivenFrames(lambda: balls(*greys), None), light, options)
-        work.prepare()
         work.images = shown
+        work.prepare()
         plan = work.plan()
         first = perform(plan.works, Task(plan.steps[0]), lambda *step: None)
         perform(plan.works, Task(plan.steps[1], (first.key,)), lambda *step: None)
